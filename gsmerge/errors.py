@@ -1,0 +1,49 @@
+"""What a user can mend, as exceptions that know their exit code.
+
+Arguments of the Python API that make no sense raise ``ValueError``. Everything that has to do with files and
+with what is in them raises one of these; the command line prints the message as one line.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+
+
+class GsmergeError(Exception):
+    """Base of all errors that a user can mend; ``exit_code`` is what the command line ends with."""
+
+    exit_code = 1
+
+
+class UsageError(GsmergeError):
+    """The command was called with options that do not go together."""
+
+    exit_code = 2
+
+
+class SceneError(GsmergeError):
+    """A file or folder does not hold what is needed.
+
+    Args:
+        path: The file or folder.
+        problem: What was expected and what was found, in one sentence without a full stop.
+        remedy: What to do about it, in one sentence without a full stop.
+    """
+
+    exit_code = 3
+
+    def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
+        self.path, self.problem, self.remedy = str(path), problem, remedy
+        super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
+
+
+class TargetError(GsmergeError):
+    """A quality or size target that was asked for could not be met."""
+
+    exit_code = 4
+
+
+class BatchError(GsmergeError):
+    """Some scenes of a batch failed."""
+
+    exit_code = 5

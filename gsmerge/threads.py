@@ -1,0 +1,72 @@
+"""One thread pool for the whole package.
+
+Numba kernels are compiled single-threaded and release the GIL; parallelism is over views (or bands of an image)
+and lives here. So there is one barrier per pass over the views instead of one per loop, nothing spins, and a
+result cannot depend on the number of threads: every item is computed alone, and results come back in order.
+OpenCV and torch are held to one thread each while a pool is in use, so that the three do not fight for the cores.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+import cv2
+import torch
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_pool: ThreadPoolExecutor | None = None
+_count = 0
+
+
+def available_threads() -> int:
+    """Number of processors that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def use_threads(count: int | None = None) -> Iterator[int]:
+    """Let :func:`parallel_map` use ``count`` threads (None: all processors) inside the block.
+
+    A block inside another keeps the outer one's threads.
+
+    Raises:
+        ValueError: If ``count`` is below 1.
+    """
+    global _pool, _count  # noqa: PLW0603 - the pool is the one thing here that is shared by design
+    count = available_threads() if count is None else count
+    if count < 1:
+        raise ValueError(f"expected at least 1 thread, got {count}")
+    if _pool is not None:
+        yield _count
+        return
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    _pool, _count = ThreadPoolExecutor(count, thread_name_prefix="gsmerge"), count
+    try:
+        yield count
+    finally:
+        _pool.shutdown()
+        _pool, _count = None, 0
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+
+
+def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """``[function(item) for item in items]`` on the pool; results in the order of the items.
+
+    Outside :func:`use_threads` a pool of all processors is made for the call. Calls from inside a pool thread
+    are not supported (they could wait for themselves).
+    """
+    items = list(items)
+    with use_threads():
+        if _count == 1 or len(items) < 2:
+            return [function(item) for item in items]
+        assert _pool is not None
+        return list(_pool.map(function, items))
