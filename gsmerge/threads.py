@@ -9,6 +9,7 @@ OpenCV and torch are held to one thread each while a pool is in use, so that the
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,13 +21,25 @@ import torch
 T = TypeVar("T")
 R = TypeVar("R")
 
-_pool: ThreadPoolExecutor | None = None
-_count = 0
+
+class _Local(threading.local):
+    """Each calling thread has its own pool, so two calls at once do not stop each other's."""
+
+    pool: ThreadPoolExecutor | None = None
+    count = 1
+    inside = False  # True on the pool's own threads: they must not wait for a pool
+
+
+_local = _Local()
 
 
 def available_threads() -> int:
     """Number of processors that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _enter_pool() -> None:
+    _local.inside = True
 
 
 @contextmanager
@@ -38,22 +51,22 @@ def use_threads(count: int | None = None) -> Iterator[int]:
     Raises:
         ValueError: If ``count`` is below 1.
     """
-    global _pool, _count  # noqa: PLW0603 - the pool is the one thing here that is shared by design
     count = available_threads() if count is None else count
     if count < 1:
         raise ValueError(f"expected at least 1 thread, got {count}")
-    if _pool is not None:
-        yield _count
+    if _local.pool is not None or _local.inside:
+        yield _local.count
         return
     before = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _pool, _count = ThreadPoolExecutor(count, thread_name_prefix="gsmerge"), count
+    _local.pool = ThreadPoolExecutor(count, thread_name_prefix="gsmerge", initializer=_enter_pool)
+    _local.count = count
     try:
         yield count
     finally:
-        _pool.shutdown()
-        _pool, _count = None, 0
+        _local.pool.shutdown()
+        _local.pool, _local.count = None, 1
         torch.set_num_threads(before[0])
         cv2.setNumThreads(before[1])
 
@@ -61,12 +74,11 @@ def use_threads(count: int | None = None) -> Iterator[int]:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """``[function(item) for item in items]`` on the pool; results in the order of the items.
 
-    Outside :func:`use_threads` a pool of all processors is made for the call. Calls from inside a pool thread
-    are not supported (they could wait for themselves).
+    Outside :func:`use_threads` a pool of all processors is made for the call; inside a pool thread the items are
+    worked off one by one.
     """
     items = list(items)
-    with use_threads():
-        if _count == 1 or len(items) < 2:
+    with use_threads() as count:
+        if count == 1 or len(items) < 2 or _local.pool is None:
             return [function(item) for item in items]
-        assert _pool is not None
-        return list(_pool.map(function, items))
+        return list(_local.pool.map(function, items))
