@@ -195,3 +195,64 @@ class Matches:
 
     clusters: Tensor
     count: int
+
+
+@dataclass(frozen=True)
+class FeatureGaussians:
+    """g Gaussians that each stand for a group of members, with what later stages need to know of the group.
+
+    Everything that describes the group adds up over its members (weights, masses, extinctions) or is an average
+    with the weights, so merging Feature Gaussians is pooling again. Opacity is derived when decoding:
+    ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is what blending conserves).
+
+    Args:
+        means: ``[g,3]`` float32.
+        covars: ``[g,3,3]`` float32: spread of the members' means plus their own covariances.
+        weights: ``[g]`` sum of the members' opacities.
+        masses: ``[g]`` opacity-weighted volume (paper eq. mass).
+        extinctions: ``[g]`` optical depth integrated over the members' discs, world units squared.
+        gains: ``[g]`` factor on the optical depth: 1, or what the other views' photos say.
+        spreads: ``[g]`` factor on the standard deviations at decoding.
+        sh0: ``[g,1,3]`` base colour.
+        shN: ``[g,k-1,3]``.
+        footprints: ``[g]`` size of one pixel at the group's depth, world units.
+        views: ``[g]`` int64, the view of the group, -1 when it was merged from several.
+        backing: ``[g]`` bool: belongs to the coarse layer behind the surfaces.
+        starts: ``[g+1]`` int64 into ``members``.
+        members: ``[m]`` int64 rows of the scene's Gaussians, group by group.
+    """
+
+    means: Tensor
+    covars: Tensor
+    weights: Tensor
+    masses: Tensor
+    extinctions: Tensor
+    gains: Tensor
+    spreads: Tensor
+    sh0: Tensor
+    shN: Tensor
+    footprints: Tensor
+    views: Tensor
+    backing: Tensor
+    starts: Tensor
+    members: Tensor
+
+    def __post_init__(self) -> None:
+        g = self.means.shape[0]
+        for name in ("weights", "masses", "extinctions", "gains", "spreads", "footprints", "views", "backing"):
+            _expect(name, getattr(self, name), (g,))
+        _expect("covars", self.covars, (g, 3, 3))
+        _expect("starts", self.starts, (g + 1,))
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @staticmethod
+    def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
+        """All groups of all parts in order."""
+        columns = {
+            f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(FeatureGaussians) if f.name != "starts"
+        }
+        sizes = torch.cat([p.starts[1:] - p.starts[:-1] for p in parts])
+        starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
+        return FeatureGaussians(starts=starts, **columns)

@@ -1,0 +1,77 @@
+"""Compact feed-forward 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU.
+
+    import gsmerge
+
+    scene = gsmerge.read_scene("scene.ply")
+    result = gsmerge.compact(scene, k=2)
+    gsmerge.write_ply("scene.compact.ply", result.gaussians)
+
+Everything public is here and loads at first use, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsmerge.errors import GsmergeError as GsmergeError
+    from gsmerge.errors import SceneError as SceneError
+    from gsmerge.inspect import inspect as inspect
+    from gsmerge.io import read_cameras as read_cameras
+    from gsmerge.io import read_ply as read_ply
+    from gsmerge.io import read_scene as read_scene
+    from gsmerge.io import to_cameras as to_cameras
+    from gsmerge.io import write_ply as write_ply
+    from gsmerge.pipeline import CompactOptions as CompactOptions
+    from gsmerge.pipeline import CompactReport as CompactReport
+    from gsmerge.pipeline import CompactResult as CompactResult
+    from gsmerge.pipeline import compact as compact
+    from gsmerge.render import Rendering as Rendering
+    from gsmerge.render import render as render
+    from gsmerge.segment import saliency as saliency
+    from gsmerge.segment import superpixels as superpixels
+    from gsmerge.types import Cameras as Cameras
+    from gsmerge.types import Gaussians as Gaussians
+    from gsmerge.types import PixelScene as PixelScene
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "errors": ("GsmergeError", "SceneError"),
+    "inspect": ("inspect",),
+    "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_ply"),
+    "pipeline": ("CompactOptions", "CompactReport", "CompactResult", "compact"),
+    "render": ("Rendering", "render"),
+    "segment": ("saliency", "superpixels"),
+    "types": ("Cameras", "Gaussians", "PixelScene"),
+}
+_EXPORTS = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = ["__version__", *sorted(_EXPORTS)]  # noqa: PLE0604 - strings all, from the table above
+
+
+class _Package(ModuleType):
+    """The package, in which a public function wins over the module of the same name that holds it."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if isinstance(value, ModuleType) and name in _EXPORTS:
+            return  # the import of gsmerge.render must not hide the function render
+        super().__setattr__(name, value)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,0 +1,67 @@
+"""Bring a scene to the frame that all arithmetic runs in, and back.
+
+Origin at the scene's middle and unit = its median depth, so that float32 keeps its precision far from the world's
+origin and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two: scaling there
+and back changes no bit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsmerge.types import Cameras, Gaussians, PixelScene
+
+
+@dataclass(frozen=True)
+class Frame:
+    """x_canonical = (x_world - origin) / unit.
+
+    Args:
+        origin: ``[3]`` float64, world units.
+        unit: Length of the canonical unit in world units, a power of two.
+    """
+
+    origin: Tensor
+    unit: float
+
+    def enter(self, gaussians: Gaussians) -> Gaussians:
+        """World to canonical; means in float32."""
+        means = ((gaussians.means.double() - self.origin) / self.unit).float()
+        return replace(gaussians, means=means, scales=gaussians.scales / self.unit)
+
+    def leave(self, gaussians: Gaussians) -> Gaussians:
+        """Canonical to world; means in float64."""
+        means = gaussians.means.double() * self.unit + self.origin
+        return replace(gaussians, means=means, scales=gaussians.scales * self.unit)
+
+    def enter_cameras(self, cameras: Cameras) -> Cameras:
+        """World to canonical."""
+        viewmats = cameras.viewmats.double().clone()
+        shift = viewmats[:, :3, 3] + viewmats[:, :3, :3] @ self.origin
+        viewmats[:, :3, 3] = shift / self.unit
+        return replace(cameras, viewmats=viewmats)
+
+
+def find_frame(scene: PixelScene) -> Frame:
+    """The canonical frame of a scene: median mean (float64) and median depth of its valid Gaussians."""
+    h, w = scene.cameras.height, scene.cameras.width
+    step = max(1, len(scene.gaussians) // 65536)
+    rows = torch.arange(0, len(scene.gaussians), step)
+    rows = rows[scene.valid.reshape(-1)[rows]]
+    means = scene.gaussians.means[rows].double()
+    origin = means.median(0).values
+    viewmats = scene.cameras.viewmats.double()[rows // (h * w)]
+    depths = (viewmats[:, 2, :3] * means).sum(1) + viewmats[:, 2, 3]
+    depth = float(depths.abs().median())
+    unit = 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
+    return Frame(origin, unit)
+
+
+def canonicalise(scene: PixelScene) -> tuple[PixelScene, Frame]:
+    """The scene in its canonical frame, and the frame."""
+    frame = find_frame(scene)
+    return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame

@@ -1,0 +1,20 @@
+"""The command line: parse, call, print. Nothing heavy is imported before a command runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Args:
+        args: Arguments without the program's name; those of the process when None.
+
+    Returns:
+        0 done, 1 something unforeseen, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
+        130 interrupted.
+    """
+    from gsmerge.cli.app import run
+
+    return run(args)

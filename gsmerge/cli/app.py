@@ -1,0 +1,82 @@
+"""The typer application, and the one place that turns exceptions into a line and an exit code."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from gsmerge import __version__
+from gsmerge.cli.compact import compact
+from gsmerge.cli.console import plain_warnings
+from gsmerge.cli.inspect import inspect
+from gsmerge.cli.options import debug_wanted, set_debug
+from gsmerge.cli.preview import preview
+from gsmerge.cli.render import render
+from gsmerge.cli.segment import segment
+from gsmerge.errors import GsmergeError
+
+PROGRAM = "gsmerge"
+
+app = typer.Typer(
+    name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
+)
+for command in (compact, inspect, segment, render, preview):
+    app.command()(command)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"{PROGRAM} {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    _: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+def _fail(message: str, code: int) -> int:
+    if debug_wanted():
+        traceback.print_exc()
+    print(f"{PROGRAM}: error: {message}", file=sys.stderr)
+    return code
+
+
+def _usage_message(error: typer.BadParameter) -> str:
+    context = error.ctx
+    place = context.command_path if context is not None else PROGRAM
+    return f"{error.format_message().rstrip('.')}; see '{place} --help'"
+
+
+def run(args: Sequence[str] | None = None) -> int:
+    """Run the application; every error becomes one line on stderr and an exit code."""
+    set_debug(False)
+    try:
+        with plain_warnings():
+            return app(args=args, prog_name=PROGRAM, standalone_mode=False) or 0
+    except GsmergeError as error:
+        return _fail(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted; nothing was written", 130)
+    except MemoryError:
+        return _fail("out of memory; use a smaller scene or fewer --threads", 1)
+    except Exception as error:
+        if isinstance(error, _UsageErrors):
+            return _fail(_usage_message(error), 2)
+        told = f"{type(error).__name__}: {error}".splitlines()[0]
+        return _fail(f"unexpected error: {told}; run again with --debug", 1)
+
+
+# typer keeps its usage errors to itself; BadParameter, which it exports, derives from their common base
+_UsageErrors = typer.BadParameter.__mro__[2]

@@ -1,0 +1,67 @@
+"""What the command line says on stderr: status lines, progress bars, warnings. Data goes to stdout."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+
+Progress = Callable[[str, int, int], None]
+
+
+def say(message: str, *, quiet: bool = False) -> None:
+    """Print one status line on stderr unless ``quiet``."""
+    if not quiet:
+        print(message, file=sys.stderr, flush=True)
+
+
+def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Stand-in for :func:`warnings.showwarning` that prints the message alone."""
+    say(f"gsmerge: warning: {message}")
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Warnings as one line each, without the place in the code that raised them."""
+    with warnings.catch_warnings():
+        warnings.showwarning = show_warning
+        yield
+
+
+def announce_compilation(*, quiet: bool) -> AbstractContextManager[None]:
+    """A block that says so, once, when a kernel has to be compiled (the first run after installation)."""
+    from gsmerge.kernels.compilation import watch_compilation
+
+    return watch_compilation(lambda: say("compiling kernels, once after installation, up to 25 s", quiet=quiet))
+
+
+@contextmanager
+def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
+    """A progress bar per stage on stderr; yields the callable that moves it.
+
+    Yields:
+        ``(stage, done, total) -> None``, or None when quiet or when stderr is no terminal (``FORCE_COLOR`` set
+        in the environment counts as one).
+    """
+    if quiet:
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    columns = TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
+        tasks: dict[str, Any] = {}
+
+        def move(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield move

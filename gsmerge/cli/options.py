@@ -1,0 +1,122 @@
+"""The options that commands share, each declared once. Names are the fields' names of the Python API.
+
+An option that was not given is None and leaves the library's own default alone; ``show_default`` repeats that
+default for the reader, and a test holds the two together.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+INPUT, SEGMENTATION, MERGING, OUTPUT = "Input", "Superpixels", "Merging and colours", "Output and behaviour"
+
+
+class Method(str, Enum):
+    """Superpixel methods."""
+
+    rdseg = "rdseg"
+    bass = "bass"
+    bass_st = "bass-st"
+    slic = "slic"
+
+
+class Preset(str, Enum):
+    """Presets of the default superpixel method."""
+
+    fast = "fast"
+    default = "default"
+    best = "best"
+
+
+class Match(str, Enum):
+    """How Feature Gaussians of different views are told to show the same surface."""
+
+    overlap = "overlap"
+    aabb = "aabb"
+    none = "none"
+
+
+class Fit(str, Enum):
+    """What is fitted to the input images."""
+
+    color = "color"
+    none = "none"
+
+
+class Opacity(str, Enum):
+    """How the file stores opacity."""
+
+    auto = "auto"
+    logit = "logit"
+    linear = "linear"
+
+
+def debug_wanted() -> bool:
+    """Whether the command line asked for tracebacks."""
+    return _state["debug"]
+
+
+def set_debug(value: bool) -> bool:
+    """Remember ``--debug`` for the error handler, which runs when no command is active any more."""
+    _state["debug"] = value
+    return value
+
+
+_state = {"debug": False}
+
+SceneArgument = Annotated[
+    Path, typer.Argument(metavar="SCENE", help="A .ply with one Gaussian per pixel and view, or the folder it is in.")
+]
+CamerasOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Cameras: transforms.json, a COLMAP folder, cameras.json or results.npz. Found beside the .ply if not"
+        " given.",
+        rich_help_panel=INPUT,
+    ),
+]
+ImagesOption = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the input images. Found beside the .ply if not given.", rich_help_panel=INPUT),
+]
+OpacityOption = Annotated[
+    Opacity,
+    typer.Option(help="How the file stores opacity; auto looks at the values.", rich_help_panel=INPUT),
+]
+SuperpixelsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Superpixels per view. Wins over --density.", rich_help_panel=SEGMENTATION),
+]
+DensityOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0, max=1.0, help="Superpixels per pixel.", show_default="{density}", rich_help_panel=SEGMENTATION
+    ),
+]
+MethodOption = Annotated[
+    Method | None,
+    typer.Option(help="Superpixel method.", show_default="rdseg", rich_help_panel=SEGMENTATION),
+]
+PresetOption = Annotated[
+    Preset | None,
+    typer.Option(help="Effort of rdseg.", show_default="default", rich_help_panel=SEGMENTATION),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Threads. The result is the same for any.", show_default="all processors", rich_help_panel=OUTPUT
+    ),
+]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the output if it exists.", rich_help_panel=OUTPUT)
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Errors only.", rich_help_panel=OUTPUT)]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.", rich_help_panel=OUTPUT)]
+DebugOption = Annotated[
+    bool,
+    typer.Option("--debug", help="Tracebacks for errors.", callback=set_debug, is_eager=True, rich_help_panel=OUTPUT),
+]

@@ -1,0 +1,401 @@
+"""Gaussian splats in PLY files: the only place that knows log scales, logits and channel-major harmonics."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
+
+from gsmerge.errors import SceneError
+from gsmerge.io.atomic import atomic_output
+from gsmerge.threads import parallel_map
+from gsmerge.types import Gaussians
+
+OpacityChoice = Literal["auto", "logit", "raw"]
+
+MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
+MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
+LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
+
+_MEANS, _NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+_SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REQUIRED = (*_MEANS, *_SH0, "opacity", *_SCALES, *_QUATS)
+_BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache while every column is taken
+
+
+@dataclass(frozen=True)
+class PlyInfo:
+    """What was found in a PLY file.
+
+    Args:
+        path: The file.
+        layout: Name of the column layout, as "17-column export" or "INRIA, SH degree 3".
+        format: "ascii", "binary little-endian" or "binary big-endian".
+        count: Gaussians, the set-aside ones included.
+        file_bytes: Size of the file.
+        bytes_by_attribute: Bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats,
+            extra); of the values' binary types for an ascii file.
+        columns: All columns of the vertex element, in the file's order.
+        extra_columns: Those that mean nothing here.
+        extra_elements: Elements beside ``vertex``.
+        sh_degree: 0 to 4.
+        opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
+        num_nonfinite: Rows with NaN or inf, set aside.
+        num_clipped_scales: Gaussians with a log scale beyond +-30, clipped.
+        num_zero_quats: Gaussians without a rotation, taken as the identity.
+    """
+
+    path: str
+    layout: str
+    format: str
+    count: int
+    file_bytes: int
+    bytes_by_attribute: dict[str, int]
+    columns: tuple[str, ...]
+    extra_columns: tuple[str, ...]
+    extra_elements: tuple[str, ...]
+    sh_degree: int
+    opacity_encoding: str
+    num_nonfinite: int
+    num_clipped_scales: int
+    num_zero_quats: int
+
+
+@dataclass(frozen=True)
+class PlyScene:
+    """The Gaussians of a PLY file, row by row.
+
+    Args:
+        gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
+            fully transparent and grey, and has the position and scales of the finite row before it.
+        valid: ``[n]`` bool, False for the rows that were not finite.
+        info: What was found.
+    """
+
+    gaussians: Gaussians
+    valid: torch.Tensor
+    info: PlyInfo
+
+
+def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
+    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
+
+    Args:
+        path: The file.
+        opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
+            as logits. Infinite logits are opacities of 0 and 1.
+
+    Raises:
+        SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
+        ValueError: If ``opacity`` is none of the three.
+    """
+    if opacity not in ("auto", "logit", "raw"):
+        raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
+    path = Path(path)
+    data = _open(path)
+    vertex = _vertex(path, data)
+    names = tuple(p.name for p in vertex.properties)
+    num_rest = _num_rest(path, vertex)
+    rows = np.asarray(vertex.data)
+    out = _allocate(rows, num_rest // 3)
+    size = max(1, _BLOCK_BYTES // rows.dtype.itemsize)
+    blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
+    done = parallel_map(lambda block: _convert(rows[block], {k: v[block] for k, v in out.items()}), blocks)
+
+    encoding = _encoding(opacity, data, done)
+    _activate(out["opacities"], out["valid"], encoding)
+    num_bad = _set_aside(path, out)
+    used = {*_REQUIRED, *_NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    extra = tuple(name for name in names if name not in used)
+    info = PlyInfo(
+        path=str(path),
+        layout=_layout(names, num_rest),
+        format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
+        count=len(rows),
+        file_bytes=path.stat().st_size,
+        bytes_by_attribute=_bytes_by_attribute(rows, extra),
+        columns=names,
+        extra_columns=extra,
+        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+        sh_degree=_degree(num_rest),
+        opacity_encoding=encoding,
+        num_nonfinite=num_bad,
+        num_clipped_scales=sum(d.num_clipped for d in done),
+        num_zero_quats=sum(d.num_zero_quats for d in done),
+    )
+    tensors = {k: torch.from_numpy(v) for k, v in out.items()}
+    return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
+
+
+def _open(path: Path) -> PlyData:
+    if path.is_dir():
+        raise SceneError(path, "expected a .ply file, found a folder")
+    try:
+        with path.open("rb") as file:
+            start = file.read(4)
+            if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
+                raise SceneError(path, "expected a PLY file, found one that does not start with the line 'ply'")
+            file.seek(0)
+            return PlyData.read(file, mmap="r")
+    except FileNotFoundError as error:
+        raise SceneError(path, "no such file") from error
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    except PlyElementParseError as error:
+        element, row = error.element, error.row
+        promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
+        raise SceneError(
+            path, f"truncated or damaged: expected {promise}, found {row or 0} whole ones ({error.message})"
+        ) from error
+    except (PlyParseError, ValueError, MemoryError) as error:
+        raise SceneError(path, f"expected a readable PLY header, found a damaged one ({error})") from error
+
+
+def _vertex(path: Path, data: PlyData) -> PlyElement:
+    if "vertex" not in data:
+        found = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
+        raise SceneError(path, f"expected an element 'vertex', found {found}")
+    vertex = data["vertex"]
+    columns = {p.name for p in vertex.properties if not isinstance(p, PlyListProperty)}
+    missing = [name for name in _REQUIRED if name not in columns]
+    if missing:
+        remedy = "this is no Gaussian splat"
+        if any(name.startswith("packed_") for name in columns):
+            remedy = "it is compressed: convert it to an ordinary .ply first"
+        elif missing == ["scale_2"]:
+            remedy = "flat 2D Gaussians need a scale_2 column of their own"
+        elif len(missing) < len(_REQUIRED) // 2:
+            remedy = "export it again with them"
+        raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
+    if vertex.count == 0:
+        raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
+    return vertex
+
+
+def _num_rest(path: Path, vertex: PlyElement) -> int:
+    names = [p.name for p in vertex.properties if p.name.startswith("f_rest_")]
+    if len(names) not in (0, 9, 24, 45, 72) or set(names) != {f"f_rest_{i}" for i in range(len(names))}:
+        raise SceneError(
+            path,
+            "expected columns f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4) or none, "
+            f"found {len(names)} f_rest columns",
+        )
+    return len(names)
+
+
+def _degree(num_rest: int) -> int:
+    return round((num_rest / 3 + 1) ** 0.5) - 1
+
+
+def _layout(names: tuple[str, ...], num_rest: int) -> str:
+    normals = set(_NORMALS) <= set(names)
+    if num_rest == 0:
+        return "17-column export" if normals else "14-column export (no normals)"
+    return f"INRIA, SH degree {_degree(num_rest)}" + ("" if normals else " (no normals)")
+
+
+def _bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
+    groups = {"means": _MEANS, "normals": _NORMALS, "sh0": _SH0, "opacities": ("opacity",)}
+    groups |= {"scales": _SCALES, "quats": _QUATS, "extra": extra}
+    of = {name: kind for kind, names in groups.items() for name in names}
+    sizes: dict[str, int] = {}
+    assert rows.dtype.names is not None
+    for name in rows.dtype.names:
+        kind = of.get(name, "shN")
+        sizes[kind] = sizes.get(kind, 0) + rows.dtype[name].itemsize * len(rows)
+    return sizes
+
+
+def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
+    n = len(rows)
+    wide = any(rows.dtype[name] in (np.dtype("<f8"), np.dtype(">f8")) for name in _MEANS)
+    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
+    out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
+    return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+
+
+@dataclass(frozen=True)
+class _Converted:
+    """What one block of rows had."""
+
+    num_clipped: int
+    num_zero_quats: int
+    any_finite_opacity: bool
+    unit_opacities: bool  # all finite ones in [0, 1]
+
+
+def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
+    """Fill the arrays of one block of rows, column by column; opacities are copied as they are."""
+    with np.errstate(all="ignore"):
+        total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
+
+        def take(name: str) -> np.ndarray:
+            column = rows[name].astype(np.float32)
+            np.add(total, column, out=total)
+            return column
+
+        for j, name in enumerate(_MEANS):
+            column = take(name)
+            out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
+        for j, name in enumerate(_SH0):
+            out["sh0"][:, 0, j] = take(name)
+        num_higher = out["shN"].shape[1]
+        for channel in range(3):
+            for j in range(num_higher):
+                out["shN"][:, j, channel] = take(f"f_rest_{channel * num_higher + j}")
+        clipped = np.zeros(len(rows), np.bool_)
+        for j, name in enumerate(_SCALES):
+            column = take(name)
+            clipped |= np.abs(column) > MAX_LOG_SCALE
+            np.clip(column, -MAX_LOG_SCALE, MAX_LOG_SCALE, out=column)
+            out["scales"][:, j] = np.exp(column, out=column)
+        quats = [take(name) for name in _QUATS]
+        zero = _normalise(quats, out["quats"])
+        out["opacities"][:] = take("opacity")
+        valid = np.isfinite(total, out=out["valid"])
+        doubtful = np.flatnonzero(~valid)
+        if len(doubtful):
+            valid[doubtful] = _exactly_valid(rows[doubtful], num_higher)
+    finite = out["opacities"][np.isfinite(out["opacities"])] if len(doubtful) else out["opacities"]
+    return _Converted(
+        num_clipped=int((clipped & valid).sum()),
+        num_zero_quats=int((zero & valid).sum()),
+        any_finite_opacity=len(finite) > 0,
+        unit_opacities=bool(len(finite) == 0 or (finite.min() >= 0 and finite.max() <= 1)),
+    )
+
+
+def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
+    """Whether rows are usable: all finite, but an infinite logit or a scale of exactly zero is a value."""
+    valid = ~np.isnan(rows["opacity"].astype(np.float32))
+    for name in (*_MEANS, *_SH0, *_QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
+        valid &= np.isfinite(rows[name].astype(np.float32))
+    for name in _SCALES:
+        column = rows[name].astype(np.float32)
+        valid &= np.isfinite(column) | (column == -np.inf)
+    return valid
+
+
+def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
+    """Write unit quaternions; returns the mask of the zero ones, which become the identity."""
+    w, x, y, z = quats
+    squared = w * w + x * x + y * y + z * z
+    inverse = 1 / np.sqrt(squared)
+    for j, column in enumerate(quats):
+        np.multiply(column, inverse, out=out[:, j])
+    zero = np.zeros(len(w), np.bool_)
+    extreme = np.flatnonzero(~((squared > 1e-30) & (squared < 1e30)))  # float32 squares under- or overflow
+    if len(extreme):
+        exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
+        length = np.linalg.norm(exact, axis=1)
+        zero[extreme] = length == 0
+        exact[length == 0] = (1, 0, 0, 0)
+        out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
+    return zero
+
+
+def _encoding(opacity: str, data: PlyData, done: list[_Converted]) -> str:
+    if opacity != "auto":
+        return opacity
+    comments = [*data.comments, *(c for e in data.elements for c in e.comments)]
+    if LOGIT_COMMENT in comments:
+        return "logit"
+    finite = any(d.any_finite_opacity for d in done)
+    return "raw" if finite and all(d.unit_opacities for d in done) else "logit"
+
+
+def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
+    """Turn stored opacities into [0, 1], in place; an infinite activated one makes its row invalid."""
+    if encoding == "raw":
+        valid &= np.isfinite(opacities)
+        np.clip(opacities, 0, 1, out=opacities)
+        return
+    with np.errstate(all="ignore"):
+        np.exp(np.negative(opacities, out=opacities), out=opacities)
+        np.add(opacities, 1, out=opacities)
+        np.reciprocal(opacities, out=opacities)
+
+
+def _set_aside(path: Path, out: dict[str, np.ndarray]) -> int:
+    """Make the invalid rows transparent, in place; returns their number."""
+    valid = out["valid"]
+    bad = np.flatnonzero(~valid)
+    if len(bad) == 0:
+        return 0
+    good = np.flatnonzero(valid)
+    if len(good) == 0:
+        raise SceneError(path, f"expected finite Gaussians, found NaN or inf in all {len(valid)} rows")
+    before = good[np.maximum(np.searchsorted(good, bad) - 1, 0)]
+    for name in ("means", "scales"):
+        out[name][bad] = out[name][before]
+    for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
+        out[name][bad] = value
+    return len(bad)
+
+
+def write_ply(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    overwrite: bool = False,
+    sh_degree: int | None = None,
+) -> None:
+    """Write Gaussians in INRIA's column order, binary little-endian float32.
+
+    Opacities become finite logits (within +-16), scales finite logarithms (within +-30), quaternions unit ones.
+
+    Args:
+        path: The file; complete or not there at all.
+        gaussians: Finite values.
+        overwrite: Replace an existing file.
+        sh_degree: Drop harmonics above this degree; None keeps all.
+
+    Raises:
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, or fewer harmonics than asked for.
+    """
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not 0 <= degree <= gaussians.sh_degree:
+        raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
+    num_higher = (degree + 1) ** 2 - 1
+    names = [*_MEANS, *_NORMALS, *_SH0, *(f"f_rest_{i}" for i in range(3 * num_higher))]
+    names += ["opacity", *_SCALES, *_QUATS]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}", f"element vertex {len(gaussians)}"]
+    header += [*(f"property float {name}" for name in names), "end_header", ""]
+    block = max(1, _BLOCK_BYTES // (4 * len(names)))
+    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        for start in range(0, len(gaussians), block):
+            rows = _stored(gaussians[start : start + block], num_higher)
+            if not np.isfinite(rows).all():
+                raise ValueError(f"expected finite Gaussians, got NaN or inf in rows from {start}")
+            file.write(rows.data)
+
+
+def _stored(part: Gaussians, num_higher: int) -> np.ndarray:
+    """``[m,columns]`` values as the file holds them."""
+
+    def array(tensor: torch.Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:
+        return tensor.detach().cpu().double().numpy()
+
+    rows = np.zeros((len(part), 17 + 3 * num_higher), "<f4")
+    rows[:, :3] = array(part.means)
+    rows[:, 6:9] = array(part.sh0)[:, 0]
+    last = 9 + 3 * num_higher
+    rows[:, 9:last] = array(part.shN)[:, :num_higher].transpose(0, 2, 1).reshape(len(part), -1)
+    with np.errstate(divide="ignore"):  # opacities 0 and 1, scales of 0: clipped below
+        opacities = array(part.opacities)
+        rows[:, last] = np.clip(np.log(opacities) - np.log1p(-opacities), -MAX_LOGIT, MAX_LOGIT)
+        rows[:, last + 1 : last + 4] = np.clip(np.log(array(part.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
+    quats = array(part.quats)
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(length > 0, quats, (1.0, 0.0, 0.0, 0.0)) / np.where(length > 0, length, 1)
+    rows[:, last + 4 :] = quats
+    return rows

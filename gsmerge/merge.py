@@ -1,0 +1,92 @@
+"""feature gaussians + matches -> feature gaussians: pool every cluster into one."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.types import FeatureGaussians, Matches
+
+
+def merge(features: FeatureGaussians, matches: Matches) -> FeatureGaussians:
+    """One Feature Gaussian per cluster; those that are alone pass unchanged.
+
+    Members are weighted with their opacities times what the photos say of them (gains); masses and integrated
+    optical depths add, so equal ones stacked on each other become 1 - prod(1 - alpha). Sums run in float64 about
+    the cluster's own mean: the result does not depend on the order of the members beyond rounding.
+
+    Args:
+        features: g Feature Gaussians.
+        matches: A cluster for each.
+
+    Returns:
+        ``matches.count`` Feature Gaussians: first those that are alone in their old order, then the merged ones.
+    """
+    clusters = matches.clusters
+    sizes = torch.bincount(clusters, minlength=matches.count)
+    alone = sizes[clusters] == 1
+    if bool(alone.all()):
+        return features
+    order = torch.nonzero(~alone)[:, 0]
+    order = order[torch.argsort(clusters[order], stable=True)]
+    first = torch.ones(len(order), dtype=torch.bool)
+    first[1:] = clusters[order][1:] != clusters[order][:-1]
+    cuts = torch.nonzero(first)[:, 0].numpy()
+    return FeatureGaussians.concat([take(features, torch.nonzero(alone)[:, 0]), _pool(features, order, cuts)])
+
+
+def take(features: FeatureGaussians, index: Tensor) -> FeatureGaussians:
+    """The Feature Gaussians that an integer ``index`` selects, with their members."""
+    starts, members = _gather(features, index)
+    names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
+    return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
+
+
+def _gather(features: FeatureGaussians, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Members of the indexed Feature Gaussians, one after the other: starts and rows."""
+    begin, sizes = features.starts[index], (features.starts[1:] - features.starts[:-1])[index]
+    starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
+    offsets = torch.arange(int(starts[-1])) - starts[:-1].repeat_interleave(sizes)
+    return starts, features.members[begin.repeat_interleave(sizes) + offsets]
+
+
+def _pool(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> FeatureGaussians:
+    """Pool runs of ``order`` that begin at ``cuts``."""
+
+    def rows(tensor: Tensor) -> np.ndarray:
+        return tensor[order].double().numpy()
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values, cuts, axis=0)
+
+    sizes = np.diff(np.append(cuts, len(order)))
+    run = np.repeat(np.arange(len(cuts)), sizes)
+    gains, extinctions = rows(features.gains), rows(features.extinctions)
+    share = np.maximum(rows(features.weights) * gains, 1e-12)
+    share /= total(share)[run]
+    means = total(share[:, None] * rows(features.means))
+    delta = rows(features.means) - means[run]
+    covars = total(share[:, None, None] * (rows(features.covars) + delta[:, :, None] * delta[:, None]))
+    summed = total(extinctions)
+    starts, members = _gather(features, order)
+
+    def single(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values).float()
+
+    return FeatureGaussians(
+        means=single(means),
+        covars=single(covars),
+        weights=single(total(rows(features.weights))),
+        masses=single(total(rows(features.masses))),
+        extinctions=single(summed),
+        gains=single(total(gains * extinctions) / np.maximum(summed, 1e-30)),
+        spreads=single(np.maximum.reduceat(rows(features.spreads), cuts)),
+        sh0=single(total(share[:, None, None] * rows(features.sh0))),
+        shN=single(total(share[:, None, None] * rows(features.shN))),
+        footprints=single(total(share * rows(features.footprints))),
+        views=torch.full((len(cuts),), -1),
+        backing=torch.zeros(len(cuts), dtype=torch.bool),
+        starts=torch.cat([starts[torch.from_numpy(cuts)], starts[-1:]]),
+        members=members,
+    )

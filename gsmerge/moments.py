@@ -1,0 +1,146 @@
+"""Pool sets of Gaussians into single ones with the same moments, and turn moments back into Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.kernels.pool import decompose, pool
+from gsmerge.threads import available_threads, parallel_map
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+
+MIN_SCALE = 1e-12
+MAX_OPACITY = 0.999  # of a merged Gaussian: finite as a logit, and still differentiable for a later fit
+ROWS_PER_TASK = 4096
+
+
+@dataclass(frozen=True)
+class Members:
+    """The scene's Gaussians as the kernels want them: contiguous float32 arrays.
+
+    Args:
+        means: ``[n,3]``.
+        quats: ``[n,4]`` wxyz.
+        scales: ``[n,3]``.
+        opacities: ``[n]``.
+        sh: ``[n,k,3]``.
+        footprints: ``[n]`` size of one pixel of the own view at the member's depth, world units.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
+    footprints: np.ndarray
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
+
+
+def scene_members(scene: PixelScene) -> Members:
+    """The members of a canonical scene, with the pixel footprint of each in its own view."""
+    g, cameras = scene.gaussians, scene.cameras
+    means = _array(g.means)
+    sh = _array(g.sh0) if g.sh_degree == 0 else np.concatenate([_array(g.sh0), _array(g.shN)], 1)
+    footprints = np.empty(len(g), np.float32)
+    pixels = scene.pixels_per_view
+
+    def fill(view: int) -> None:
+        rows = slice(view * pixels, (view + 1) * pixels)
+        third = cameras.viewmats[view, 2].numpy().astype(np.float32)
+        focal = float((cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1]).abs().sqrt())
+        depths = np.abs(means[rows] @ third[:3] + third[3])
+        footprints[rows] = np.maximum(depths, 1e-6) / focal
+
+    parallel_map(fill, range(len(scene)))
+    return Members(means, _array(g.quats), _array(g.scales), _array(g.opacities), sh, footprints)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Pooled moments of g groups: ``means [g,3]``, ``covars [g,3,3]``, ``weights``, ``masses``, ``extinctions``,
+    ``footprints [g]`` and ``sh [g,k,3]``; numpy, float64 except for float32 sh. See :class:`FeatureGaussians`.
+    """
+
+    means: np.ndarray
+    covars: np.ndarray
+    weights: np.ndarray
+    masses: np.ndarray
+    extinctions: np.ndarray
+    footprints: np.ndarray
+    sh: np.ndarray
+
+
+def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, *, own_covariance: bool = True) -> Moments:
+    """Moments of every group of members (docs/method: opacity weights, total covariance, winsorised members).
+
+    Args:
+        members: The scene's Gaussians.
+        starts: ``[g+1]`` int64 into ``ids``.
+        ids: ``[m]`` int64 rows of ``members``.
+        own_covariance: Add the members' own covariances to the spread of their means. Without it this is the
+            paper's moment matching (eq. teacher_mean, teacher_cov).
+    """
+    num_groups = len(starts) - 1
+    geometry = np.zeros((num_groups, 13))
+    sh = np.zeros((num_groups, members.sh.shape[1], 3), np.float32)
+
+    def run(first: int) -> None:
+        last = min(first + ROWS_PER_TASK, num_groups)
+        m = members
+        pool(
+            starts[first : last + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh, m.footprints,
+            own_covariance, geometry[first:last], sh[first:last],
+        )  # fmt: skip
+
+    parallel_map(run, range(0, num_groups, ROWS_PER_TASK))
+    covars = geometry[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
+    return Moments(geometry[:, :3], covars, geometry[:, 9], geometry[:, 10], geometry[:, 11], geometry[:, 12], sh)
+
+
+def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations ``[g,3]`` (rising) and unit quaternions ``[g,4]`` of covariances ``[g,3,3]``."""
+    covars = np.ascontiguousarray(covars, dtype=np.float64)
+    scales, quats = np.empty((len(covars), 3)), np.empty((len(covars), 4))
+
+    def run(first: int) -> None:
+        rows = slice(first, first + ROWS_PER_TASK)
+        decompose(covars[rows], scales[rows], quats[rows])
+
+    parallel_map(run, range(0, len(covars), ROWS_PER_TASK))
+    return np.maximum(scales, MIN_SCALE), quats
+
+
+def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, spreads: np.ndarray, means: Tensor, sh: Tensor) -> Gaussians:
+    """Gaussians of given moments; opacity from the conserved optical depth over the (unspread) disc."""
+    scales, quats = principal_axes(covars)
+    opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))
+    return Gaussians(
+        means=means.float(),
+        quats=torch.from_numpy(quats).float(),
+        scales=torch.from_numpy(scales * spreads[:, None]).float(),
+        opacities=torch.from_numpy(np.clip(opacities, 0, MAX_OPACITY)).float(),
+        sh0=sh[:, :1].float(),
+        shN=sh[:, 1:].float(),
+    )
+
+
+def feature_to_gaussians(features: FeatureGaussians) -> Gaussians:
+    """One Gaussian per Feature Gaussian (K = 1)."""
+    return to_gaussians(
+        features.covars.double().numpy(),
+        (features.extinctions * features.gains).double().numpy(),
+        features.spreads.double().numpy(),
+        features.means,
+        torch.cat([features.sh0, features.shN], 1),
+    )
+
+
+def num_tasks(rows: int) -> int:
+    """How many pieces of work ``rows`` groups make."""
+    return max(1, min(available_threads(), rows // ROWS_PER_TASK))

@@ -1,0 +1,63 @@
+"""The input photos with their cameras, at full or reduced size, as the stages that render against them want them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gsmerge.threads import parallel_map
+from gsmerge.types import PixelScene
+
+EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
+
+
+@dataclass(frozen=True)
+class Photos:
+    """V photos of one size.
+
+    Args:
+        images: ``[v,h,w,3]`` float32, sRGB in [0, 1].
+        viewmats: ``[v,4,4]`` world to camera.
+        Ks: ``[v,3,3]`` intrinsics at this size.
+        eps2d: Low-pass variance in square pixels of this size: it stays that of the full-size image, so that
+            scales are judged against the filter that they will be rendered with.
+    """
+
+    images: np.ndarray
+    viewmats: np.ndarray
+    Ks: np.ndarray
+    eps2d: float
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return self.images.shape[1]
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return self.images.shape[2]
+
+
+def scene_photos(scene: PixelScene, level: int = 1) -> Photos:
+    """The scene's photos, each side divided by ``level`` (area averages).
+
+    Raises:
+        ValueError: If the scene has no images.
+    """
+    if scene.images is None:
+        raise ValueError("expected a scene with images")
+    images = scene.images.numpy()
+    viewmats, Ks = scene.cameras.viewmats.double().numpy(), scene.cameras.Ks.double().numpy()
+    if level == 1:
+        return Photos(images, viewmats, Ks, EPS2D)
+    h, w = images.shape[1:3]
+    size = max(1, round(w / level)), max(1, round(h / level))
+    small = np.stack(parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images))
+    sx, sy = size[0] / w, size[1] / h
+    return Photos(small, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
