@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gsmerge.io import read_scene as read_scene
     from gsmerge.io import to_cameras as to_cameras
     from gsmerge.io import write_ply as write_ply
-    from gsmerge.pipeline import CompactOptions as CompactOptions
+    from gsmerge.options import CompactOptions as CompactOptions
     from gsmerge.pipeline import CompactReport as CompactReport
     from gsmerge.pipeline import CompactResult as CompactResult
     from gsmerge.pipeline import compact as compact
@@ -43,7 +43,8 @@ _HOMES = {
     "errors": ("GsmergeError", "SceneError"),
     "inspect": ("inspect",),
     "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_ply"),
-    "pipeline": ("CompactOptions", "CompactReport", "CompactResult", "compact"),
+    "options": ("CompactOptions",),
+    "pipeline": ("CompactReport", "CompactResult", "compact"),
     "render": ("Rendering", "render"),
     "segment": ("saliency", "superpixels"),
     "types": ("Cameras", "Gaussians", "PixelScene"),

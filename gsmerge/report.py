@@ -40,27 +40,37 @@ def _digest(file: Any) -> str:
     return state.hexdigest()
 
 
-def report_document(report: Any, *, input_path: Path, output_path: Path, seconds: Mapping[str, float]) -> dict[str, Any]:
+def report_document(
+    report: Any,
+    *,
+    input_path: Path,
+    output_path: Path,
+    seconds_before: Mapping[str, float],
+    seconds_after: Mapping[str, float],
+    hashed: bool = True,
+) -> dict[str, Any]:
     """The report of one ``compact`` as plain JSON types.
 
     Args:
         report: The :class:`gsmerge.CompactReport`.
-        input_path: The ``.ply`` that was read; hashed here.
+        input_path: The ``.ply`` that was read.
         output_path: The ``.ply`` that was written.
-        seconds: Wall time of the stages outside the report (imports, reading, writing), by name.
+        seconds_before: Wall time by name of what came before the report's stages (imports, reading).
+        seconds_after: The same for what came after them (writing).
+        hashed: Also hash the input, which takes time on large files.
 
     Returns:
         ``schema_version`` 1: tool, input, output, ratio, options, seed, choices, seconds, psnr, memory, notes.
         Keys are only ever added within one schema version.
     """
     numbers = asdict(report) if is_dataclass(report) and not isinstance(report, type) else dict(report)
-    stages = {**seconds, **numbers["seconds"]}
+    stages = {**seconds_before, **numbers["seconds"], **seconds_after}
     return {
         "schema_version": SCHEMA_VERSION,
         "tool": {"name": "gsmerge", "version": __version__},
         "input": {
             "path": os.fspath(input_path),
-            "sha256": file_sha256(input_path),
+            "sha256": file_sha256(input_path) if hashed else None,
             "bytes": input_path.stat().st_size,
             "num_gaussians": numbers["num_input"],
         },
@@ -122,36 +132,101 @@ def human_bytes(count: float) -> str:
     return f"{count:.1f} GB"
 
 
-def estimate(
-    num_gaussians: int, num_views: int, height: int, width: int, options: Mapping[str, Any], *, images: bool, threads: int
+def plan_document(
+    files: Mapping[str, str | None],
+    grid: tuple[int, int, int],
+    options: Mapping[str, Any],
+    *,
+    output_path: Path,
+    per_view: int,
+    photos: bool,
+    threads: int,
 ) -> dict[str, Any]:
-    """What a run will make of a scene, before it is read.
+    """What a run would make of a scene, and an estimate of its time and memory.
 
     Args:
-        num_gaussians: Rows of the input.
-        num_views: Views.
-        height: Image height, pixels.
-        width: Image width, pixels.
-        options: Flat resolved options, as of ``CompactOptions.to_dict()``.
-        images: Whether photos are there; robust merging and the colour fit need them.
-        threads: Threads that will run.
+        files: Paths of the ``ply``, the ``cameras`` and the ``images``.
+        grid: Views, height and width of the Gaussian grid.
+        options: All settings by flat name, as of ``CompactOptions.to_dict()``.
+        output_path: The ``.ply`` that would be written.
+        per_view: Superpixels per view.
+        photos: Whether the scene has photos; robust merging and the colour fit need them.
+        threads: Threads that would run.
 
     Returns:
-        ``superpixels_per_view``, ``num_output_at_most``, ``seconds`` and ``memory_bytes``; the last two hold
-        within a factor of about two on a common processor, kernels already compiled.
+        ``schema_version`` 1: the plan; ``estimate`` holds within a factor of about two on a common processor once
+        the kernels are compiled.
     """
-    million = num_views * height * width / 1e6
-    per_view = options.get("superpixels") or max(1, round(options["density"] * height * width))
-    seconds = million * (COST_READ + COST_MERGE + COST_SEGMENT.get(options["preset"], COST_SEGMENT["best"]))
-    robust = bool(options["robust"]) and images and num_views >= 3
-    fitted = options["fit"] != "none" and images
-    seconds += million * (COST_ROBUST * robust + COST_FIT * fitted)
-    pixels = num_views * height * width if images else 0
+    views, height, width = grid
+    pixels = views * height * width
+    robust = bool(options["robust"]) and photos and views >= 3
+    fit = options["fit"] if photos else "none"
+    work = COST_READ + COST_MERGE + COST_SEGMENT.get(options["preset"], COST_SEGMENT["best"])
+    work += COST_ROBUST * robust + COST_FIT * (fit != "none")
+    memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
+        "schema_version": SCHEMA_VERSION,
+        "tool": {"name": "gsmerge", "version": __version__},
+        "dry_run": True,
+        "input": {**files, "num_gaussians": pixels, "num_views": views, "height": height, "width": width},
+        "output": {
+            "path": os.fspath(output_path),
+            "num_gaussians_at_most": min(pixels, per_view * views * options["k"]),
+        },
         "superpixels_per_view": per_view,
-        "num_output_at_most": min(num_gaussians, per_view * num_views * options["k"]),
         "robust": robust,
-        "fit": options["fit"] if fitted else "none",
-        "seconds": round(COST_FIXED + seconds / min(threads, num_views), 1),
-        "memory_bytes": BYTES_FIXED + BYTES_PER_GAUSSIAN * num_gaussians + BYTES_PER_PIXEL * pixels,
+        "fit": fit,
+        "estimate": {
+            "seconds": round(COST_FIXED + pixels / 1e6 * work / min(threads, views), 1),
+            "memory_bytes": memory,
+        },
+        "options": dict(options),
     }
+
+
+def plan_lines(plan: Mapping[str, Any]) -> list[str]:
+    """The plan for people."""
+    found, guess = plan["input"], plan["estimate"]
+    return [
+        f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",
+        f"would write  {plan['output']['path']}: at most {plan['output']['num_gaussians_at_most']:,} Gaussians",
+        f"superpixels  {plan['superpixels_per_view']:,} per view, {plan['options']['k']} Gaussian(s) each",
+        f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
+        f" across views: {plan['options']['match']}",
+        f"fit          {plan['fit']}",
+        f"estimate     about {guess['seconds']:.0f} s, {human_bytes(guess['memory_bytes'])} of memory",
+    ]
+
+
+def inspection_lines(found: Mapping[str, Any]) -> list[str]:
+    """What ``gsmerge.inspect`` found, for people.
+
+    Args:
+        found: ``Inspection.to_dict()``.
+    """
+    parts = ", ".join(f"{name} {human_bytes(size)}" for name, size in found["bytes_by_attribute"].items())
+    extras = [*found["extra_columns"], *(f"element {name}" for name in found["extra_elements"])]
+    low, high = (" ".join(f"{value:.4g}" for value in found[key]) for key in ("box_low", "box_high"))
+    cameras = found["cameras"] and f"{found['cameras']}: {found['num_views']} ({found['camera_format']})"
+    alignment = found["alignment"]
+    lines = [
+        f"file       {found['path']}: {human_bytes(found['bytes'])} ({parts})",
+        f"layout     {found['layout']}, {found['format']}; opacity stored {_ENCODINGS[found['opacity_encoding']]}",
+        f"ignored    {', '.join(extras)}" if extras else "",
+        f"Gaussians  {found['count']:,}: {found['num_nonfinite']} not finite, {found['num_transparent']:,} transparent,"
+        f" {found['num_opaque']:,} opaque",
+        f"extent     {low}  to  {high}  (1 % to 99 %)",
+        f"cameras    {cameras or 'none found'}",
+        f"images     {found['images'] or 'none found'}",
+    ]
+    if found["alignment_problem"] is not None:
+        lines.append(f"alignment  not one Gaussian per pixel: {found['alignment_problem']}")
+    elif alignment is not None:
+        lines.append(
+            f"alignment  one Gaussian per pixel, {found['num_views']} x {found['height']} x {found['width']};"
+            f" median offset {max(alignment['median_px']):.2f} px in the worst view"
+        )
+    return [line for line in lines if line] + [f"note       {note}" for note in found["notes"]]
+
+
+_ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}

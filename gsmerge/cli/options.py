@@ -52,7 +52,7 @@ class Opacity(str, Enum):
 
     auto = "auto"
     logit = "logit"
-    linear = "linear"
+    raw = "raw"
 
 
 def debug_wanted() -> bool:
@@ -67,6 +67,7 @@ def set_debug(value: bool) -> bool:
 
 
 _state = {"debug": False}
+
 
 SceneArgument = Annotated[
     Path, typer.Argument(metavar="SCENE", help="A .ply with one Gaussian per pixel and view, or the folder it is in.")
@@ -85,7 +86,10 @@ ImagesOption = Annotated[
 ]
 OpacityOption = Annotated[
     Opacity,
-    typer.Option(help="How the file stores opacity; auto looks at the values.", rich_help_panel=INPUT),
+    typer.Option(
+        help="How the file stores opacity: as logits, or raw in [0, 1]; auto looks at the values.",
+        rich_help_panel=INPUT,
+    ),
 ]
 SuperpixelsOption = Annotated[
     int | None,
@@ -93,9 +97,7 @@ SuperpixelsOption = Annotated[
 ]
 DensityOption = Annotated[
     float | None,
-    typer.Option(
-        min=0.0, max=1.0, help="Superpixels per pixel.", show_default="{density}", rich_help_panel=SEGMENTATION
-    ),
+    typer.Option(min=0.0, max=1.0, help="Superpixels per pixel.", show_default="0.01", rich_help_panel=SEGMENTATION),
 ]
 MethodOption = Annotated[
     Method | None,
@@ -104,6 +106,43 @@ MethodOption = Annotated[
 PresetOption = Annotated[
     Preset | None,
     typer.Option(help="Effort of rdseg.", show_default="default", rich_help_panel=SEGMENTATION),
+]
+KOption = Annotated[
+    int | None,
+    typer.Option(
+        "--k",
+        min=1,
+        max=8,
+        help="Gaussians per superpixel: finer with more.",
+        show_default="1",
+        rich_help_panel=MERGING,
+    ),
+]
+RobustOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--robust/--no-robust",
+        help="Choose among merges by what the photos say; needs three views.",
+        show_default="robust",
+        rich_help_panel=MERGING,
+    ),
+]
+MatchOption = Annotated[
+    Match | None, typer.Option(help="Merging across views.", show_default="overlap", rich_help_panel=MERGING)
+]
+FitOption = Annotated[
+    Fit | None, typer.Option(help="What to fit to the photos.", show_default="color", rich_help_panel=MERGING)
+]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="The compact .ply.", show_default="SCENE.compact.ply", rich_help_panel=OUTPUT),
+]
+SeedOption = Annotated[
+    int | None, typer.Option(min=0, help="Seed of everything random.", show_default="0", rich_help_panel=OUTPUT)
+]
+ReportOption = Annotated[Path | None, typer.Option(help="Write the JSON report to this file.", rich_help_panel=OUTPUT)]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="Print plan, time and memory; write nothing.", rich_help_panel=OUTPUT)
 ]
 ThreadsOption = Annotated[
     int | None,

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
+
+if TYPE_CHECKING:
+    from gsmerge.io import CameraFile, SceneFiles
 
 
 def default_output(ply: Path) -> Path:
@@ -45,3 +49,16 @@ def check_folder(folder: Path, *, overwrite: bool) -> None:
         raise SceneError(folder, f"cannot be written ({error.strerror})", "name another with --output") from error
     if occupied and not overwrite:
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")
+
+
+def cameras_of(files: SceneFiles) -> CameraFile:
+    """The cameras found with a scene.
+
+    Raises:
+        SceneError: If none were found, or they cannot be read.
+    """
+    from gsmerge.io import read_cameras
+
+    if files.cameras is None:
+        raise SceneError(files.ply, "no cameras found beside it", "name them with --cameras")
+    return read_cameras(files.cameras)

@@ -1,0 +1,31 @@
+"""Files: the only place that knows their formats."""
+
+from gsmerge.io.alignment import Alignment, check_alignment
+from gsmerge.io.atomic import atomic_output
+from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
+from gsmerge.io.images import read_images
+from gsmerge.io.ply import PlyInfo, PlyScene, read_ply
+from gsmerge.io.ply_writer import write_ply
+from gsmerge.io.scene import SceneLoad, align_scene, load_scene, read_photos, read_scene
+from gsmerge.io.scene_files import SceneFiles, find_scene_files
+
+__all__ = [
+    "Alignment",
+    "CameraFile",
+    "PlyInfo",
+    "PlyScene",
+    "SceneFiles",
+    "SceneLoad",
+    "align_scene",
+    "atomic_output",
+    "check_alignment",
+    "find_scene_files",
+    "load_scene",
+    "read_cameras",
+    "read_images",
+    "read_photos",
+    "read_ply",
+    "read_scene",
+    "to_cameras",
+    "write_ply",
+]

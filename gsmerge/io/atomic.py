@@ -12,7 +12,7 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 
 # What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
-_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+_DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS}
 
 
 @contextmanager
@@ -41,17 +41,17 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         _refuse(path, overwrite)  # somebody else may have been quicker
         temporary.replace(path)
     except OSError as error:
-        if error.errno not in _DISK_ERRORS:
+        if error.errno not in _DISK_ERRORS and error.filename != str(temporary):
             raise
-        raise SceneError(path, f"could not be written ({error.strerror})", "free some space") from error
+        raise SceneError(path, f"could not be written ({error.strerror})") from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def _refuse(path: Path, overwrite: bool) -> None:
-    if path.is_dir():
+    if os.path.isdir(path):
         raise SceneError(path, "expected a file to write, found a folder", "name a file in it")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         raise SceneError(path, f"the folder {path.parent} does not exist", "make it first")
-    if path.exists() and not overwrite:
+    if os.path.lexists(path) and not overwrite:
         raise SceneError(path, "exists already", "choose another name or allow overwriting")

@@ -1,33 +1,35 @@
-"""Gaussian splats in PLY files: the only place that knows log scales, logits and channel-major harmonics."""
+"""Reading Gaussian splats from PLY: log scales, logits and channel-major harmonics end here."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError
-from gsmerge.io.atomic import atomic_output
+from gsmerge.io.ply_layout import (
+    BLOCK_BYTES,
+    LOGIT_COMMENT,
+    MAX_LOG_SCALE,
+    MEANS,
+    NORMALS,
+    QUATS,
+    REQUIRED,
+    SCALES,
+    SH0,
+    bytes_by_attribute,
+    layout_name,
+    sh_degree,
+)
 from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
 OpacityChoice = Literal["auto", "logit", "raw"]
-
-MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
-MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
-LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
-
-_MEANS, _NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
-_SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALES = ("scale_0", "scale_1", "scale_2")
-_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REQUIRED = (*_MEANS, *_SH0, "opacity", *_SCALES, *_QUATS)
-_BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache while every column is taken
 
 
 @dataclass(frozen=True)
@@ -105,26 +107,26 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     num_rest = _num_rest(path, vertex)
     rows = np.asarray(vertex.data)
     out = _allocate(rows, num_rest // 3)
-    size = max(1, _BLOCK_BYTES // rows.dtype.itemsize)
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
     blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
     done = parallel_map(lambda block: _convert(rows[block], {k: v[block] for k, v in out.items()}), blocks)
 
     encoding = _encoding(opacity, data, done)
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _set_aside(path, out)
-    used = {*_REQUIRED, *_NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    used = {*REQUIRED, *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
     extra = tuple(name for name in names if name not in used)
     info = PlyInfo(
         path=str(path),
-        layout=_layout(names, num_rest),
+        layout=layout_name(names, num_rest),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
         count=len(rows),
         file_bytes=path.stat().st_size,
-        bytes_by_attribute=_bytes_by_attribute(rows, extra),
+        bytes_by_attribute=bytes_by_attribute(rows, extra),
         columns=names,
         extra_columns=extra,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
-        sh_degree=_degree(num_rest),
+        sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
         num_nonfinite=num_bad,
         num_clipped_scales=sum(d.num_clipped for d in done),
@@ -135,15 +137,14 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
 
 
 def _open(path: Path) -> PlyData:
-    if path.is_dir():
+    if os.path.isdir(path):
         raise SceneError(path, "expected a .ply file, found a folder")
     try:
         with path.open("rb") as file:
             start = file.read(4)
-            if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
-                raise SceneError(path, "expected a PLY file, found one that does not start with the line 'ply'")
-            file.seek(0)
-            return PlyData.read(file, mmap="r")
+        if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
+            raise SceneError(path, "expected a PLY file, found one that does not start with the line 'ply'")
+        return PlyData.read(str(path), mmap="r")
     except FileNotFoundError as error:
         raise SceneError(path, "no such file") from error
     except OSError as error:
@@ -155,7 +156,7 @@ def _open(path: Path) -> PlyData:
             path, f"truncated or damaged: expected {promise}, found {row or 0} whole ones ({error.message})"
         ) from error
     except (PlyParseError, ValueError, MemoryError) as error:
-        raise SceneError(path, f"expected a readable PLY header, found a damaged one ({error})") from error
+        raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
 
 def _vertex(path: Path, data: PlyData) -> PlyElement:
@@ -164,14 +165,14 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
         raise SceneError(path, f"expected an element 'vertex', found {found}")
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties if not isinstance(p, PlyListProperty)}
-    missing = [name for name in _REQUIRED if name not in columns]
+    missing = [name for name in REQUIRED if name not in columns]
     if missing:
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
             remedy = "it is compressed: convert it to an ordinary .ply first"
         elif missing == ["scale_2"]:
             remedy = "flat 2D Gaussians need a scale_2 column of their own"
-        elif len(missing) < len(_REQUIRED) // 2:
+        elif len(missing) < len(REQUIRED) // 2:
             remedy = "export it again with them"
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
     if vertex.count == 0:
@@ -190,32 +191,9 @@ def _num_rest(path: Path, vertex: PlyElement) -> int:
     return len(names)
 
 
-def _degree(num_rest: int) -> int:
-    return round((num_rest / 3 + 1) ** 0.5) - 1
-
-
-def _layout(names: tuple[str, ...], num_rest: int) -> str:
-    normals = set(_NORMALS) <= set(names)
-    if num_rest == 0:
-        return "17-column export" if normals else "14-column export (no normals)"
-    return f"INRIA, SH degree {_degree(num_rest)}" + ("" if normals else " (no normals)")
-
-
-def _bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
-    groups = {"means": _MEANS, "normals": _NORMALS, "sh0": _SH0, "opacities": ("opacity",)}
-    groups |= {"scales": _SCALES, "quats": _QUATS, "extra": extra}
-    of = {name: kind for kind, names in groups.items() for name in names}
-    sizes: dict[str, int] = {}
-    assert rows.dtype.names is not None
-    for name in rows.dtype.names:
-        kind = of.get(name, "shN")
-        sizes[kind] = sizes.get(kind, 0) + rows.dtype[name].itemsize * len(rows)
-    return sizes
-
-
 def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
     n = len(rows)
-    wide = any(rows.dtype[name] in (np.dtype("<f8"), np.dtype(">f8")) for name in _MEANS)
+    wide = any(rows.dtype[name] in (np.dtype("<f8"), np.dtype(">f8")) for name in MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
     out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
     return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
@@ -241,22 +219,22 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
             np.add(total, column, out=total)
             return column
 
-        for j, name in enumerate(_MEANS):
+        for j, name in enumerate(MEANS):
             column = take(name)
             out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
-        for j, name in enumerate(_SH0):
+        for j, name in enumerate(SH0):
             out["sh0"][:, 0, j] = take(name)
         num_higher = out["shN"].shape[1]
         for channel in range(3):
             for j in range(num_higher):
                 out["shN"][:, j, channel] = take(f"f_rest_{channel * num_higher + j}")
         clipped = np.zeros(len(rows), np.bool_)
-        for j, name in enumerate(_SCALES):
+        for j, name in enumerate(SCALES):
             column = take(name)
             clipped |= np.abs(column) > MAX_LOG_SCALE
             np.clip(column, -MAX_LOG_SCALE, MAX_LOG_SCALE, out=column)
             out["scales"][:, j] = np.exp(column, out=column)
-        quats = [take(name) for name in _QUATS]
+        quats = [take(name) for name in QUATS]
         zero = _normalise(quats, out["quats"])
         out["opacities"][:] = take("opacity")
         valid = np.isfinite(total, out=out["valid"])
@@ -275,9 +253,9 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
 def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
     """Whether rows are usable: all finite, but an infinite logit or a scale of exactly zero is a value."""
     valid = ~np.isnan(rows["opacity"].astype(np.float32))
-    for name in (*_MEANS, *_SH0, *_QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
+    for name in (*MEANS, *SH0, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
         valid &= np.isfinite(rows[name].astype(np.float32))
-    for name in _SCALES:
+    for name in SCALES:
         column = rows[name].astype(np.float32)
         valid &= np.isfinite(column) | (column == -np.inf)
     return valid
@@ -338,64 +316,3 @@ def _set_aside(path: Path, out: dict[str, np.ndarray]) -> int:
     for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
         out[name][bad] = value
     return len(bad)
-
-
-def write_ply(
-    path: str | os.PathLike[str],
-    gaussians: Gaussians,
-    *,
-    overwrite: bool = False,
-    sh_degree: int | None = None,
-) -> None:
-    """Write Gaussians in INRIA's column order, binary little-endian float32.
-
-    Opacities become finite logits (within +-16), scales finite logarithms (within +-30), quaternions unit ones.
-
-    Args:
-        path: The file; complete or not there at all.
-        gaussians: Finite values.
-        overwrite: Replace an existing file.
-        sh_degree: Drop harmonics above this degree; None keeps all.
-
-    Raises:
-        SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, or fewer harmonics than asked for.
-    """
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    if not 0 <= degree <= gaussians.sh_degree:
-        raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
-    num_higher = (degree + 1) ** 2 - 1
-    names = [*_MEANS, *_NORMALS, *_SH0, *(f"f_rest_{i}" for i in range(3 * num_higher))]
-    names += ["opacity", *_SCALES, *_QUATS]
-    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}", f"element vertex {len(gaussians)}"]
-    header += [*(f"property float {name}" for name in names), "end_header", ""]
-    block = max(1, _BLOCK_BYTES // (4 * len(names)))
-    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        for start in range(0, len(gaussians), block):
-            rows = _stored(gaussians[start : start + block], num_higher)
-            if not np.isfinite(rows).all():
-                raise ValueError(f"expected finite Gaussians, got NaN or inf in rows from {start}")
-            file.write(rows.data)
-
-
-def _stored(part: Gaussians, num_higher: int) -> np.ndarray:
-    """``[m,columns]`` values as the file holds them."""
-
-    def array(tensor: torch.Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:
-        return tensor.detach().cpu().double().numpy()
-
-    rows = np.zeros((len(part), 17 + 3 * num_higher), "<f4")
-    rows[:, :3] = array(part.means)
-    rows[:, 6:9] = array(part.sh0)[:, 0]
-    last = 9 + 3 * num_higher
-    rows[:, 9:last] = array(part.shN)[:, :num_higher].transpose(0, 2, 1).reshape(len(part), -1)
-    with np.errstate(divide="ignore"):  # opacities 0 and 1, scales of 0: clipped below
-        opacities = array(part.opacities)
-        rows[:, last] = np.clip(np.log(opacities) - np.log1p(-opacities), -MAX_LOGIT, MAX_LOGIT)
-        rows[:, last + 1 : last + 4] = np.clip(np.log(array(part.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
-    quats = array(part.quats)
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    quats = np.where(length > 0, quats, (1.0, 0.0, 0.0, 0.0)) / np.where(length > 0, length, 1)
-    rows[:, last + 4 :] = quats
-    return rows

@@ -12,6 +12,7 @@ from gsmerge.kernels.jit import kernel
 # Cuts wait in buckets by the exponent and three mantissa bits of their gain: nearly best first, at O(1) a step.
 NUM_BUCKETS = 2048
 BUCKET_SHIFT = 20
+CUT, NEXT = 4, 5  # columns of a rectangle's row after y0, x0, y1, x1: its best cut (row, or minus column), its list
 
 
 @kernel
@@ -74,21 +75,33 @@ def cut_gain(integral, near, far, step, side, num_pixels, compactness):
 
 
 @kernel
-def _enqueue(node, integral, stride, compactness, limit, rectangles, cuts, gains, heads, following):
-    """Find the best cut of a rectangle and put it in its bucket, ``limit`` or below; single pixels are left out."""
-    y0, x0, y1, x1 = rectangles[node]
+def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, heads, gain, gain_bits):
+    """Store a rectangle with its best cut, in the bucket of the cut's gain or ``limit``; single pixels wait nowhere.
+
+    A cut below another waits for it anyway, so its bucket never needs to be above the one being emptied.
+    """
     height, width = y1 - y0, x1 - x0
     num_pixels = float(height) * width
     near = y0 * stride + x0
     gain_y, cut_y = cut_gain(integral, near, near + width, stride, height, num_pixels, compactness)
     gain_x, cut_x = cut_gain(integral, near, near + height * stride, 1, width, num_pixels, compactness)
-    gains[node] = max(gain_y, gain_x)
-    # A cut below another waits for it anyway, so its bucket never needs to be above the one being emptied.
-    cuts[node] = -(y0 + cut_y) if gain_y >= gain_x else x0 + cut_x
-    if gains[node] >= 0:
-        bucket = min(limit, gains.view(np.int32)[node] >> BUCKET_SHIFT)
-        following[node] = heads[bucket]
+    nodes[node, 0], nodes[node, 1], nodes[node, 2], nodes[node, 3] = y0, x0, y1, x1
+    nodes[node, CUT] = y0 + cut_y if gain_y >= gain_x else -(x0 + cut_x)
+    gain[0] = max(gain_y, gain_x)
+    if gain[0] >= 0:
+        bucket = min(limit, gain_bits[0] >> BUCKET_SHIFT)
+        nodes[node, NEXT] = heads[bucket]
         heads[bucket] = node
+
+
+@kernel
+def _paint(nodes, count, height, width):
+    labels = np.full((height + 2, width + 2), -1, np.int32)
+    for node in range(count):
+        for y in range(nodes[node, 0] + 1, nodes[node, 2] + 1):
+            for x in range(nodes[node, 1] + 1, nodes[node, 3] + 1):
+                labels[y, x] = node
+    return labels
 
 
 @kernel
@@ -107,41 +120,32 @@ def split_rectangles(pixels, count, block, compactness):
     height, width, _ = pixels.shape
     integral, stride = integral_image(pixels), width + 1
     num_rows, num_columns = max(1, height // block), max(1, width // block)
-    capacity = max(count, num_rows * num_columns)
-    rectangles = np.empty((capacity, 4), np.int64)
-    cuts, gains, following = np.empty(capacity, np.int64), np.empty(capacity, np.float32), np.empty(capacity, np.int64)
+    nodes = np.empty((max(count, num_rows * num_columns), 8), np.int32)
     heads = np.full(NUM_BUCKETS, -1)
-    num_leaves = 0
+    gain = np.empty(1, np.float32)
+    gain_bits = gain.view(np.int32)
+    num_leaves, bucket = 0, NUM_BUCKETS - 1
     for i in range(num_rows):
+        y0, y1 = i * height // num_rows, (i + 1) * height // num_rows
         for j in range(num_columns):
-            rectangles[num_leaves, 0], rectangles[num_leaves, 2] = i * height // num_rows, (i + 1) * height // num_rows
-            rectangles[num_leaves, 1], rectangles[num_leaves, 3] = j * width // num_columns, (j + 1) * width // num_columns
-            _enqueue(num_leaves, integral, stride, compactness, NUM_BUCKETS - 1, rectangles, cuts, gains, heads, following)
+            x0, x1 = j * width // num_columns, (j + 1) * width // num_columns
+            _enqueue(
+                num_leaves, y0, x0, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, gain_bits
+            )
             num_leaves += 1
-    bucket = NUM_BUCKETS - 1
     while num_leaves < count and bucket >= 0:
         node = heads[bucket]
         if node < 0:
             bucket -= 1
             continue
-        heads[bucket] = following[node]
-        rectangles[num_leaves] = rectangles[node]
-        if cuts[node] < 0:
-            rectangles[node, 2] = rectangles[num_leaves, 0] = -cuts[node]
-        else:
-            rectangles[node, 3] = rectangles[num_leaves, 1] = cuts[node]
-        _enqueue(node, integral, stride, compactness, bucket, rectangles, cuts, gains, heads, following)
-        _enqueue(num_leaves, integral, stride, compactness, bucket, rectangles, cuts, gains, heads, following)
+        heads[bucket] = nodes[node, NEXT]
+        y0, x0, y1, x1 = np.int64(nodes[node, 0]), np.int64(nodes[node, 1]), np.int64(nodes[node, 2]), np.int64(nodes[node, 3])
+        cut = np.int64(nodes[node, CUT])
+        end_y, end_x = (cut, x1) if cut >= 0 else (y1, -cut)  # of the first part
+        start_y, start_x = (cut, x0) if cut >= 0 else (y0, -cut)  # of the second
+        _enqueue(node, y0, x0, end_y, end_x, bucket, integral, stride, compactness, nodes, heads, gain, gain_bits)
+        _enqueue(
+            num_leaves, start_y, start_x, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, gain_bits
+        )
         num_leaves += 1
-    return _paint(rectangles[:num_leaves], height, width), num_leaves
-
-
-@kernel
-def _paint(rectangles, height, width):
-    labels = np.full((height + 2, width + 2), -1, np.int32)
-    for node in range(len(rectangles)):
-        y0, x0, y1, x1 = rectangles[node]
-        for y in range(y0 + 1, y1 + 1):
-            for x in range(x0 + 1, x1 + 1):
-                labels[y, x] = node
-    return labels
+    return _paint(nodes, num_leaves, height, width), num_leaves

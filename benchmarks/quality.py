@@ -1,0 +1,85 @@
+"""Quality on real scenes: visible PSNR and SSIM of held-out views, unmerged, paper's moment matching, and ours.
+
+    python benchmarks/quality.py eval                       # defaults
+    python benchmarks/quality.py fox,fern --set k=2 density=0.01 robust=false
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from shared_scenes import Targets, export, read_targets, scene_folders
+
+import gsmerge
+from gsmerge.metrics import psnr, ssim
+from gsmerge.types import Gaussians
+
+PAPER = {"rule": "paper", "robust": False, "match": "none", "fit": "none", "prune": 0.0, "min_opacity": 0.0}
+
+
+def score(gaussians: Gaussians, targets: Targets) -> tuple[float, float]:
+    """Mean PSNR (dB) and SSIM over the visible pixels of all target views."""
+    images = gsmerge.render(gaussians, targets.cameras).images.numpy().clip(0, 1)
+    values = [
+        (psnr(a, b, mask), ssim(a, b, mask)) for a, b, mask in zip(images, targets.images, targets.masks, strict=True)
+    ]
+    return tuple(np.mean(values, 0))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scenes", help="train, eval, or names with commas between")
+    parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
+    parser.add_argument("--paper", action="store_true", help="also the paper's moment matching")
+    parser.add_argument("--ply", help="also a .ply of another tool; {scene} stands for the scene's name")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
+    args = parser.parse_args()
+    settings = {k: _value(v) for k, v in (s.split("=") for s in args.set)}
+    rows = []
+    for folder in scene_folders(args.scenes):
+        scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_targets(folder)
+        row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets)}
+        if args.paper:
+            row["paper"] = score(gsmerge.compact(scene, density=0.044, **PAPER).gaussians, targets)
+        if args.ply:
+            row["other"] = score(gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians, targets)
+        start = time.perf_counter()
+        result = gsmerge.compact(scene, **settings)
+        seconds = time.perf_counter() - start
+        row["gsmerge"] = score(result.gaussians, targets)
+        row["count"] = f"{len(result.gaussians)} ({100 * len(result.gaussians) / len(scene.gaussians):.2f} %)"
+        report = result.report
+        row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
+        row["seconds"] = f"{seconds:.1f}"
+        row["choice"] = report.choices.get("merge", "-")
+        row["fit"] = report.choices.get("fit")
+        row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
+        print(json.dumps({k: _short(v) for k, v in row.items()}), flush=True)
+        rows.append(row)
+    for name in ("unmerged", "paper", "other", "gsmerge"):
+        if name in rows[0]:
+            print(f"mean {name:9s} {np.mean([r[name] for r in rows], 0).round(3)}")
+
+
+def _value(text: str) -> object:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _short(value: object) -> object:
+    if isinstance(value, tuple):
+        return f"{value[0]:.2f} / {value[1]:.3f}"
+    if isinstance(value, dict):
+        return {k: round(v, 3) if isinstance(v, float) else v for k, v in value.items()}
+    return value
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,25 @@
+"""``gsmerge inspect``: what was recognised."""
+
+from __future__ import annotations
+
+import sys
+
+from gsmerge.cli import options as opt
+
+
+def inspect(
+    scene: opt.SceneArgument,
+    cameras: opt.CamerasOption = None,
+    images: opt.ImagesOption = None,
+    json: opt.JsonOption = False,
+    debug: opt.DebugOption = False,
+) -> None:
+    """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
+    from gsmerge.inspect import inspect as inspect_scene
+    from gsmerge.report import inspection_lines, to_json
+
+    found = inspect_scene(scene, cameras=cameras, images=images).to_dict()
+    if json:
+        sys.stdout.write(to_json(found))
+    else:
+        print("\n".join(inspection_lines(found)))

@@ -1,0 +1,235 @@
+"""gaussians -> fitted gaussians: colours that reproduce the input photos best.
+
+With geometry, opacity and order fixed, every pixel is linear in the colours, so the best ones solve a sparse
+linear system whose matrix is one splat and one transposed splat; a few preconditioned conjugate-gradient steps do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+
+from gsmerge.photos import Photos
+from gsmerge.render import Splats, ViewPlan, composite, contributions, plan_view, prepare, splat_adjoint
+from gsmerge.threads import parallel_map
+from gsmerge.types import SH_C0, Gaussians
+
+Fit = Literal["none", "color"]
+BLOCK = 32  # pixels of the full-size image
+MAX_RETRIES = 2
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What is fitted to the photos.
+
+    Args:
+        fit: ``"color"``: the base colours; ``"none"``: nothing.
+        fit_level: Photos are reduced by this factor on each side for the fit.
+        iterations: Conjugate-gradient steps.
+        pull: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
+        huber: Colour error beyond which a pixel counts less (moving things, reflections).
+        max_gain: Largest exposure difference between views that is compensated, as a factor.
+        holdout: Share of the photos' blocks that decides whether the fit is accepted.
+        prune: Leave out Gaussians that contribute less than this to every pixel of every photo that they lie in.
+    """
+
+    fit: Fit = "color"
+    fit_level: int = 2
+    iterations: int = 6
+    pull: float = 0.05
+    huber: float = 0.2
+    max_gain: float = 1.6
+    holdout: float = 0.1
+    prune: float = 1 / 255
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What the fit did: PSNR (dB) on the held-out blocks with the colours before and after, pull used (0: none)."""
+
+    accepted: bool
+    holdout_before: float
+    holdout_after: float
+    pull: float
+
+
+@dataclass(frozen=True)
+class _System:
+    """Per view: plan, photo minus prior render, prior render, pixel weights ``[h,w]``, exposure gain ``[3]``."""
+
+    plans: list[ViewPlan]
+    photos: np.ndarray
+    priors: list[np.ndarray]
+    weights: list[np.ndarray]
+    gains: np.ndarray
+
+
+def plan_photos(splats: Splats, photos: Photos) -> list[ViewPlan]:
+    """Project, sort and bin the Gaussians for every photo."""
+
+    def one_view(view: int) -> ViewPlan:
+        return plan_view(
+            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
+        )
+
+    return parallel_map(one_view, range(len(photos)))
+
+
+def prune_unseen(gaussians: Gaussians, plans: list[ViewPlan], least: float) -> torch.Tensor:
+    """Mask of the Gaussians worth keeping: those that show somewhere, or lie in no photo's frustum at all."""
+    peak, inside = np.zeros(len(gaussians)), np.zeros(len(gaussians), bool)
+    for plan, (_, view_peak) in zip(plans, parallel_map(contributions, plans), strict=True):
+        np.maximum(peak, view_peak, out=peak)
+        inside[plan.ids] = True
+    return torch.from_numpy(~inside | (peak >= least))
+
+
+def fit_colors(gaussians: Gaussians, photos: Photos, options: FitOptions, seed: int = 0) -> tuple[Gaussians, FitReport]:
+    """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
+
+    Args:
+        gaussians: Geometry and opacities stay as they are; higher SH stay too.
+        photos: The input views.
+        options: The solver's settings.
+        seed: Chooses the held-out blocks.
+
+    Returns:
+        The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
+    """
+    plans = plan_photos(prepare(gaussians), photos)
+    priors = parallel_map(lambda plan: composite(plan)[0], plans)
+    train = [_blocks(photos, view, options, seed) for view in range(len(photos))]
+    plain = _System(plans, photos.images, priors, train, np.ones((len(photos), 3)))
+    before = _holdout_psnr(plain, train, None)
+    pull = options.pull
+    for _ in range(1 + MAX_RETRIES):
+        system, offsets = _solve(plain, options, pull)
+        after = _holdout_psnr(plain, train, offsets)
+        if after > before:
+            offsets = _finish(system, offsets, options, pull)
+            return replace(gaussians, sh0=_clamped(gaussians, offsets)), FitReport(True, before, after, pull)
+        pull *= 8
+    return gaussians, FitReport(False, before, after, 0.0)
+
+
+def _blocks(photos: Photos, view: int, options: FitOptions, seed: int) -> np.ndarray:
+    """``[h,w]`` float32, 0 on the held-out blocks of a view and 1 elsewhere."""
+    size = max(2, round(BLOCK * (photos.eps2d / 0.3) ** 0.5))
+    rows, columns = -(-photos.height // size), -(-photos.width // size)
+    keep = np.random.default_rng([seed, view]).random((rows, columns)) >= options.holdout
+    full = np.repeat(np.repeat(keep, size, 0), size, 1)[: photos.height, : photos.width]
+    return full.astype(np.float32)
+
+
+def _holdout_psnr(system: _System, train: list[np.ndarray], offsets: np.ndarray | None) -> float:
+    """PSNR (dB) on the held-out blocks, without any exposure gain: as the result will be looked at."""
+
+    def one_view(view: int) -> tuple[float, float]:
+        image = system.priors[view]
+        if offsets is not None:
+            image = image + composite(system.plans[view], offsets)[0]
+        error = ((np.clip(image, 0, 1) - system.photos[view]) ** 2).sum(-1)
+        held = train[view] == 0
+        return float(error[held].sum(dtype=np.float64)), float(held.sum())
+
+    error, count = np.sum(parallel_map(one_view, range(len(system.plans))), axis=0)
+    return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+
+
+def _solve(plain: _System, options: FitOptions, pull: float) -> tuple[_System, np.ndarray]:
+    """Offsets ``[n,3]`` of the base colours that fit the training pixels, and the system with its final weights.
+
+    A third of the steps with plain weights; then pixels that still fit badly count less, exposure is compensated,
+    and another third follows.
+    """
+    steps = max(1, options.iterations // 3)
+    offsets = _conjugate_gradients(plain, np.zeros((len(plain.plans[0].splats), 3)), steps, pull)
+    system = _reweighed(plain, plain.weights, offsets, options)
+    return system, _conjugate_gradients(system, offsets, steps, pull)
+
+
+def _finish(system: _System, offsets: np.ndarray, options: FitOptions, pull: float) -> np.ndarray:
+    """The last steps, on all pixels."""
+    everywhere = [np.ones_like(weight) for weight in system.weights]
+    steps = max(1, options.iterations - 2 * (options.iterations // 3))
+    return _conjugate_gradients(_reweighed(system, everywhere, offsets, options), offsets, steps, pull)
+
+
+def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, pull: float) -> np.ndarray:
+    """Jacobi-preconditioned CG on sum |gain (prior + W x) - photo|^2 + pull mass |x|^2, started at ``x``."""
+    mass, r = _residual(system, x)
+    r -= pull * mass * x
+    inverse = 1 / (mass * (1 + pull) + 1e-6)
+    z = inverse * r
+    p, rz = z, (r * z).sum(0)
+    for _ in range(iterations):
+        ap = _normal(system, p) + pull * mass * p
+        step = rz / ((p * ap).sum(0) + 1e-12)
+        x, r = x + step * p, r - step * ap
+        z = inverse * r
+        rz, before = (r * z).sum(0), rz
+        p = z + rz / (before + 1e-12) * p
+    return x
+
+
+def _residual(system: _System, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonal scale ``[n,3]`` and negative gradient ``[n,3]`` of the data term at ``x``."""
+
+    def one_view(view: int) -> np.ndarray:
+        plan, weight = system.plans[view], system.weights[view][..., None]
+        gain = system.gains[view].astype(np.float32)
+        image = system.priors[view] + composite(plan, x)[0]
+        residual = weight * (system.photos[view] - gain * image)
+        sums = splat_adjoint(plan, np.concatenate([residual, weight], -1)).astype(np.float64)
+        return np.concatenate([sums[:, 3:] * gain**2, sums[:, :3] * gain], 1)
+
+    sums = _sum_views(one_view, len(system.plans))
+    return sums[:, :3], sums[:, 3:]
+
+
+def _normal(system: _System, x: np.ndarray) -> np.ndarray:
+    """Normal matrix of the data term times ``x``."""
+
+    def one_view(view: int) -> np.ndarray:
+        plan, gain = system.plans[view], system.gains[view]
+        image = composite(plan, x)[0] * system.weights[view][..., None]
+        return splat_adjoint(plan, image) * gain**2
+
+    return _sum_views(one_view, len(system.plans))
+
+
+def _sum_views(function, count: int) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """Sum of per-view arrays in the order of the views, so that the threads cannot change it."""
+    total = None
+    for part in parallel_map(function, range(count)):
+        total = part.astype(np.float64) if total is None else np.add(total, part, out=total)
+    assert total is not None
+    return total
+
+
+def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: FitOptions) -> _System:
+    """Weights ``base`` times Huber weights from the present residuals, and per-view exposure gains with geometric mean one."""
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        image = system.priors[view] + composite(system.plans[view], x)[0]
+        photo, weight = system.photos[view], base[view][..., None]
+        error = np.sqrt(((photo - image) ** 2).mean(-1))
+        robust = base[view] * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
+        calm = weight * (error < 2 * options.huber)[..., None]
+        ratio = (calm * photo * image).sum((0, 1)) / np.maximum((calm * image * image).sum((0, 1)), 1e-9)
+        return robust, np.clip(ratio, 1 / options.max_gain, options.max_gain)
+
+    weights, gains = zip(*parallel_map(one_view, range(len(system.plans))), strict=True)
+    gains = np.stack(gains)
+    gains /= np.exp(np.log(gains).mean(0))
+    return replace(system, weights=list(weights), gains=gains)
+
+
+def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> torch.Tensor:
+    """New sh0 within a little more than the range of colours."""
+    color = 0.5 + SH_C0 * gaussians.sh0[:, 0].double().numpy() + offsets
+    return torch.from_numpy((np.clip(color, -0.05, 1.05) - 0.5) / SH_C0).float()[:, None]

@@ -1,0 +1,183 @@
+"""What a ``.ply`` and the files around it hold, as plain numbers."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io import Alignment, PlyScene, SceneFiles, align_scene, find_scene_files, read_cameras, read_ply
+from gsmerge.types import Gaussians
+
+_MAX_EXTENT_SAMPLES = 200_000
+_TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # below one step of an 8-bit image; where optical depth is capped
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Everything that was recognised, in plain Python values.
+
+    Args:
+        path: The ``.ply``.
+        layout: Name of the column layout.
+        format: "ascii", "binary little-endian" or "binary big-endian".
+        count: Gaussians in the file.
+        bytes: Size of the file.
+        bytes_by_attribute: Bytes of the rows by attribute.
+        extra_columns: Columns that mean nothing here.
+        extra_elements: Elements beside ``vertex``.
+        sh_degree: 0 to 4.
+        opacity_encoding: "logit" or "raw".
+        box_low: 1 % quantile of the positions per axis, world units.
+        box_high: 99 % quantile of the same.
+        num_nonfinite: Rows with NaN or inf.
+        num_clipped_scales: Gaussians with a scale beyond what a float32 covariance can hold.
+        num_zero_quats: Gaussians without a rotation.
+        num_opaque: Gaussians with an opacity of at least 0.995.
+        num_transparent: Finite Gaussians with an opacity below 1/255.
+        num_views: Cameras, 0 where none were found.
+        width: Of the Gaussian grid, pixels; 0 while it is not verified.
+        height: The same.
+        cameras: Where the cameras are, None where none were found.
+        camera_format: Name of their format.
+        images: Where the images are, None where none were found.
+        alignment: The measured alignment; None if it could not be measured.
+        alignment_problem: Why the scene is not known to have one Gaussian per pixel; None if it has.
+        notes: What was adapted or looks odd, one sentence each.
+    """
+
+    path: str
+    layout: str
+    format: str
+    count: int
+    bytes: int
+    bytes_by_attribute: dict[str, int]
+    extra_columns: tuple[str, ...]
+    extra_elements: tuple[str, ...]
+    sh_degree: int
+    opacity_encoding: str
+    box_low: tuple[float, ...]
+    box_high: tuple[float, ...]
+    num_nonfinite: int
+    num_clipped_scales: int
+    num_zero_quats: int
+    num_opaque: int
+    num_transparent: int
+    num_views: int
+    width: int
+    height: int
+    cameras: str | None
+    camera_format: str | None
+    images: str | None
+    alignment: Alignment | None
+    alignment_problem: str | None
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as dictionaries, lists and plain values, ready for JSON; what is not finite becomes None."""
+        plain: dict[str, Any] = _plain(asdict(self))
+        return plain
+
+
+def inspect(
+    path: str | os.PathLike[str],
+    *,
+    cameras: str | os.PathLike[str] | None = None,
+    images: str | os.PathLike[str] | None = None,
+) -> Inspection:
+    """Say what a scene is made of, and whether it has one Gaussian per pixel of its views.
+
+    Cameras that are missing or do not fit are reported, not raised.
+
+    Args:
+        path: A ``.ply`` or a folder that has one.
+        cameras: Camera file or folder; None looks beside the ``.ply``.
+        images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
+
+    Raises:
+        SceneError: If the ``.ply`` cannot be read, or a named file does not exist.
+    """
+    files = find_scene_files(path, cameras=cameras, images=images)
+    ply = read_ply(files.ply)
+    return Inspection(**_of_ply(ply), **_of_views(ply, files))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _of_ply(ply: PlyScene) -> dict[str, Any]:
+    info = ply.info
+    opacities = ply.gaussians.opacities[ply.valid]
+    low, high = _box(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians)
+    return {
+        "path": info.path,
+        "layout": info.layout,
+        "format": info.format,
+        "count": info.count,
+        "bytes": info.file_bytes,
+        "bytes_by_attribute": info.bytes_by_attribute,
+        "extra_columns": info.extra_columns,
+        "extra_elements": info.extra_elements,
+        "sh_degree": info.sh_degree,
+        "opacity_encoding": info.opacity_encoding,
+        "box_low": low,
+        "box_high": high,
+        "num_nonfinite": info.num_nonfinite,
+        "num_clipped_scales": info.num_clipped_scales,
+        "num_zero_quats": info.num_zero_quats,
+        "num_opaque": int((opacities >= _OPAQUE).sum()),
+        "num_transparent": int((opacities < _TRANSPARENT).sum()),
+    }
+
+
+def _box(gaussians: Gaussians) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    step = -(-len(gaussians) // _MAX_EXTENT_SAMPLES)
+    low, high = np.percentile(gaussians.means[::step].numpy(), (1, 99), axis=0)
+    return tuple(map(float, low)), tuple(map(float, high))
+
+
+def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "num_views": 0,
+        "width": 0,
+        "height": 0,
+        "cameras": None if files.cameras is None else str(files.cameras),
+        "camera_format": None,
+        "images": None if files.images is None else str(files.images),
+        "alignment": None,
+        "alignment_problem": None,
+        "notes": _notes(ply),
+    }
+    camera_file = None
+    try:
+        if files.cameras is not None:
+            camera_file = read_cameras(files.cameras)
+            found |= {"num_views": len(camera_file), "camera_format": camera_file.source}
+        load = align_scene(ply, files, camera_file)
+    except SceneError as error:
+        return found | {"alignment_problem": str(error)}
+    size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
+    return found | size | {"alignment": load.alignment, "notes": (*found["notes"], *load.notes)}
+
+
+def _notes(ply: PlyScene) -> tuple[str, ...]:
+    info = ply.info
+    notes = []
+    if info.opacity_encoding == "raw":
+        notes.append("all opacities lie in [0, 1] and are taken as activated, not as logits")
+    if info.num_nonfinite:
+        notes.append(f"{info.num_nonfinite} rows hold NaN or inf and are set aside")
+    if info.num_clipped_scales:
+        notes.append(f"{info.num_clipped_scales} Gaussians have extreme scales, which are clipped")
+    if info.num_zero_quats:
+        notes.append(f"{info.num_zero_quats} Gaussians have a zero quaternion, taken as the identity")
+    return tuple(notes)

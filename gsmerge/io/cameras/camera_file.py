@@ -1,0 +1,172 @@
+"""What every reader of camera files returns, and the conventions they translate from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.errors import SceneError
+from gsmerge.types import Cameras
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
+
+# How a format stores poses: direction of the matrix, and the camera's axes.
+Convention = tuple[str, str]
+W2C_OPENCV: Convention = ("world-to-camera", "OpenCV")
+C2W_OPENCV: Convention = ("camera-to-world", "OpenCV")
+W2C_OPENGL: Convention = ("world-to-camera", "OpenGL")
+C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
+CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """c pinhole cameras in the order of their file.
+
+    Args:
+        path: The file or folder.
+        viewmats: ``[c,4,4]`` world to camera, OpenCV axes, float64.
+        Ks: ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5).
+        widths: ``[c]`` int64, pixels; 0 where unknown.
+        heights: ``[c]`` int64, pixels; 0 where unknown.
+        names: Image names as the file gives them.
+        source: The format's name.
+        convention: How the format stores poses.
+        images: ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves.
+    """
+
+    path: str
+    viewmats: Tensor
+    Ks: Tensor
+    widths: Tensor
+    heights: Tensor
+    names: tuple[str, ...]
+    source: str
+    convention: Convention = W2C_OPENCV
+    images: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def make_camera_file(
+    path: str | os.PathLike[str],
+    source: str,
+    convention: Convention,
+    poses: np.ndarray | Sequence[np.ndarray],
+    Ks: np.ndarray | Sequence[np.ndarray],
+    sizes: Sequence[tuple[int, int]],
+    names: Sequence[str],
+    images: np.ndarray | None = None,
+) -> CameraFile:
+    """Translate poses to the one convention and check that they are poses of pinhole cameras.
+
+    Args:
+        path: The file, for messages.
+        source: The format's name.
+        convention: How ``poses`` are stored.
+        poses: c matrices, 3x4 or 4x4.
+        Ks: c matrices 3x3, pixels.
+        sizes: (width, height) of each camera, pixels; 0 where unknown.
+        names: Image names.
+        images: ``[c,h,w,3]`` uint8, if the file holds them.
+
+    Raises:
+        SceneError: If there is no camera, a number is not finite, a rotation is none, or a focal length not positive.
+    """
+    if len(poses) == 0:
+        raise SceneError(path, "expected at least one camera, found none")
+    full = np.tile(np.eye(4), (len(poses), 1, 1))
+    for i, pose in enumerate(poses):
+        pose = np.asarray(pose, np.float64)
+        if pose.shape not in ((3, 4), (4, 4)):
+            raise SceneError(path, f"view {names[i]}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
+        full[i, :3] = pose[:3]
+    K = np.asarray(Ks, np.float64).reshape(-1, 3, 3)
+    _check(path, full, K, names)
+    return CameraFile(
+        path=str(path),
+        viewmats=torch.from_numpy(to_viewmats(full, convention)),
+        Ks=torch.from_numpy(K),
+        widths=torch.tensor([w for w, _ in sizes], dtype=torch.int64),
+        heights=torch.tensor([h for _, h in sizes], dtype=torch.int64),
+        names=tuple(names),
+        source=source,
+        convention=convention,
+        images=images,
+    )
+
+
+def _check(path: str | os.PathLike[str], poses: np.ndarray, Ks: np.ndarray, names: Sequence[str]) -> None:
+    for name, pose, K in zip(names, poses, Ks, strict=True):
+        if not (np.isfinite(pose).all() and np.isfinite(K).all()):
+            raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
+        rotation = pose[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 0.02:
+            raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
+        if np.linalg.det(rotation) < 0:
+            raise SceneError(
+                path, f"view {name}: expected a rotation, found a mirrored (left-handed) one", "negate one axis"
+            )
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
+
+
+def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
+    """World-to-camera matrices with OpenCV axes from ``[c,4,4]`` poses of a convention."""
+    direction, axes = convention
+    if direction == "camera-to-world":
+        poses = np.linalg.inv(poses)
+    return FLIP @ poses if axes == "OpenGL" else poses
+
+
+def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
+    """The inverse of :func:`to_viewmats`: the poses as a file of that convention holds them."""
+    direction, axes = convention
+    poses = FLIP @ viewmats if axes == "OpenGL" else viewmats
+    return np.linalg.inv(poses) if direction == "camera-to-world" else poses
+
+
+def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
+    """The named views, in that order."""
+    ids = list(view_ids)
+    return replace(
+        cameras,
+        viewmats=cameras.viewmats[ids],
+        Ks=cameras.Ks[ids],
+        widths=cameras.widths[ids],
+        heights=cameras.heights[ids],
+        names=tuple(cameras.names[i] for i in ids),
+        images=None if cameras.images is None else cameras.images[ids],
+    )
+
+
+def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
+    """Cameras of one image size.
+
+    Args:
+        camera_file: What was read.
+        size: (width, height), pixels; intrinsics of another size are scaled to it, each axis by itself. None takes
+            the file's size.
+
+    Raises:
+        SceneError: If no size is given and the file's cameras have none, or several.
+    """
+    found = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
+    if size is None:
+        if len(found) > 1:
+            sizes = " and ".join(f"{w} x {h}" for w, h in found[:2])
+            raise SceneError(camera_file.path, f"expected cameras of one image size, found {sizes}")
+        size = found[0]
+        if 0 in size:
+            raise SceneError(camera_file.path, "expected the image size (w, h) of the cameras, found none")
+    known = (camera_file.widths > 0) & (camera_file.heights > 0)
+    scale = torch.ones(len(camera_file), 3, dtype=torch.float64)
+    scale[:, 0] = torch.where(known, size[0] / camera_file.widths.clamp_min(1), 1.0)
+    scale[:, 1] = torch.where(known, size[1] / camera_file.heights.clamp_min(1), 1.0)
+    return Cameras(camera_file.viewmats, camera_file.Ks * scale[:, :, None], *size)

@@ -1,0 +1,146 @@
+"""COLMAP models: ``cameras`` and ``images`` as text or binary; points, rigs and frames are not needed."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+
+# model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
+_MODELS = (
+    (0, "SIMPLE_PINHOLE", 3), (1, "PINHOLE", 4), (2, "SIMPLE_RADIAL", 4), (3, "RADIAL", 5), (4, "OPENCV", 8),
+    (5, "OPENCV_FISHEYE", 8), (6, "FULL_OPENCV", 12), (7, "FOV", 5), (8, "SIMPLE_RADIAL_FISHEYE", 4),
+    (9, "RADIAL_FISHEYE", 5), (10, "THIN_PRISM_FISHEYE", 12),
+)  # fmt: skip
+_NAMES = {number: name for number, name, _ in _MODELS}
+_NUM_PARAMS = {name: count for _, name, count in _MODELS}
+_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
+_PERSPECTIVE = {*_ONE_FOCAL, "PINHOLE", "OPENCV", "FULL_OPENCV"}  # pinhole cameras if all distortion is zero
+
+_Camera = tuple[np.ndarray, tuple[int, int]]  # K [3,3], (width, height)
+_Image = tuple[str, int, list[float]]  # name, camera id, quaternion wxyz and translation
+
+
+def is_colmap(folder: Path) -> bool:
+    """Whether a folder holds a COLMAP model."""
+    return any((folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file() for s in (".bin", ".txt"))
+
+
+def read_colmap(folder: Path) -> CameraFile:
+    """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes.
+
+    Raises:
+        SceneError: If a file is missing or damaged, or a lens is distorted.
+    """
+    binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
+    suffix = ".bin" if binary else ".txt"
+    camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
+    try:
+        if binary:
+            cameras = _binary_cameras(camera_path, camera_path.read_bytes())
+            images = _binary_images(image_path.read_bytes())
+        else:
+            cameras = _text_cameras(camera_path, camera_path.read_text())
+            images = _text_images(image_path.read_text())
+    except (struct.error, ValueError, IndexError) as error:
+        raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
+    except OSError as error:
+        raise SceneError(folder, f"cannot be read ({error.strerror})") from error
+    unknown = next((name for name, camera, _ in images if camera not in cameras), None)
+    if unknown is not None:
+        raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
+    return make_camera_file(
+        folder,
+        f"COLMAP {'binary' if binary else 'text'}",
+        W2C_OPENCV,
+        [_pose(numbers) for _, _, numbers in images],
+        [cameras[camera][0] for _, camera, _ in images],
+        [cameras[camera][1] for _, camera, _ in images],
+        [name for name, _, _ in images],
+    )
+
+
+def _pose(numbers: list[float]) -> np.ndarray:
+    quat = np.array(numbers[:4])
+    w, x, y, z = quat / max(np.linalg.norm(quat), 1e-12)
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
+
+
+def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> _Camera:
+    if model not in _PERSPECTIVE:
+        raise SceneError(
+            path, f"camera {camera_id}: expected a pinhole camera, found {model}", "undistort the images first"
+        )
+    one = model in _ONE_FOCAL
+    fx, fy, cx, cy = (params[0], params[0], *params[1:3]) if one else params[:4]
+    if any(params[3 if one else 4 : _NUM_PARAMS[model]]):
+        raise SceneError(
+            path,
+            f"camera {camera_id}: expected a pinhole camera, found {model} with lens distortion",
+            "undistort the images first",
+        )
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size
+
+
+def _binary_cameras(path: Path, data: bytes) -> dict[int, _Camera]:
+    (count,) = struct.unpack_from("<Q", data)
+    position, cameras = 8, {}
+    for _ in range(count):
+        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, position)
+        position += 24
+        model = _NAMES.get(model_id, f"model {model_id}")
+        params = list(struct.unpack_from(f"<{_NUM_PARAMS.get(model, 0)}d", data, position))
+        position += 8 * len(params)
+        cameras[camera_id] = _camera(path, camera_id, model, (width, height), params)
+    return cameras
+
+
+def _binary_images(data: bytes) -> list[_Image]:
+    (count,) = struct.unpack_from("<Q", data)
+    position, images = 8, []
+    for _ in range(count):
+        _, *numbers, camera = struct.unpack_from("<i7di", data, position)
+        position += 64
+        end = data.index(b"\0", position)
+        name = data[position:end].decode("utf-8")
+        (num_points,) = struct.unpack_from("<Q", data, end + 1)
+        position = end + 9 + 24 * num_points
+        if position > len(data):
+            raise ValueError("early end of file")
+        images.append((name, camera, numbers))
+    return images
+
+
+def _text_cameras(path: Path, text: str) -> dict[int, _Camera]:
+    cameras = {}
+    for line in text.splitlines():
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        camera_id, model, width, height, *params = line.split()
+        if len(params) != _NUM_PARAMS.get(model, len(params)):
+            raise ValueError("wrong number of parameters")
+        size = int(width), int(height)
+        cameras[int(camera_id)] = _camera(path, int(camera_id), model, size, [float(p) for p in params])
+    return cameras
+
+
+def _text_images(text: str) -> list[_Image]:
+    """Two lines per image: pose and name (which may hold spaces), then its points (maybe an empty line)."""
+    lines = iter(text.splitlines())
+    images = []
+    for line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        _, *numbers, camera, name = line.split(maxsplit=9)
+        images.append((name.strip(), int(camera), [float(x) for x in numbers]))
+        next(lines, None)
+    return images

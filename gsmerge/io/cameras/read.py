@@ -1,0 +1,88 @@
+"""Telling camera files apart."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.cameras.colmap import is_colmap, read_colmap
+from gsmerge.io.cameras.da3 import read_da3
+from gsmerge.io.cameras.inria import read_inria
+from gsmerge.io.cameras.transforms import read_transforms
+
+# Where cameras lie beside a scene, the first that exists wins; a COLMAP model right in the folder comes last,
+# because Depth Anything 3 puts one there at the photos' own size.
+CAMERA_PLACES = (
+    "transforms.json",
+    "cameras.json",
+    "sparse/0",
+    "sparse",
+    "colmap/sparse/0",
+    "colmap",
+    "exports/npz/results.npz",
+    "exports/mini_npz/results.npz",
+    "results.npz",
+    ".",
+)
+
+
+def find_cameras(folder: Path) -> Path | None:
+    """The first of the known camera files below a folder, None where there is none."""
+    for place in CAMERA_PLACES:
+        candidate = folder / place
+        if candidate.is_file() or (candidate.is_dir() and is_colmap(candidate)):
+            return candidate
+    return None
+
+
+def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
+    """Read cameras from a file, or from a folder that holds one of the known kinds.
+
+    ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``, and
+    ``results.npz`` of Depth Anything 3. Poses become world-to-camera with OpenCV axes.
+
+    Args:
+        path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
+
+    Raises:
+        SceneError: If there are no cameras, a file is damaged or incomplete, or a lens is distorted.
+    """
+    path = Path(path)
+    if not os.path.exists(path):
+        raise SceneError(path, "no such file or folder")
+    if path.is_dir():
+        found = path if is_colmap(path) else find_cameras(path)
+        if found is None:
+            raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
+        path = found
+    if path.is_dir():
+        return read_colmap(path)
+    if path.suffix in (".bin", ".txt"):
+        if not is_colmap(path.parent):
+            raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
+        return read_colmap(path.parent)
+    if path.suffix == ".npz":
+        return read_da3(path)
+    if path.suffix == ".json":
+        return _read_json(path)
+    raise SceneError(path, "expected cameras as .json, .npz or a COLMAP folder, found another kind of file")
+
+
+def _read_json(path: Path) -> CameraFile:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise SceneError(path, f"expected JSON, found something else ({error})") from error
+    if isinstance(data, dict) and "frames" in data:
+        return read_transforms(path, data)
+    if isinstance(data, list) and data and all(isinstance(entry, dict) for entry in data):
+        if "transform_matrix" in data[0]:
+            return read_transforms(path, data)
+        if "position" in data[0] or "rotation" in data[0]:
+            return read_inria(path, data)
+    raise SceneError(path, "expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither")

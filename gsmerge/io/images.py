@@ -1,0 +1,143 @@
+"""Photos of a scene, found by name and decoded in parallel."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.errors import SceneError
+from gsmerge.threads import parallel_map
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
+
+ImageSource = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+
+
+def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
+    """Read the image of every view.
+
+    Args:
+        source: A folder (with its sub-folders), or the image files themselves.
+        names: One name per view, as camera files give them: with or without folders and extension. If no name is
+            found but there are as many images as names, the images are taken in order (of their names with numbers
+            counted as numbers, or of the list).
+
+    Returns:
+        ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
+
+    Raises:
+        SceneError: If an image is missing or cannot be read, or two differ in size.
+    """
+    paths = match_images(source, names)
+    decoded = parallel_map(_decode, paths)
+    for path, image in zip(paths, decoded, strict=True):
+        if image.shape != decoded[0].shape:
+            (h0, w0), (h, w) = decoded[0].shape[:2], image.shape[:2]
+            raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
+    return as_tensor(decoded)
+
+
+def as_tensor(images: Sequence[np.ndarray] | np.ndarray) -> Tensor:
+    """``[c,h,w,3]`` float32 in [0, 1] from c uint8 images of one size."""
+    out = np.empty((len(images), *images[0].shape), np.float32)
+    parallel_map(lambda i: np.multiply(images[i], np.float32(1 / 255), out=out[i]), range(len(images)))
+    return torch.from_numpy(out)
+
+
+def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
+    """The image file of every view; see :func:`read_images`."""
+    if isinstance(source, str | os.PathLike):
+        root = Path(source)
+        if not root.is_dir():
+            problem = "expected a folder of images, found a file" if root.exists() else "no such folder"
+            raise SceneError(root, problem)
+        files = list_images(root)
+    else:
+        files = [Path(p) for p in source]
+        root = files[0].parent if files else Path()
+    keys = _index([f.relative_to(root) if f.is_relative_to(root) else f for f in files], files)
+    found = [_lookup(root, keys, name) for name in names]
+    if all(f is None for f in found) and len(files) == len(names):
+        return files
+    missing = [name for name, f in zip(names, found, strict=True) if f is None]
+    if missing:
+        raise SceneError(
+            root, f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing[0]}"
+        )
+    matched = [f for f in found if f is not None]
+    if len(set(matched)) < len(matched):
+        twice = next(f for f in matched if matched.count(f) > 1)
+        raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
+    return matched
+
+
+def list_images(folder: Path) -> list[Path]:
+    """All images below a folder, numbers in their names counted as numbers."""
+    files = [Path(base) / f for base, _, inside in os.walk(folder) for f in inside]
+    images = [f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
+    return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts "view 2" before "view 10"."""
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"([0-9]+)", name) if p]
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """The image that a camera file beside it names, with or without its extension; None where there is none."""
+    path = folder / name
+    if path.is_file():
+        return path
+    candidates = [path.with_name(path.name + suffix) for suffix in sorted(IMAGE_SUFFIXES)]
+    return next((c for c in candidates if c.is_file()), None)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image, pixels."""
+    height, width = _decode(path).shape[:2]
+    return width, height
+
+
+def _index(relative: Sequence[Path], files: Sequence[Path]) -> dict[str, list[Path]]:
+    """Files by every ending of their path, with and without extension."""
+    keys: dict[str, list[Path]] = {}
+    for short, file in zip(relative, files, strict=True):
+        parts = short.parts
+        for i in range(len(parts)):
+            ending = PurePosixPath(*parts[i:])
+            for key in {str(ending), str(ending.with_suffix(""))}:
+                keys.setdefault(key, []).append(file)
+    return keys
+
+
+def _lookup(root: Path, keys: dict[str, list[Path]], name: str) -> Path | None:
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    for i in range(len(parts)):
+        ending = PurePosixPath(*parts[i:])
+        for key in (str(ending), str(ending.with_suffix(""))):
+            hits = keys.get(key, [])
+            if len(hits) > 1:
+                raise SceneError(root, f"expected one image named {name}, found {hits[0].name} and {hits[1].name}")
+            if hits:
+                return hits[0]
+    return None
+
+
+def _decode(path: Path) -> np.ndarray:
+    """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise SceneError(path, "expected an image, found a file that cannot be decoded")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)

@@ -1,0 +1,45 @@
+"""The columns of a Gaussian splat in a PLY file, and the ranges of what they may hold.
+
+Log scales, logits and channel-major harmonics exist only in the three ``ply`` modules.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
+MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
+LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
+
+MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES = ("scale_0", "scale_1", "scale_2")
+QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
+
+
+def sh_degree(num_rest: int) -> int:
+    """SH degree of that many ``f_rest`` columns."""
+    return round((num_rest / 3 + 1) ** 0.5) - 1
+
+
+def layout_name(names: tuple[str, ...], num_rest: int) -> str:
+    """What to call a file with these columns."""
+    normals = set(NORMALS) <= set(names)
+    if num_rest == 0:
+        return "17-column export" if normals else "14-column export (no normals)"
+    return f"INRIA, SH degree {sh_degree(num_rest)}" + ("" if normals else " (no normals)")
+
+
+def bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
+    """Bytes of all rows by attribute; ``extra`` are the columns that mean nothing here."""
+    groups = {"means": MEANS, "normals": NORMALS, "sh0": SH0, "opacities": ("opacity",)}
+    groups |= {"scales": SCALES, "quats": QUATS, "extra": extra}
+    of = {name: kind for kind, names in groups.items() for name in names}
+    sizes: dict[str, int] = {}
+    assert rows.dtype.names is not None
+    for name in rows.dtype.names:
+        kind = of.get(name, "shN")
+        sizes[kind] = sizes.get(kind, 0) + rows.dtype[name].itemsize * len(rows)
+    return sizes

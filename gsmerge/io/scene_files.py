@@ -1,0 +1,105 @@
+"""Finding the cameras and images that belong to a ``.ply``."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.da3 import holds_images
+from gsmerge.io.cameras.read import find_cameras
+from gsmerge.io.images import list_images
+
+# The first that exists wins; then the folder's only .ply.
+PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
+IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
+_NO_GAUSSIANS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # point clouds that others put there
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files of a scene.
+
+    Args:
+        ply: The Gaussians.
+        cameras: Camera file or COLMAP folder; None if none was found.
+        images: Folder of images, or an ``.npz`` that holds them; None if none was found.
+    """
+
+    ply: Path
+    cameras: Path | None
+    images: Path | None
+
+
+def find_scene_files(
+    path: str | os.PathLike[str],
+    *,
+    cameras: str | os.PathLike[str] | None = None,
+    images: str | os.PathLike[str] | None = None,
+) -> SceneFiles:
+    """Find a scene's files.
+
+    Looked through are the given folder, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above
+    it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and
+    ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` go before a folder, because they have the
+    Gaussians' size.
+
+    Args:
+        path: A ``.ply`` or a folder.
+        cameras: Named by the user: taken instead of what would be found.
+        images: The same.
+
+    Raises:
+        SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.
+    """
+    path = Path(path)
+    ply = _find_ply(path) if os.path.isdir(path) else path
+    if not os.path.exists(ply):
+        raise SceneError(ply, "no such file")
+    roots = list(dict.fromkeys(root.resolve() for root in [path if ply != path else ply.parent, *_roots(ply)]))
+    camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
+    image_path = _named(images)
+    if image_path is None and camera_path is not None and camera_path.suffix == ".npz" and holds_images(camera_path):
+        image_path = camera_path
+    if image_path is None:
+        folders = (root / place for root in roots for place in IMAGE_PLACES)
+        image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
+    return SceneFiles(ply, camera_path, image_path)
+
+
+def _named(path: str | os.PathLike[str] | None) -> Path | None:
+    if path is None:
+        return None
+    if not os.path.exists(path):
+        raise SceneError(path, "no such file or folder")
+    return Path(path)
+
+
+def _roots(ply: Path) -> list[Path]:
+    folder = ply.parent.resolve()
+    if folder.name == "gs_ply":
+        return [folder, folder.parent]
+    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
+        return [folder, folder.parent.parent]
+    return [folder]
+
+
+def _find_ply(folder: Path) -> Path:
+    for place in PLY_PLACES:
+        if (folder / place).is_file():
+            return folder / place
+    trained = [p for p in folder.glob("point_cloud/iteration_*/point_cloud.ply") if p.parent.name[10:].isdecimal()]
+    if trained:
+        return max(trained, key=lambda p: int(p.parent.name[10:]))
+    found = sorted(
+        p
+        for p in folder.glob("*.ply")
+        if not p.name.startswith(".") and not p.name.endswith(".compact.ply") and p.name not in _NO_GAUSSIANS
+    )
+    if not found:
+        raise SceneError(folder, "expected a .ply file in the folder, found none")
+    if len(found) > 1:
+        names = ", ".join(p.name for p in found[:4])
+        raise SceneError(folder, f"expected one .ply file in the folder, found {len(found)} ({names})", "name one")
+    return found[0]

@@ -1,0 +1,190 @@
+"""The whole story: scene -> groups -> feature gaussians -> merged -> decoded -> fitted."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsmerge.backing import encode_backing
+from gsmerge.canonical import canonicalise
+from gsmerge.decode import decode
+from gsmerge.encode import encode
+from gsmerge.fit import fit_colors, plan_photos, prune_unseen
+from gsmerge.match import match
+from gsmerge.merge import merge
+from gsmerge.metrics import psnr
+from gsmerge.moments import Members, scene_members
+from gsmerge.options import CompactOptions
+from gsmerge.photos import Photos, scene_photos
+from gsmerge.render import composite, plan_view, prepare
+from gsmerge.robust import MIN_VIEWS, choose_merge
+from gsmerge.segment import count_for, segment
+from gsmerge.threads import parallel_map, use_threads
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, PixelScene
+
+Progress = Callable[[str, int, int], None]
+STAGES = ("prepare", "segment", "encode", "robust", "match", "decode", "fit", "score")
+
+
+@dataclass(frozen=True)
+class CompactReport:
+    """What a run did.
+
+    Args:
+        num_input: Gaussians in the scene.
+        num_output: Gaussians in the result.
+        seconds: Wall time of each stage.
+        psnr_before: Mean PSNR (dB) of the input views rendered from the input; None without photos.
+        psnr_after: The same from the result.
+        choices: What the stages decided (merge, scores, clusters, fit).
+        notes: Things worth telling, one sentence each.
+        options: All settings by flat name.
+        peak_memory_bytes: Largest resident memory of the process so far.
+    """
+
+    num_input: int
+    num_output: int
+    seconds: dict[str, float]
+    psnr_before: float | None
+    psnr_after: float | None
+    choices: dict[str, Any]
+    notes: list[str]
+    options: dict[str, Any]
+    peak_memory_bytes: int
+
+
+@dataclass(frozen=True)
+class CompactResult:
+    """The compact Gaussians, in the scene's own world frame, and the report."""
+
+    gaussians: Gaussians
+    report: CompactReport
+
+
+@dataclass
+class _Run:
+    """Clock and notebook of one run."""
+
+    progress: Progress | None
+    seconds: dict[str, float] = field(default_factory=dict)
+    choices: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        if self.progress:
+            self.progress(name, STAGES.index(name), len(STAGES))
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def compact(
+    scene: PixelScene, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
+) -> CompactResult:
+    """Replace a per-pixel scene by a compact one that renders at least as well from new viewpoints.
+
+    Args:
+        scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`.
+        options: Settings of all stages; None: the defaults.
+        progress: Called with (stage, stages done, number of stages) as each stage begins.
+        **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, density=0.01)``.
+
+    Returns:
+        The Gaussians and a report.
+
+    Raises:
+        ValueError: If a setting is unknown or out of range.
+    """
+    options = (options or CompactOptions()).with_settings(settings)
+    run = _Run(progress)
+    with use_threads(options.threads), torch.inference_mode():
+        with run.stage("prepare"):
+            canonical, frame = canonicalise(scene)
+            members = scene_members(canonical)
+        features = _merged_features(canonical, members, options, run)
+        with run.stage("decode"):
+            gaussians = decode(features, members, options.decode)
+        before = after = None
+        if canonical.images is not None:
+            with run.stage("fit"):
+                gaussians = _fitted(gaussians, canonical, options, run)
+            with run.stage("score"):
+                photos = scene_photos(canonical)
+                before, after = input_psnr(canonical.gaussians, photos), input_psnr(gaussians, photos)
+        gaussians = frame.leave(gaussians)
+    if progress:
+        progress("done", len(STAGES), len(STAGES))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    report = CompactReport(
+        len(scene.gaussians), len(gaussians), run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak
+    )
+    return CompactResult(gaussians, report)
+
+
+def _merged_features(scene: PixelScene, members: Members, options: CompactOptions, run: _Run) -> FeatureGaussians:
+    """Superpixels, one Feature Gaussian each, the merge that the photos prefer, and merging across views."""
+    robust = options.robust.robust and scene.images is not None and len(scene) >= MIN_VIEWS
+    with run.stage("segment"):
+        height, width = scene.cameras.height, scene.cameras.width
+        count = count_for(options.segment, height, width)
+        coarse = min(round(options.backing.backing * height * width), count // 2) if robust else 0
+        pictures = scene.images if scene.images is not None else _own_colors(scene)
+        groups = segment(pictures, options.segment, count - coarse)
+        coarse_groups = segment(pictures, options.segment, coarse) if coarse else None
+    with run.stage("encode"):
+        features = encode(scene, members, groups, options.encode)
+        backing = encode_backing(scene, members, coarse_groups, options.backing) if coarse_groups else None
+    if robust:
+        with run.stage("robust"):
+            features, choice = choose_merge(features, backing, scene_photos(scene, 2), options.robust)
+            run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
+    with run.stage("match"):
+        matches = match(features, options.match)
+        run.choices["groups"], run.choices["clusters"] = len(features), matches.count
+        return merge(features, matches)
+
+
+def _own_colors(scene: PixelScene) -> torch.Tensor:
+    """Pictures made of the Gaussians' base colours, for scenes without photos."""
+    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
+    return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
+
+
+def _fitted(gaussians: Gaussians, scene: PixelScene, options: CompactOptions, run: _Run) -> Gaussians:
+    """Gaussians that no photo shows left out, colours fitted."""
+    photos = scene_photos(scene, options.fit.fit_level)
+    keep = prune_unseen(gaussians, plan_photos(prepare(gaussians), photos), options.fit.prune)
+    run.choices["pruned"] = int((~keep).sum())
+    gaussians = gaussians[keep]
+    if options.fit.fit == "none":
+        return gaussians
+    gaussians, report = fit_colors(gaussians, photos, options.fit, options.seed)
+    run.choices["fit"] = report.__dict__
+    if not report.accepted:
+        run.notes.append("the colour fit was not accepted: held-out parts of the photos did not get better")
+    return gaussians
+
+
+def input_psnr(gaussians: Gaussians, photos: Photos) -> float:
+    """Mean PSNR (dB) of the photos rendered from some Gaussians."""
+    splats = prepare(gaussians)
+
+    def one_view(view: int) -> float:
+        plan = plan_view(
+            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
+        )
+        return psnr(np.clip(composite(plan)[0], 0, 1), photos.images[view])
+
+    return float(np.mean(parallel_map(one_view, range(len(photos)))))
+
+
+__all__ = ["CompactOptions", "CompactReport", "CompactResult", "compact"]

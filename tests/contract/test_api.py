@@ -1,0 +1,73 @@
+"""What is public is documented, typed, and where the documentation says."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import gsmerge
+
+PUBLIC = sorted(set(gsmerge.__all__) - {"__version__"})
+PROMISED = ("read_scene", "compact", "write_ply", "render", "superpixels", "Gaussians", "Cameras")
+
+
+def test_promised_names_are_exported() -> None:
+    assert set(PROMISED) <= set(PUBLIC)
+    assert set(PUBLIC) <= set(dir(gsmerge))
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_names_are_documented(name: str) -> None:
+    value = getattr(gsmerge, name)
+    assert callable(value)
+    assert value.__doc__
+    assert value.__module__.startswith("gsmerge.")
+    first = value.__doc__.splitlines()[0]
+    assert first.endswith(".")
+    assert not first.startswith(f"{name}(")  # what dataclasses make up when there is no docstring
+
+
+@pytest.mark.parametrize("name", [name for name in PUBLIC if name[0].islower()])
+def test_public_functions_are_typed(name: str) -> None:
+    signature = inspect.signature(getattr(gsmerge, name))
+    assert signature.return_annotation is not inspect.Signature.empty
+    assert [p.name for p in signature.parameters.values() if p.annotation is inspect.Parameter.empty] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("compact", ["scene", "options", "progress", "settings"]),
+        ("superpixels", ["image", "count", "method"]),
+        ("render", ["gaussians", "cameras", "background"]),
+        ("Gaussians", ["means", "quats", "scales", "opacities", "sh0", "shN"]),
+        ("Cameras", ["viewmats", "Ks", "width", "height"]),
+        ("write_ply", ["path", "gaussians"]),
+        ("read_scene", ["path"]),
+    ],
+)
+def test_signatures_start_as_promised(name: str, parameters: list[str]) -> None:
+    assert list(inspect.signature(getattr(gsmerge, name)).parameters)[: len(parameters)] == parameters
+
+
+def test_unknown_names_are_refused() -> None:
+    module: Any = gsmerge
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        _ = module.no_such_thing
+
+
+def test_type_checkers_see_what_is_exported(root: Path) -> None:
+    text = (root / "gsmerge" / "__init__.py").read_text()
+    assert [name for name in PUBLIC if f" {name} as {name}\n" not in text] == []
+
+
+def test_the_package_is_typed(root: Path) -> None:
+    assert (root / "gsmerge" / "py.typed").exists()
+
+
+@pytest.mark.parametrize("path", sorted((Path(gsmerge.__file__).parent).rglob("*.py")), ids=lambda p: p.stem)
+def test_files_stay_short(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 400

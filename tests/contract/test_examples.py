@@ -1,0 +1,60 @@
+"""The numbered examples run, in their order, as their docstrings say."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run_example(root: Path, name: str, *arguments: object) -> str:
+    script = root / "examples" / name
+    done = subprocess.run(
+        [sys.executable, str(script), *map(str, arguments)], capture_output=True, text=True, check=False, cwd=root
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_examples_are_numbered_without_gaps(root: Path) -> None:
+    names = sorted(path.name for path in (root / "examples").glob("*.py"))
+    assert [int(name[:2]) for name in names] == list(range(1, len(names) + 1))
+    for name in names:
+        first_lines = (root / "examples" / name).read_text()[:600]
+        assert f"python examples/{name} " in first_lines
+
+
+def test_examples_run_one_after_the_other(root: Path, tmp_path: Path) -> None:
+    scene, small = tmp_path / "scene", tmp_path / "scene" / "small.ply"
+    made = run_example(root, "01_make_scene.py", scene, "--views", 4, "--width", 72, "--height", 48)
+    assert "13824 Gaussians, 4 views" in made
+    compacted = run_example(root, "02_compact.py", scene, small, "--k", 2)
+    count = int(re.search(r"13824 -> (\d+) Gaussians", compacted).group(1))  # type: ignore[union-attr]
+    assert 0 < count < 13824 / 5
+    measured = run_example(root, "03_measure_targets.py", scene / "targets", scene / "scene.ply", small)
+    values = [float(value) for value in re.findall(r": (\S+) dB", measured)]
+    assert len(values) == 2
+    assert all(10 < value < 60 for value in values)
+
+
+def test_the_same_seed_makes_the_same_scene(make_scene, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    sizes = {"num_views": 2, "width": 24, "height": 16}
+    first, again, other = (
+        (make_scene(tmp_path / name, seed=seed, **sizes) / "scene.ply").read_bytes()
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    )
+    assert first == again
+    assert first != other
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "targets/transforms.json"])
+def test_the_made_scene_has_cameras_for_its_photos(name: str, made_scene: Path) -> None:
+    import gsmerge
+
+    camera_file = gsmerge.read_cameras(made_scene / name)
+    folder = (made_scene / name).parent
+    assert len(camera_file) == (5 if name == "transforms.json" else 4)
+    assert all((folder / image).exists() for image in camera_file.names)

@@ -1,0 +1,55 @@
+"""The package and the command line load nothing before they are asked for something."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage")
+
+
+def run_python(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def loaded_after(code: str) -> set[str]:
+    listing = run_python(f"{code}\nimport sys\nprint('modules:', *(m for m in sys.modules if '.' not in m))")
+    return set(listing.splitlines()[-1].split()) & set(HEAVY)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["--version"],
+        [],
+        *([name, "--help"] for name in ("compact", "inspect", "segment", "render", "preview")),
+    ],
+    ids=" ".join,
+)
+def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
+    assert loaded_after(f"from gsmerge.cli import main\nassert main({arguments!r}) == 0") == set()
+
+
+def test_import_loads_nothing_heavy() -> None:
+    assert loaded_after("import gsmerge") == set()
+
+
+def test_missing_file_is_told_without_torch_loading_twice() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "gsmerge", "compact", "nowhere.ply"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert "nowhere.ply" in done.stderr
+
+
+def test_submodule_imports_do_not_hide_functions() -> None:
+    """The modules render and inspect share their names with the functions that they hold."""
+    print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"
+    assert run_python(f"import gsmerge.render, gsmerge.inspect\n{print_kinds}").split() == ["function", "function"]
+    assert run_python(f"import gsmerge.pipeline\n{print_kinds}").split() == ["function", "function"]

@@ -1,0 +1,235 @@
+"""Every kind of bad input: its exit code, one clear line, no traceback, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from .conftest import Run, listing
+
+HEADER_END = b"end_header\n"
+Spoil = Callable[[Path], list[object]]
+
+
+def header_and_rows(ply: Path) -> tuple[str, bytes]:
+    head, rows = ply.read_bytes().split(HEADER_END, 1)
+    return head.decode(), rows
+
+
+def missing_file(scene: Path) -> list[object]:
+    (scene / "scene.ply").unlink()
+    return []
+
+
+def truncated(scene: Path) -> list[object]:
+    ply = scene / "scene.ply"
+    ply.write_bytes(ply.read_bytes()[:-1000])
+    return []
+
+
+def text_file(scene: Path) -> list[object]:
+    (scene / "scene.ply").write_text("These are notes, not Gaussians.\n")
+    return []
+
+
+def no_vertex(scene: Path) -> list[object]:
+    ply = scene / "scene.ply"
+    ply.write_bytes(ply.read_bytes().replace(b"element vertex", b"element points", 1))
+    return []
+
+
+def missing_columns(scene: Path) -> list[object]:
+    ply = scene / "scene.ply"
+    data = ply.read_bytes()
+    for name in (b"rot_3", b"scale_1"):
+        data = data.replace(b"property float " + name + b"\n", b"property float other_" + name + b"\n", 1)
+    ply.write_bytes(data)
+    return []
+
+
+def no_gaussians(scene: Path) -> list[object]:
+    head, _ = header_and_rows(scene / "scene.ply")
+    lines = ["element vertex 0" if line.startswith("element") else line for line in head.splitlines()]
+    (scene / "scene.ply").write_bytes("\n".join([*lines, ""]).encode() + HEADER_END)
+    return []
+
+
+def all_nan(scene: Path) -> list[object]:
+    head, rows = header_and_rows(scene / "scene.ply")
+    nans = np.full(len(rows) // 4, np.nan, "<f4").tobytes()
+    (scene / "scene.ply").write_bytes(head.encode() + HEADER_END + nans)
+    return []
+
+
+def flipped_cameras(scene: Path) -> list[object]:
+    """Camera-to-world with OpenCV axes in a file that promises OpenGL ones."""
+    path = scene / "transforms.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])).tolist()
+    path.write_text(json.dumps(data))
+    return []
+
+
+def resized_images(scene: Path) -> list[object]:
+    for path in (scene / "images").iterdir():
+        image = cv2.imread(str(path))
+        assert image is not None
+        cv2.imwrite(str(path), cv2.resize(image, (48, 32)))
+    return []
+
+
+def lost_image(scene: Path) -> list[object]:
+    (scene / "images" / "view_03.png").unlink()
+    return []
+
+
+def unreadable_image(scene: Path) -> list[object]:
+    (scene / "images" / "view_03.png").write_bytes(b"no picture")
+    return []
+
+
+def no_cameras(scene: Path) -> list[object]:
+    (scene / "transforms.json").unlink()
+    return []
+
+
+def broken_json(scene: Path) -> list[object]:
+    (scene / "transforms.json").write_text("{")
+    return []
+
+
+def dropped_pixels(scene: Path) -> list[object]:
+    head, rows = header_and_rows(scene / "scene.ply")
+    count = len(rows) // 68
+    head = head.replace(f"element vertex {count}", f"element vertex {count - 7}")
+    (scene / "scene.ply").write_bytes(head.encode() + b"\n"[:0] + HEADER_END + rows[: -7 * 68])
+    return []
+
+
+def output_in_no_folder(scene: Path) -> list[object]:
+    return ["-o", scene / "nowhere" / "small.ply"]
+
+
+def output_below_a_file(scene: Path) -> list[object]:
+    return ["-o", scene / "transforms.json" / "small.ply"]
+
+
+def output_is_a_folder(scene: Path) -> list[object]:
+    return ["-o", scene / "images"]
+
+
+def output_is_the_input(scene: Path) -> list[object]:
+    return ["-o", scene / "scene.ply", "--overwrite"]
+
+
+def output_is_the_input_by_another_name(scene: Path) -> list[object]:
+    return ["-o", scene / "images" / ".." / "scene.ply", "--overwrite"]
+
+
+def output_exists(scene: Path) -> list[object]:
+    (scene / "scene.compact.ply").write_bytes(b"precious")
+    return []
+
+
+def report_is_the_output(scene: Path) -> list[object]:
+    return ["-o", scene / "small.ply", "--report", scene / "small.ply"]
+
+
+def given(*arguments: object) -> Spoil:
+    return lambda scene: list(arguments)
+
+
+CASES: dict[str, tuple[Spoil, int, list[str]]] = {
+    "missing file": (missing_file, 3, ["scene"]),
+    "truncated": (truncated, 3, ["scene.ply", "truncated", "30720"]),
+    "text file": (text_file, 3, ["scene.ply", "expected a PLY file"]),
+    "no vertex element": (no_vertex, 3, ["scene.ply", "vertex", "points"]),
+    "missing columns": (missing_columns, 3, ["scene.ply", "scale_1", "rot_3"]),
+    "zero Gaussians": (no_gaussians, 3, ["scene.ply", "at least one Gaussian", "0"]),
+    "all NaN": (all_nan, 3, ["scene.ply", "NaN", "30720"]),
+    "wrong convention": (flipped_cameras, 3, ["transforms.json", "OpenCV"]),
+    "image size": (resized_images, 3, ["96 x 64", "48 x 32"]),
+    "fewer images than cameras": (lost_image, 3, ["images", "expected 5", "found 4", "view_03"]),
+    "unreadable image": (unreadable_image, 3, ["view_03.png"]),
+    "no cameras": (no_cameras, 3, ["scene.ply", "no cameras", "--cameras"]),
+    "broken JSON": (broken_json, 3, ["transforms.json", "expected JSON"]),
+    "dropped pixels": (dropped_pixels, 3, ["scene.ply", "30720", "30713"]),
+    "no such cameras": (given("--cameras", "nowhere.json"), 3, ["nowhere.json", "no such file"]),
+    "no such images": (given("--images", "nowhere"), 3, ["nowhere", "no such file"]),
+    "output in no folder": (output_in_no_folder, 3, ["small.ply", "nowhere"]),
+    "output below a file": (output_below_a_file, 3, ["small.ply"]),
+    "output is a folder": (output_is_a_folder, 2, ["images", "found a folder"]),
+    "output is the input": (output_is_the_input, 2, ["scene.ply", "other than the input"]),
+    "output is the input, renamed": (output_is_the_input_by_another_name, 2, ["other than the input"]),
+    "output exists": (output_exists, 2, ["scene.compact.ply", "--overwrite"]),
+    "report is the output": (report_is_the_output, 2, ["small.ply"]),
+    "K = 0": (given("--k", 0), 2, ["--k"]),
+    "K = 9": (given("--k", 9), 2, ["--k"]),
+    "more superpixels than pixels": (given("--superpixels", 96 * 64 + 1), 2, ["6144", "6145"]),
+    "no superpixels": (given("--superpixels", 0), 2, ["--superpixels"]),
+    "density zero": (given("--density", 0), 2, ["density"]),
+    "density above one": (given("--density", 1.5), 2, ["--density"]),
+    "unknown method": (given("--method", "magic"), 2, ["--method", "rdseg"]),
+    "unknown match": (given("--match", "magic"), 2, ["--match", "overlap"]),
+    "unknown option": (given("--magic"), 2, ["--magic"]),
+    "no threads": (given("--threads", 0), 2, ["--threads"]),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bad_input_is_told_in_one_line(name: str, scene_copy: Path, run: Run) -> None:
+    spoil, code, fragments = CASES[name]
+    arguments = spoil(scene_copy)
+    before = listing(scene_copy)
+    outcome = run("compact", scene_copy, *arguments)
+    assert outcome.code == code, outcome.err
+    assert outcome.out == ""
+    assert outcome.err.startswith("gsmerge: error: ")
+    assert outcome.err.count("\n") == 1
+    assert [part for part in fragments if part not in outcome.err] == []
+    assert listing(scene_copy) == before
+
+
+def test_a_named_file_that_is_missing_is_told(tmp_path: Path, run: Run) -> None:
+    outcome = run("compact", tmp_path / "nothing.ply")
+    assert outcome.code == 3
+    assert "nothing.ply: no such file" in outcome.err
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_without_permission_is_told(scene_copy: Path, run: Run) -> None:
+    locked = scene_copy / "locked"
+    locked.mkdir(mode=0o500)
+    outcome = run("compact", scene_copy, "-o", locked / "small.ply")
+    assert outcome.code == 3
+    assert "cannot be written" in outcome.err
+    assert list(locked.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["inspect", "segment", "render", "preview"])
+def test_other_commands_tell_bad_input_too(command: str, scene_copy: Path, run: Run) -> None:
+    text_file(scene_copy)
+    scene = scene_copy / "scene.ply" if command == "preview" else scene_copy
+    output = {"inspect": [], "preview": ["-o", scene_copy / "p.png"]}.get(command, ["-o", scene_copy / "out"])
+    outcome = run(command, scene, *output)
+    assert outcome.code == 3
+    assert outcome.err.count("\n") == 1
+    assert "expected a PLY file" in outcome.err
+    assert not (scene_copy / "p.png").exists()
+
+
+@pytest.mark.parametrize("command", ["segment", "render"])
+def test_occupied_folders_are_refused(command: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("precious")
+    outcome = run(command, made_scene, "-o", tmp_path / "out")
+    assert outcome.code == 2
+    assert "--overwrite" in outcome.err
+    assert listing(tmp_path) == {"out/mine.txt": 8}

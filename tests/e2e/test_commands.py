@@ -1,0 +1,171 @@
+"""The commands on a scene that the project makes itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import gsmerge
+
+from .conftest import Run, listing
+
+VIEWS, HEIGHT, WIDTH = 5, 64, 96
+SMALL = ("--superpixels", 200)
+
+
+def test_compact_writes_beside_the_input_and_says_what_it_did(scene_copy: Path, run: Run) -> None:
+    outcome = run("compact", scene_copy / "scene.ply", "--k", 2, *SMALL)
+    assert outcome.code == 0, outcome.err
+    out = scene_copy / "scene.compact.ply"
+    count = len(gsmerge.read_ply(out).gaussians)
+    assert 0 < count <= VIEWS * 200 * 2
+    line = outcome.out
+    assert line.count("\n") == 1
+    assert f"30,720 -> {count:,} Gaussians" in line
+    assert "dB" in line
+    assert all(stage in line for stage in ("read", "segment", "encode", "fit", "write"))
+
+
+def test_compact_of_a_folder_does_not_take_its_own_output_for_the_input(scene_copy: Path, run: Run) -> None:
+    assert run("compact", scene_copy, *SMALL, "--quiet").code == 0
+    assert run("compact", scene_copy, *SMALL, "--quiet", "--overwrite").code == 0
+
+
+def test_overwrite_is_needed_and_works(scene_copy: Path, run: Run) -> None:
+    out = scene_copy / "small.ply"
+    out.write_bytes(b"precious")
+    assert run("compact", scene_copy, "-o", out, *SMALL).code == 2
+    assert out.read_bytes() == b"precious"
+    assert run("compact", scene_copy, "-o", out, *SMALL, "--overwrite").code == 0
+    assert out.read_bytes().startswith(b"ply")
+
+
+def test_json_report(scene_copy: Path, run: Run) -> None:
+    out, report = scene_copy / "small.ply", scene_copy / "report.json"
+    outcome = run("compact", scene_copy, "-o", out, *SMALL, "--k", 2, "--seed", 3, "--json", "--report", report)
+    assert outcome.code == 0
+    assert outcome.err == ""
+    document = json.loads(outcome.out)
+    assert document == json.loads(report.read_text())
+    ply = scene_copy / "scene.ply"
+    assert document["schema_version"] == 1
+    assert document["tool"] == {"name": "gsmerge", "version": gsmerge.__version__}
+    assert document["input"]["sha256"] == hashlib.sha256(ply.read_bytes()).hexdigest()
+    assert document["input"]["bytes"] == ply.stat().st_size
+    assert document["input"]["num_gaussians"] == VIEWS * HEIGHT * WIDTH
+    assert document["output"]["bytes"] == out.stat().st_size
+    assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
+    assert document["ratio"] == pytest.approx(document["output"]["num_gaussians"] / (VIEWS * HEIGHT * WIDTH))
+    assert (document["seed"], document["options"]["k"], document["options"]["superpixels"]) == (3, 2, 200)
+    assert set(document["seconds"]) >= {"import", "read", "segment", "encode", "decode", "write"}
+    assert document["total_seconds"] == pytest.approx(sum(document["seconds"].values()), abs=1e-2)
+    assert document["psnr_input_views"]["after"] > 15
+    assert document["peak_memory_bytes"] > 1e7
+
+
+def test_quiet_says_nothing(scene_copy: Path, run: Run) -> None:
+    outcome = run("compact", scene_copy, *SMALL, "--quiet")
+    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+def test_dry_run_writes_nothing(scene_copy: Path, run: Run) -> None:
+    before = listing(scene_copy)
+    outcome = run("compact", scene_copy, "--dry-run", "--k", 2, *SMALL)
+    assert outcome.code == 0, outcome.err
+    assert "at most 2,000 Gaussians" in outcome.out
+    assert "estimate" in outcome.out
+    document = json.loads(run("compact", scene_copy, "--dry-run", "--json", *SMALL).out)
+    assert document["dry_run"] is True
+    assert document["superpixels_per_view"] == 200
+    assert document["estimate"]["seconds"] > 0
+    assert document["estimate"]["memory_bytes"] > 1e8
+    assert listing(scene_copy) == before
+
+
+def test_progress_only_when_a_terminal_is_there(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    fast = (*SMALL, "--no-robust", "--fit", "none", "--overwrite")
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    assert "segment" not in run("compact", scene_copy, *fast).err
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "segment" in run("compact", scene_copy, *fast).err
+    assert run("compact", scene_copy, *fast, "--quiet").err == ""
+    assert run("compact", scene_copy, *fast, "--json").err == ""
+
+
+def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
+    for path in (scene_copy / "images").iterdir():
+        path.unlink()
+    outcome = run("compact", scene_copy, *SMALL, "--json")
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["psnr_input_views"] == {"before": None, "after": None}
+
+
+def test_threads_and_repetition_do_not_change_the_file(scene_copy: Path, run: Run) -> None:
+    hashes = set()
+    for i, threads in enumerate((1, 2, 8, 2)):
+        out = scene_copy / f"small{i}.ply"
+        assert run("compact", scene_copy, "-o", out, *SMALL, "--k", 2, "--threads", threads, "--quiet").code == 0
+        hashes.add(hashlib.sha256(out.read_bytes()).hexdigest())
+    assert len(hashes) == 1
+
+
+def test_inspect(made_scene: Path, run: Run) -> None:
+    outcome = run("inspect", made_scene)
+    assert outcome.code == 0
+    assert "17-column" in outcome.out
+    assert "30,720" in outcome.out
+    assert f"{VIEWS} x {HEIGHT} x {WIDTH}" in outcome.out
+    document = json.loads(run("inspect", made_scene, "--json").out)
+    assert (document["count"], document["num_views"], document["width"]) == (30720, VIEWS, WIDTH)
+    assert document["opacity_encoding"] == "logit"
+    assert document["alignment"]["ok"] is True
+
+
+def test_inspect_of_an_unaligned_file_is_no_error(scene_copy: Path, run: Run) -> None:
+    assert run("compact", scene_copy, *SMALL, "--quiet").code == 0
+    outcome = run("inspect", scene_copy / "scene.compact.ply")
+    assert outcome.code == 0
+    assert "not one Gaussian per pixel" in outcome.out
+
+
+def test_segment(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("segment", made_scene, "-o", tmp_path / "overlays", *SMALL)
+    assert outcome.code == 0, outcome.err
+    assert "200 to 200 superpixels" in outcome.err
+    pictures = sorted((tmp_path / "overlays").iterdir())
+    assert len(pictures) == 3 * VIEWS
+    assert {cv2.imread(str(path)).shape for path in pictures} == {(HEIGHT, WIDTH, 3)}
+    photo = cv2.imread(str(made_scene / "images" / "view_00.png")).astype(float)
+    means = cv2.imread(str(tmp_path / "overlays" / "view_00.means.png")).astype(float)
+    assert np.abs(photo - means).mean() < 12  # the pictures belong to the views that they are named after
+
+
+def test_render(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    cameras = made_scene / "transforms.json"
+    outcome = run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames")
+    assert outcome.code == 0, outcome.err
+    names = sorted(path.name for path in (tmp_path / "frames").iterdir())
+    assert names == [f"view_{i:02d}.png" for i in range(VIEWS)]
+    for name in names:
+        photo = cv2.imread(str(made_scene / "images" / name)).astype(float)
+        render = cv2.imread(str(tmp_path / "frames" / name)).astype(float)
+        assert np.abs(photo - render).mean() < 12
+
+
+def test_preview(scene_copy: Path, run: Run) -> None:
+    assert run("compact", scene_copy, *SMALL, "--quiet").code == 0
+    out = scene_copy / "preview.png"
+    outcome = run("preview", scene_copy / "scene.ply", scene_copy / "scene.compact.ply", "-o", out)
+    assert outcome.code == 0, outcome.err
+    sheet = cv2.imread(str(out))
+    assert sheet.shape[1] >= 3 * WIDTH  # photo, before, after
+    assert sheet.shape[0] >= 4 * HEIGHT
+
+
+def test_version(run: Run) -> None:
+    assert run("--version").out == f"gsmerge {gsmerge.__version__}\n"

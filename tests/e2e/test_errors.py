@@ -1,0 +1,62 @@
+"""What nobody foresaw: one line, the right code, a traceback only on request, no half-written file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from .conftest import Run, listing
+
+
+class Broken:
+    """Stands in for a stage and fails."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+    def __call__(self, *_: object, **__: object) -> None:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (KeyError("lost"), 1, "gsmerge: error: unexpected error: KeyError: 'lost'; run again with --debug\n"),
+        (ValueError("two\nlines"), 1, "gsmerge: error: unexpected error: ValueError: two; run again with --debug\n"),
+        (MemoryError(), 1, "gsmerge: error: out of memory; use a smaller scene or fewer --threads\n"),
+        (KeyboardInterrupt(), 130, "gsmerge: error: interrupted; nothing was written\n"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_failures_inside_the_work(
+    error: BaseException, code: int, line: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.pipeline.compact", Broken(error))
+    before = listing(scene_copy)
+    outcome = run("compact", scene_copy, "--quiet")
+    assert (outcome.code, outcome.err, outcome.out) == (code, line, "")
+    assert listing(scene_copy) == before
+
+
+def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.pipeline.compact", Broken(KeyError("lost")))
+    outcome = run("compact", scene_copy, "--quiet", "--debug")
+    assert outcome.code == 1
+    assert outcome.err.startswith("Traceback (most recent call last):")
+    assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
+
+
+def test_failures_while_writing_leave_nothing(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(path: Path, *_: object, **__: object) -> None:
+        Path(path).write_bytes(b"ply\n")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gsmerge.io.write_ply", half)
+    before = listing(scene_copy)
+    outcome = run("compact", scene_copy, "--quiet", "--superpixels", 40, "--fit", "none", "--no-robust")
+    assert outcome.code == 3
+    assert outcome.err.count("\n") == 1
+    assert "scene.compact.ply" in outcome.err
+    assert "No space left" in outcome.err
+    assert listing(scene_copy) == before
