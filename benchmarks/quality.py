@@ -1,7 +1,7 @@
 """Quality on real scenes: visible PSNR and SSIM of held-out views, unmerged, paper's moment matching, and ours.
 
-    python benchmarks/quality.py eval                       # defaults
-    python benchmarks/quality.py fox,fern --set k=2 density=0.01 robust=false
+python benchmarks/quality.py eval                       # defaults
+python benchmarks/quality.py fox,fern --set k=2 density=0.01 robust=false
 """
 
 from __future__ import annotations

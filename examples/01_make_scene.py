@@ -232,12 +232,13 @@ def photograph(room: list[Surface], c2w: Array, K: Array, width: int, height: in
 def learned_depth(depth: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Depth as a network predicts it, and its confidence in [0, 1], both ``[h,w]``."""
     height, width = depth.shape
-    soft = cv2.GaussianBlur(depth, (0, 0), 1.2)
-    edge = np.clip(np.abs(cv2.GaussianBlur(depth, (0, 0), 0.7) - soft) / (0.02 * depth), 0, 1)
-    bled = depth + (soft - depth) * edge
+    inverse = 1 / depth  # networks smooth inverse depth, so near things grow fat
+    soft = cv2.GaussianBlur(inverse, (0, 0), 1.0)
+    edge = np.clip(np.abs(soft * depth - 1) / 0.05, 0, 1)
+    bled = 1 / (inverse + 0.4 * (soft - inverse) * edge)
     drift = cv2.resize(rng.normal(0, 0.01, (4, 5)), (width, height), interpolation=cv2.INTER_CUBIC)
     bias = rng.normal(0, 0.01)
-    return bled * (1 + bias) * (1 + drift) * (1 + rng.normal(0, 0.003, depth.shape)), 1 - 0.8 * edge
+    return bled * (1 + bias) * (1 + drift) * (1 + rng.normal(0, 0.003, depth.shape)), 1 - 0.7 * edge
 
 
 def pixel_gaussians(

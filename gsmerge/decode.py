@@ -81,5 +81,9 @@ def _children(features: FeatureGaussians, members: Members, count: int) -> Gauss
     moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), child_ids)
     gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
     return to_gaussians(
-        moments.covars, moments.extinctions * gains, spreads, torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
+        moments.covars,
+        moments.extinctions * gains,
+        spreads,
+        torch.from_numpy(moments.means),
+        torch.from_numpy(moments.sh),
     )

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from gsmerge.photos import Photos
-from gsmerge.render import Splats, ViewPlan, composite, contributions, plan_view, prepare, splat_adjoint
+from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import SH_C0, Gaussians
+from gsmerge.weights import ViewWeights, apply, apply_transposed, peak_weights, view_weights
 
 Fit = Literal["none", "color"]
 BLOCK = 32  # pixels of the full-size image
@@ -57,42 +58,62 @@ class FitReport:
     pull: float
 
 
-@dataclass(frozen=True)
-class _System:
-    """Per view: plan, photo minus prior render, prior render, pixel weights ``[h,w]``, exposure gain ``[3]``."""
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """One set of Gaussians against the photos: per view the blending weights and the render with their own colours.
 
-    plans: list[ViewPlan]
+    Args:
+        count: Number of Gaussians, n.
+        views: Blending weights of every view.
+        images: ``[h,w,3]`` renders.
+    """
+
+    count: int
+    views: list[ViewWeights]
+    images: list[np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``."""
+
+    drawn: Drawn
     photos: np.ndarray
-    priors: list[np.ndarray]
     weights: list[np.ndarray]
     gains: np.ndarray
 
 
-def plan_photos(splats: Splats, photos: Photos) -> list[ViewPlan]:
-    """Project, sort and bin the Gaussians for every photo."""
+def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
+    """Render the Gaussians into every photo and keep the blending weights."""
+    splats: Splats = prepare(gaussians)
 
-    def one_view(view: int) -> ViewPlan:
-        return plan_view(
+    def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
+        plan = plan_view(
             splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
         )
+        return view_weights(plan), composite(plan)[0]
 
-    return parallel_map(one_view, range(len(photos)))
+    views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
+    return Drawn(len(gaussians), list(views), list(images))
 
 
-def prune_unseen(gaussians: Gaussians, plans: list[ViewPlan], least: float) -> torch.Tensor:
+def seen(drawn: Drawn, least: float) -> torch.Tensor:
     """Mask of the Gaussians worth keeping: those that show somewhere, or lie in no photo's frustum at all."""
-    peak, inside = np.zeros(len(gaussians)), np.zeros(len(gaussians), bool)
-    for plan, (_, view_peak) in zip(plans, parallel_map(contributions, plans), strict=True):
-        np.maximum(peak, view_peak, out=peak)
-        inside[plan.ids] = True
+    peak, inside = np.zeros(drawn.count, np.float32), np.zeros(drawn.count, bool)
+    for view, peaks in zip(drawn.views, parallel_map(peak_weights, drawn.views), strict=True):
+        peak[view.ids] = np.maximum(peak[view.ids], peaks)
+        inside[view.ids] = True
     return torch.from_numpy(~inside | (peak >= least))
 
 
-def fit_colors(gaussians: Gaussians, photos: Photos, options: FitOptions, seed: int = 0) -> tuple[Gaussians, FitReport]:
+def fit_colors(
+    gaussians: Gaussians, drawn: Drawn, photos: Photos, options: FitOptions, seed: int = 0
+) -> tuple[Gaussians, FitReport]:
     """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
 
     Args:
         gaussians: Geometry and opacities stay as they are; higher SH stay too.
+        drawn: The same Gaussians against the photos, see :func:`draw`.
         photos: The input views.
         options: The solver's settings.
         seed: Chooses the held-out blocks.
@@ -100,10 +121,8 @@ def fit_colors(gaussians: Gaussians, photos: Photos, options: FitOptions, seed: 
     Returns:
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
-    plans = plan_photos(prepare(gaussians), photos)
-    priors = parallel_map(lambda plan: composite(plan)[0], plans)
     train = [_blocks(photos, view, options, seed) for view in range(len(photos))]
-    plain = _System(plans, photos.images, priors, train, np.ones((len(photos), 3)))
+    plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)))
     before = _holdout_psnr(plain, train, None)
     pull = options.pull
     for _ in range(1 + MAX_RETRIES):
@@ -129,14 +148,12 @@ def _holdout_psnr(system: _System, train: list[np.ndarray], offsets: np.ndarray 
     """PSNR (dB) on the held-out blocks, without any exposure gain: as the result will be looked at."""
 
     def one_view(view: int) -> tuple[float, float]:
-        image = system.priors[view]
-        if offsets is not None:
-            image = image + composite(system.plans[view], offsets)[0]
+        image = _image(system, view, offsets)
         error = ((np.clip(image, 0, 1) - system.photos[view]) ** 2).sum(-1)
         held = train[view] == 0
         return float(error[held].sum(dtype=np.float64)), float(held.sum())
 
-    error, count = np.sum(parallel_map(one_view, range(len(system.plans))), axis=0)
+    error, count = np.sum(parallel_map(one_view, range(len(system.photos))), axis=0)
     return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
 
 
@@ -147,7 +164,7 @@ def _solve(plain: _System, options: FitOptions, pull: float) -> tuple[_System, n
     and another third follows.
     """
     steps = max(1, options.iterations // 3)
-    offsets = _conjugate_gradients(plain, np.zeros((len(plain.plans[0].splats), 3)), steps, pull)
+    offsets = _conjugate_gradients(plain, np.zeros((plain.drawn.count, 3)), steps, pull)
     system = _reweighed(plain, plain.weights, offsets, options)
     return system, _conjugate_gradients(system, offsets, steps, pull)
 
@@ -176,46 +193,47 @@ def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, pull: 
     return x
 
 
+def _image(system: _System, view: int, offsets: np.ndarray | None) -> np.ndarray:
+    """Render of a view with offsets on the base colours."""
+    image = system.drawn.images[view]
+    return image if offsets is None else image + apply(system.drawn.views[view], offsets)
+
+
 def _residual(system: _System, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Diagonal scale ``[n,3]`` and negative gradient ``[n,3]`` of the data term at ``x``."""
 
     def one_view(view: int) -> np.ndarray:
-        plan, weight = system.plans[view], system.weights[view][..., None]
-        gain = system.gains[view].astype(np.float32)
-        image = system.priors[view] + composite(plan, x)[0]
-        residual = weight * (system.photos[view] - gain * image)
-        sums = splat_adjoint(plan, np.concatenate([residual, weight], -1)).astype(np.float64)
-        return np.concatenate([sums[:, 3:] * gain**2, sums[:, :3] * gain], 1)
+        weight, gain = system.weights[view][..., None], system.gains[view].astype(np.float32)
+        residual = weight * (system.photos[view] - gain * _image(system, view, x))
+        return apply_transposed(system.drawn.views[view], np.concatenate([residual, weight], -1))
 
-    sums = _sum_views(one_view, len(system.plans))
-    return sums[:, :3], sums[:, 3:]
+    mass, gradient = np.zeros_like(x), np.zeros_like(x)
+    for view, sums in enumerate(parallel_map(one_view, range(len(system.photos)))):
+        ids, gain = system.drawn.views[view].ids, system.gains[view]
+        mass[ids] += sums[:, 3:] * gain**2
+        gradient[ids] += sums[:, :3] * gain
+    return mass, gradient
 
 
 def _normal(system: _System, x: np.ndarray) -> np.ndarray:
     """Normal matrix of the data term times ``x``."""
 
     def one_view(view: int) -> np.ndarray:
-        plan, gain = system.plans[view], system.gains[view]
-        image = composite(plan, x)[0] * system.weights[view][..., None]
-        return splat_adjoint(plan, image) * gain**2
+        matrix = system.drawn.views[view]
+        return apply_transposed(matrix, apply(matrix, x) * system.weights[view][..., None])
 
-    return _sum_views(one_view, len(system.plans))
-
-
-def _sum_views(function, count: int) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """Sum of per-view arrays in the order of the views, so that the threads cannot change it."""
-    total = None
-    for part in parallel_map(function, range(count)):
-        total = part.astype(np.float64) if total is None else np.add(total, part, out=total)
-    assert total is not None
+    # views are added in their order, so that the threads cannot change the sum
+    total = np.zeros_like(x)
+    for view, sums in enumerate(parallel_map(one_view, range(len(system.photos)))):
+        total[system.drawn.views[view].ids] += sums * system.gains[view] ** 2
     return total
 
 
 def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: FitOptions) -> _System:
-    """Weights ``base`` times Huber weights from the present residuals, and per-view exposure gains with geometric mean one."""
+    """Weights ``base`` times Huber weights of the present residuals; exposure gains with geometric mean one."""
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        image = system.priors[view] + composite(system.plans[view], x)[0]
+        image = _image(system, view, x)
         photo, weight = system.photos[view], base[view][..., None]
         error = np.sqrt(((photo - image) ** 2).mean(-1))
         robust = base[view] * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
@@ -223,7 +241,7 @@ def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: 
         ratio = (calm * photo * image).sum((0, 1)) / np.maximum((calm * image * image).sum((0, 1)), 1e-9)
         return robust, np.clip(ratio, 1 / options.max_gain, options.max_gain)
 
-    weights, gains = zip(*parallel_map(one_view, range(len(system.plans))), strict=True)
+    weights, gains = zip(*parallel_map(one_view, range(len(system.photos))), strict=True)
     gains = np.stack(gains)
     gains /= np.exp(np.log(gains).mean(0))
     return replace(system, weights=list(weights), gains=gains)

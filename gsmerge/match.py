@@ -58,7 +58,14 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     colors = SH_C0 * features.sh0[:, 0].double().numpy()[front]
     scores = np.empty(neighbors.shape)
     edge_scores(
-        neighbors, means, np.ascontiguousarray(covars), colors, views, options.max_color, options.match == "aabb", scores
+        neighbors,
+        means,
+        np.ascontiguousarray(covars),
+        colors,
+        views,
+        options.max_color,
+        options.match == "aabb",
+        scores,
     )
     if options.match == "aabb":
         found, num_found = connected_components(neighbors, scores, options.overlap)

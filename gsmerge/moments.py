@@ -116,7 +116,9 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(scales, MIN_SCALE), quats
 
 
-def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, spreads: np.ndarray, means: Tensor, sh: Tensor) -> Gaussians:
+def to_gaussians(
+    covars: np.ndarray, extinctions: np.ndarray, spreads: np.ndarray, means: Tensor, sh: Tensor
+) -> Gaussians:
     """Gaussians of given moments; opacity from the conserved optical depth over the (unspread) disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))

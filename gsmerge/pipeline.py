@@ -17,7 +17,7 @@ from gsmerge.backing import encode_backing
 from gsmerge.canonical import canonicalise
 from gsmerge.decode import decode
 from gsmerge.encode import encode
-from gsmerge.fit import fit_colors, plan_photos, prune_unseen
+from gsmerge.fit import draw, fit_colors, seen
 from gsmerge.match import match
 from gsmerge.merge import merge
 from gsmerge.metrics import psnr
@@ -124,8 +124,9 @@ def compact(
     if progress:
         progress("done", len(STAGES), len(STAGES))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    counts = len(scene.gaussians), len(gaussians)
     report = CompactReport(
-        len(scene.gaussians), len(gaussians), run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak
+        *counts, run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak_memory_bytes=peak
     )
     return CompactResult(gaussians, report)
 
@@ -162,16 +163,16 @@ def _own_colors(scene: PixelScene) -> torch.Tensor:
 def _fitted(gaussians: Gaussians, scene: PixelScene, options: CompactOptions, run: _Run) -> Gaussians:
     """Gaussians that no photo shows left out, colours fitted."""
     photos = scene_photos(scene, options.fit.fit_level)
-    keep = prune_unseen(gaussians, plan_photos(prepare(gaussians), photos), options.fit.prune)
+    drawn = draw(gaussians, photos)
+    keep = seen(drawn, options.fit.prune)
     run.choices["pruned"] = int((~keep).sum())
-    gaussians = gaussians[keep]
     if options.fit.fit == "none":
-        return gaussians
-    gaussians, report = fit_colors(gaussians, photos, options.fit, options.seed)
+        return gaussians[keep]
+    gaussians, report = fit_colors(gaussians, drawn, photos, options.fit, options.seed)
     run.choices["fit"] = report.__dict__
     if not report.accepted:
         run.notes.append("the colour fit was not accepted: held-out parts of the photos did not get better")
-    return gaussians
+    return gaussians[keep]
 
 
 def input_psnr(gaussians: Gaussians, photos: Photos) -> float:

@@ -130,4 +130,5 @@ def draw_heat(values: Tensor) -> Picture:
     """``[h,w]`` non-negative values as a heat map, the 99th percentile at the top."""
     top = float(torch.quantile(values.double().flatten(), 0.99)) or 1.0
     level = (values.double() / top).clamp(0, 1)
-    return cv2.applyColorMap((level.numpy() * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+    colored = cv2.applyColorMap((level.numpy() * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
+    return np.ascontiguousarray(colored[..., ::-1], np.uint8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,8 @@ def report_document(
     output_path: Path,
     seconds_before: Mapping[str, float],
     seconds_after: Mapping[str, float],
+    recognised: Mapping[str, Any] | None = None,
+    notes: Sequence[str] = (),
     hashed: bool = True,
 ) -> dict[str, Any]:
     """The report of one ``compact`` as plain JSON types.
@@ -57,6 +59,8 @@ def report_document(
         output_path: The ``.ply`` that was written.
         seconds_before: Wall time by name of what came before the report's stages (imports, reading).
         seconds_after: The same for what came after them (writing).
+        recognised: What is known of the input beside path, bytes and count (layout, views, ...).
+        notes: What the reader had to say; the report's own notes follow.
         hashed: Also hash the input, which takes time on large files.
 
     Returns:
@@ -73,6 +77,7 @@ def report_document(
             "sha256": file_sha256(input_path) if hashed else None,
             "bytes": input_path.stat().st_size,
             "num_gaussians": numbers["num_input"],
+            **(recognised or {}),
         },
         "output": {
             "path": os.fspath(output_path),
@@ -87,7 +92,7 @@ def report_document(
         "total_seconds": round(sum(stages.values()), 4),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "peak_memory_bytes": numbers["peak_memory_bytes"],
-        "notes": list(numbers["notes"]),
+        "notes": [*notes, *numbers["notes"]],
     }
 
 

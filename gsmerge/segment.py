@@ -95,9 +95,7 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -
     wanted = count_for(options, height, width) if count is None else count
 
     def one_view(image: Tensor) -> Tensor:
-        return superpixels(
-            image, wanted, options.method, preset=options.preset, compactness=options.compactness
-        )
+        return superpixels(image, wanted, options.method, preset=options.preset, compactness=options.compactness)
 
     labels = parallel_map(one_view, images.unbind(0))
     stacked = torch.stack(labels) if labels else torch.empty((0, height, width), dtype=torch.int32)
@@ -175,7 +173,7 @@ def _as_pixels(image: Tensor | np.ndarray) -> np.ndarray:
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image: expected shape [h, w, 3], got {list(array.shape)}")
     if array.dtype == np.uint8:
-        return array.astype(np.float32) / np.float32(255)
+        return np.divide(array, np.float32(255), dtype=np.float32, order="C")
     if not np.issubdtype(array.dtype, np.floating):
         raise ValueError(f"image: expected uint8 or float, got {array.dtype}")
     low, high = array.min(), array.max()

@@ -251,7 +251,9 @@ class FeatureGaussians:
     def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
         """All groups of all parts in order."""
         columns = {
-            f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(FeatureGaussians) if f.name != "starts"
+            f.name: torch.cat([getattr(p, f.name) for p in parts])
+            for f in fields(FeatureGaussians)
+            if f.name != "starts"
         }
         sizes = torch.cat([p.starts[1:] - p.starts[:-1] for p in parts])
         starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])

@@ -41,6 +41,12 @@ def make_scene() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
+def target_psnr() -> Callable[[Path, Path], float]:
+    """``target_psnr(targets, ply)`` of the measuring example, dB."""
+    return load_script(ROOT / "examples" / "03_measure_targets.py").target_psnr
+
+
+@pytest.fixture(scope="session")
 def made_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scene.ply, transforms.json, images/ and targets/: 5 views of 96 x 64. Read only."""
     return make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=96, height=64)

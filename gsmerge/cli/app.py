@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,6 +20,7 @@ from gsmerge.cli.segment import segment
 from gsmerge.errors import GsmergeError
 
 PROGRAM = "gsmerge"
+INTERRUPTED = 130
 
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
@@ -53,7 +54,7 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _usage_message(error: typer.BadParameter) -> str:
+def _usage_message(error: Any) -> str:
     context = error.ctx
     place = context.command_path if context is not None else PROGRAM
     return f"{error.format_message().rstrip('.')}; see '{place} --help'"
@@ -64,11 +65,12 @@ def run(args: Sequence[str] | None = None) -> int:
     set_debug(False)
     try:
         with plain_warnings():
-            return app(args=args, prog_name=PROGRAM, standalone_mode=False) or 0
+            code = app(args=args, prog_name=PROGRAM, standalone_mode=False) or 0
+        return _fail("interrupted", code) if code == INTERRUPTED else code  # typer turns Ctrl-C into this code
     except GsmergeError as error:
         return _fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; nothing was written", 130)
+        return _fail("interrupted", INTERRUPTED)
     except MemoryError:
         return _fail("out of memory; use a smaller scene or fewer --threads", 1)
     except Exception as error:

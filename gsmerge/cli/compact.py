@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say, stage_progress
 from gsmerge.cli.paths import check_output, default_output
-from gsmerge.cli.superpixels import superpixels_per_view
+from gsmerge.cli.settings import superpixels_per_view, told_as_usage
 
 if TYPE_CHECKING:
-    from gsmerge.io import SceneFiles
+    from gsmerge.io import SceneFiles, SceneLoad
     from gsmerge.io.ply import OpacityChoice
     from gsmerge.options import CompactOptions
 
@@ -52,7 +52,13 @@ def compact(
     check_output(out, (files.ply,), overwrite=overwrite)
     if report is not None:
         check_output(report, (files.ply, out), overwrite=overwrite)
-    chosen = {"k": k, "superpixels": superpixels, "density": density, "method": method, "preset": preset}
+    chosen: dict[str, Any] = {
+        "k": k,
+        "superpixels": superpixels,
+        "density": density,
+        "method": method,
+        "preset": preset,
+    }
     chosen |= {"robust": robust, "match": match, "fit": fit, "seed": seed, "threads": threads}
     settings = _settings(chosen)
     if dry_run:
@@ -70,7 +76,8 @@ def _settings(chosen: Mapping[str, Any]) -> CompactOptions:
     from gsmerge.options import CompactOptions
 
     given = {name: value.value if isinstance(value, Enum) else value for name, value in chosen.items()}
-    return CompactOptions().with_settings({name: value for name, value in given.items() if value is not None})
+    with told_as_usage():
+        return CompactOptions().with_settings({name: value for name, value in given.items() if value is not None})
 
 
 def _run(
@@ -92,8 +99,6 @@ def _run(
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
         loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
-        for note in loaded.notes:
-            say(note, quiet=quiet)
         superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
         read = perf_counter()
         with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
@@ -106,8 +111,18 @@ def _run(
         output_path=out,
         seconds_before={"import": imported - start, "read": read - imported},
         seconds_after={"write": perf_counter() - compacted},
+        recognised=_recognised(loaded),
+        notes=loaded.notes,
         hashed=hashed,
     )
+
+
+def _recognised(loaded: SceneLoad) -> dict[str, Any]:
+    """What the report says about the input."""
+    names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
+    cameras = loaded.scene.cameras
+    views = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    return views | {name: getattr(loaded.ply, name) for name in names}
 
 
 def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, quiet: bool, overwrite: bool) -> None:

@@ -97,7 +97,7 @@ SuperpixelsOption = Annotated[
 ]
 DensityOption = Annotated[
     float | None,
-    typer.Option(min=0.0, max=1.0, help="Superpixels per pixel.", show_default="0.01", rich_help_panel=SEGMENTATION),
+    typer.Option(min=0.0, max=1.0, help="Superpixels per pixel.", show_default="0.044", rich_help_panel=SEGMENTATION),
 ]
 MethodOption = Annotated[
     Method | None,

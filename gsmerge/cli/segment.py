@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -11,7 +11,7 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say
 from gsmerge.cli.paths import check_folder
 from gsmerge.cli.pictures import write_picture
-from gsmerge.cli.superpixels import superpixels_per_view
+from gsmerge.cli.settings import superpixels_per_view, told_as_usage
 
 
 def segment(
@@ -38,9 +38,10 @@ def segment(
     from gsmerge.segment import segment as segment_images
     from gsmerge.threads import use_threads
 
-    chosen = {"superpixels": superpixels, "density": density}
+    chosen: dict[str, Any] = {"superpixels": superpixels, "density": density}
     chosen |= {"method": method and method.value, "preset": preset and preset.value}
-    options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
+    with told_as_usage():
+        options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
     pixel_scene = read_scene(scene, cameras=cameras, images=images)
     superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
     pictures = preview.view_pictures(pixel_scene)

@@ -85,7 +85,7 @@ def _measure(sample: _Sample, cameras: Cameras) -> Alignment:
     image = camera @ Ks.transpose(1, 2)
     in_front = camera[..., 2] > 0
     distance = (image[..., :2] / image[..., 2:] - sample.pixels).norm(dim=-1)
-    distance = torch.where(in_front, distance, torch.inf).nan_to_num(nan=torch.inf)
+    distance = torch.where(in_front, distance, torch.inf).nan_to_num(nan=torch.inf, posinf=torch.inf)
     median = [float(d[ok].median()) if ok.any() else math.nan for d, ok in zip(distance, sample.valid, strict=True)]
     tested = max(1, int(sample.valid.sum()))
     share = float((in_front & sample.valid).sum()) / tested

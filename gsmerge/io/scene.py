@@ -94,7 +94,7 @@ def align_scene(ply: PlyScene, files: SceneFiles, camera_file: CameraFile | None
         SceneError: As :func:`read_scene`.
     """
     if files.cameras is None:
-        places = ", ".join(place for place in CAMERA_PLACES if place != ".")
+        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         raise SceneError(files.ply, f"no cameras found beside it (looked for {places})", "name them with --cameras")
     camera_file = read_cameras(files.cameras) if camera_file is None else camera_file
     names = camera_file.names

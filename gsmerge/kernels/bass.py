@@ -17,7 +17,7 @@ COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
 POTTS = 0.5
 PRIOR_WEIGHT = 50  # pseudo-observations of the shape prior per pixel of a superpixel's expected area
 NUM_PASSES = 4  # label passes per update of the parameters
-XX, XY, YY, LOG_DET, ROW = 5, 6, 7, 8, 9  # columns after the mean (three colours, x, y): inverse covariance
+XX, XY, YY, LOG_DET, ROW = 5, 6, 7, 8, 9  # columns after the mean (three colours, x, y)
 
 
 def simple_point_table():
@@ -62,7 +62,7 @@ def fit_regions(labels, colours, count):
         xy = (sums[label, XY] - n * mean_x * mean_y) * weight
         yy = (area * area + sums[label, YY] - n * mean_y * mean_y) * weight
         det = xx * yy - xy * xy
-        rows[label, XX], rows[label, XY], rows[label, YY] = yy / det, -xy / det, xx / det
+        rows[label, XX], rows[label, XY], rows[label, YY] = yy / det, -2 * xy / det, xx / det
         rows[label, LOG_DET] = np.log(det)
     return rows
 
@@ -72,39 +72,13 @@ def log_posterior(rows, label, c0, c1, c2, x, y, num_foreign, precision):
     """Twice the logarithm of the posterior of a label for a pixel, up to a constant."""
     d0, d1, d2 = c0 - rows[label, 0], c1 - rows[label, 1], c2 - rows[label, 2]
     dx, dy = x - rows[label, 3], y - rows[label, 4]
-    shape = rows[label, XX] * dx * dx + 2 * rows[label, XY] * dx * dy + rows[label, YY] * dy * dy
+    shape = rows[label, XX] * dx * dx + rows[label, XY] * dx * dy + rows[label, YY] * dy * dy
     colour = precision * (d0 * d0 + d1 * d1 + d2 * d2)
     return -(colour + shape + rows[label, LOG_DET] + np.float32(POTTS) * num_foreign)
 
 
 @kernel
-def _best_label(labels, y, x, table, ones, colours, rows, precision):
-    """The label that a border pixel should have; its own where a change could take any label apart."""
-    own = labels[y, x]
-    candidates = (labels[y - 1, x], labels[y, x + 1], labels[y + 1, x], labels[y, x - 1])
-    own_mask = ring_mask(labels, y, x, own)
-    if table[own_mask] == 0:
-        return own
-    c0, c1, c2 = colours[y - 1, x - 1, 0], colours[y - 1, x - 1, 1], colours[y - 1, x - 1, 2]
-    across, down = np.float32(x - 1), np.float32(y - 1)
-    best_label = own
-    best = log_posterior(rows, own, c0, c1, c2, across, down, 8 - ones[own_mask], precision)
-    tried = own
-    for label in candidates:
-        if label < 0 or label == own or label == tried:
-            continue
-        tried = label
-        mask = ring_mask(labels, y, x, label)
-        if table[mask] == 0:
-            return own
-        score = log_posterior(rows, label, c0, c1, c2, across, down, 8 - ones[mask], precision)
-        if score > best:
-            best, best_label = score, label
-    return best_label
-
-
-@kernel
-def label_pass(labels, colours, rows, table, ones, precision):
+def label_pass(labels, colours, rows, table, foreign, precision):
     """One pass over all border pixels, in four grids of pixels that do not touch; returns how many changed.
 
     No two pixels of a grid are neighbours, so their order does not matter.
@@ -118,7 +92,22 @@ def label_pass(labels, colours, rows, table, ones, precision):
                 north, east, south, west = labels[y - 1, x], labels[y, x + 1], labels[y + 1, x], labels[y, x - 1]
                 if (north == own) & (east == own) & (south == own) & (west == own):
                     continue
-                label = _best_label(labels, y, x, table, ones, colours, rows, precision)
+                mask = ring_mask(labels, y, x, own)
+                if table[mask] == 0:
+                    continue
+                c0, c1, c2 = colours[y - 1, x - 1, 0], colours[y - 1, x - 1, 1], colours[y - 1, x - 1, 2]
+                across, down, label = np.float32(x - 1), np.float32(y - 1), own
+                best = log_posterior(rows, own, c0, c1, c2, across, down, foreign[mask], precision)
+                for rival in (north, east, south, west):
+                    if rival < 0 or rival == own or rival == label:  # noqa: SIM109 - faster
+                        continue
+                    mask = ring_mask(labels, y, x, rival)
+                    if table[mask] == 0:
+                        label = own
+                        break
+                    score = log_posterior(rows, rival, c0, c1, c2, across, down, foreign[mask], precision)
+                    if score > best:
+                        best, label = score, rival
                 if label != own:
                     labels[y, x] = label
                     num_changed += 1
@@ -135,11 +124,11 @@ def infer_labels(labels, colours, count):
     """
     height, width, _ = colours.shape
     table = simple_point_table()
-    ones = ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
+    foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
     for _ in range(max(1, round((height * width / count) ** 0.5))):
         rows = fit_regions(labels, colours, count)
         for _ in range(NUM_PASSES):
-            if label_pass(labels, colours, rows, table, ones, precision) == 0:
+            if label_pass(labels, colours, rows, table, foreign, precision) == 0:
                 break
     return labels

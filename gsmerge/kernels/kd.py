@@ -34,7 +34,7 @@ def integral_image(pixels):
     return integral
 
 
-@kernel
+@kernel(inline=True)
 def cut_gain(integral, near, far, step, side, num_pixels, compactness):
     """Where to cut a rectangle across one of its sides, and by how much that lowers its squared error.
 
@@ -74,8 +74,8 @@ def cut_gain(integral, near, far, step, side, num_pixels, compactness):
     return best / num_pixels, best_cut
 
 
-@kernel
-def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, heads, gain, gain_bits):
+@kernel(inline=True)
+def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, heads, gain, bits):
     """Store a rectangle with its best cut, in the bucket of the cut's gain or ``limit``; single pixels wait nowhere.
 
     A cut below another waits for it anyway, so its bucket never needs to be above the one being emptied.
@@ -89,7 +89,7 @@ def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, 
     nodes[node, CUT] = y0 + cut_y if gain_y >= gain_x else -(x0 + cut_x)
     gain[0] = max(gain_y, gain_x)
     if gain[0] >= 0:
-        bucket = min(limit, gain_bits[0] >> BUCKET_SHIFT)
+        bucket = min(limit, bits[0] >> BUCKET_SHIFT)
         nodes[node, NEXT] = heads[bucket]
         heads[bucket] = node
 
@@ -123,15 +123,13 @@ def split_rectangles(pixels, count, block, compactness):
     nodes = np.empty((max(count, num_rows * num_columns), 8), np.int32)
     heads = np.full(NUM_BUCKETS, -1)
     gain = np.empty(1, np.float32)
-    gain_bits = gain.view(np.int32)
+    bits = gain.view(np.int32)
     num_leaves, bucket = 0, NUM_BUCKETS - 1
     for i in range(num_rows):
         y0, y1 = i * height // num_rows, (i + 1) * height // num_rows
         for j in range(num_columns):
             x0, x1 = j * width // num_columns, (j + 1) * width // num_columns
-            _enqueue(
-                num_leaves, y0, x0, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, gain_bits
-            )
+            _enqueue(num_leaves, y0, x0, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, bits)
             num_leaves += 1
     while num_leaves < count and bucket >= 0:
         node = heads[bucket]
@@ -139,13 +137,13 @@ def split_rectangles(pixels, count, block, compactness):
             bucket -= 1
             continue
         heads[bucket] = nodes[node, NEXT]
-        y0, x0, y1, x1 = np.int64(nodes[node, 0]), np.int64(nodes[node, 1]), np.int64(nodes[node, 2]), np.int64(nodes[node, 3])
-        cut = np.int64(nodes[node, CUT])
-        end_y, end_x = (cut, x1) if cut >= 0 else (y1, -cut)  # of the first part
-        start_y, start_x = (cut, x0) if cut >= 0 else (y0, -cut)  # of the second
-        _enqueue(node, y0, x0, end_y, end_x, bucket, integral, stride, compactness, nodes, heads, gain, gain_bits)
-        _enqueue(
-            num_leaves, start_y, start_x, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, gain_bits
-        )
+        y0, x0, y1, x1 = nodes[node, 0], nodes[node, 1], nodes[node, 2], nodes[node, 3]
+        row, column = max(nodes[node, CUT], y0), max(-nodes[node, CUT], x0)  # where the second part starts
+        across = row > y0
+        for part in range(2):
+            top, left = (row, column) if part == 1 else (y0, x0)
+            bottom, right = (y1, x1) if part == 1 else (row if across else y1, x1 if across else column)
+            target = num_leaves if part == 1 else node
+            _enqueue(target, top, left, bottom, right, bucket, integral, stride, compactness, nodes, heads, gain, bits)
         num_leaves += 1
     return _paint(nodes, num_leaves, height, width), num_leaves

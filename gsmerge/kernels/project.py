@@ -39,7 +39,17 @@ def _cull_block(block, camera):
 
     Planes: mean x, y, z, scales x, y, z, opacity.
     """
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8]
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
+        camera[0],
+        camera[1],
+        camera[2],
+        camera[3],
+        camera[4],
+        camera[5],
+        camera[6],
+        camera[7],
+        camera[8],
+    )
     t0, t1, t2 = camera[SHIFT], camera[SHIFT + 1], camera[SHIFT + 2]
     fx, fy, cx, cy, width, height = camera[FX], camera[FY], camera[CX], camera[CY], camera[WIDTH], camera[HEIGHT]
     near, far, eps2d = camera[NEAR], camera[FAR], camera[EPS2D]
@@ -117,7 +127,17 @@ def _project_block(block, camera):
     Planes out: mean_x, mean_y, rate_x, slope, rate_y, lnop, variance x, variance y, depth, density ratio of the
     undilated footprint.
     """
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8]
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
+        camera[0],
+        camera[1],
+        camera[2],
+        camera[3],
+        camera[4],
+        camera[5],
+        camera[6],
+        camera[7],
+        camera[8],
+    )
     t0, t1, t2 = camera[SHIFT], camera[SHIFT + 1], camera[SHIFT + 2]
     fx, fy, cx, cy, eps2d = camera[FX], camera[FY], camera[CX], camera[CY], camera[EPS2D]
     right, left, below, above = camera[LIMIT_X], camera[LIMIT_X + 1], camera[LIMIT_Y], camera[LIMIT_Y + 1]
@@ -151,8 +171,16 @@ def _project_block(block, camera):
         m00, m01, m02 = one - h * (qy * qy + qz * qz), h * (qx * qy - qw * qz), h * (qx * qz + qw * qy)
         m10, m11, m12 = h * (qx * qy + qw * qz), one - h * (qx * qx + qz * qz), h * (qy * qz - qw * qx)
         m20, m21, m22 = h * (qx * qz - qw * qy), h * (qy * qz + qw * qx), one - h * (qx * qx + qy * qy)
-        u0, u1, u2 = (a0 * m00 + a1 * m10 + a2 * m20) * s0, (a0 * m01 + a1 * m11 + a2 * m21) * s1, (a0 * m02 + a1 * m12 + a2 * m22) * s2
-        v0, v1, v2 = (b0 * m00 + b1 * m10 + b2 * m20) * s0, (b0 * m01 + b1 * m11 + b2 * m21) * s1, (b0 * m02 + b1 * m12 + b2 * m22) * s2
+        u0, u1, u2 = (
+            (a0 * m00 + a1 * m10 + a2 * m20) * s0,
+            (a0 * m01 + a1 * m11 + a2 * m21) * s1,
+            (a0 * m02 + a1 * m12 + a2 * m22) * s2,
+        )
+        v0, v1, v2 = (
+            (b0 * m00 + b1 * m10 + b2 * m20) * s0,
+            (b0 * m01 + b1 * m11 + b2 * m21) * s1,
+            (b0 * m02 + b1 * m12 + b2 * m22) * s2,
+        )
         uu, vv, uv = u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2, u0 * v0 + u1 * v1 + u2 * v2
         # |u x v|^2 = |u|^2 |v|^2 - (u.v)^2 without its cancellation: thin footprints keep a positive determinant
         n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
@@ -217,7 +245,12 @@ def project(means, quats, scales, lnops, ids, camera, footprints, depths, boxes)
             i = np.uint64(ids[start + lane])
             j = np.uint64(lane)
             block[j], block[j + P1], block[j + P2] = means[i, 0], means[i, 1], means[i, 2]
-            block[j + P3], block[j + P4], block[j + P5], block[j + P6] = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+            block[j + P3], block[j + P4], block[j + P5], block[j + P6] = (
+                quats[i, 0],
+                quats[i, 1],
+                quats[i, 2],
+                quats[i, 3],
+            )
             block[j + P7], block[j + P8], block[j + P9] = scales[i, 0], scales[i, 1], scales[i, 2]
             block[j + P10] = lnops[start + lane]
         _project_block(block, camera)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
+from gsmerge.kernels.prefetch import prefetch_row
 from gsmerge.kernels.project import LN_CUT, TILE
 
 PLANE = TILE * TILE
@@ -22,7 +23,6 @@ MAX_ALPHA, MIN_TRANSMITTANCE = f4(0.99), f4(1e-4)
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
 
 P1, P2, P3, P4, P5 = (np.uint64(PLANE * plane) for plane in range(1, 6))
-A1, A2, A3, A4 = (np.uint64(PLANE * 5 + TILE * row) for row in range(4))  # one row of lanes per channel
 
 # exp(p) = poly(p)^8 on [ln(1/255), 0]: minimax of relative error 8e-8 for exp(p / 8), coefficients scaled by 8^-k.
 E0, E1, E2 = f4(0.99999992), f4(0.12499907), f4(0.0078106653)
@@ -41,8 +41,9 @@ def _alpha(p):
 
 
 @kernel
-def _gather(footprints, members, first, last, left, top, batch):
-    """Copy footprints into the batch, relative to the tile's corner pixel centre."""
+def _gather(footprints, members, first, last, end, tile_x, tile_y, batch):
+    """Copy footprints into the batch, relative to the tile's first pixel centre, and call for the next batch's."""
+    left, top = f4(tile_x) + f4(0.5), f4(tile_y) + f4(0.5)
     for i in range(first, last):
         k = np.uint64(members[i])
         j = np.uint64(i - first)
@@ -50,8 +51,10 @@ def _gather(footprints, members, first, last, left, top, batch):
         batch[j, 1] = footprints[k, 1] - top
         for q in range(2, 6):
             batch[j, q] = footprints[k, q]
-        batch[j, 6] = footprints[k, 6] - top + f4(0.5)
-        batch[j, 7] = footprints[k, 7] - top + f4(0.5)
+        batch[j, 6] = footprints[k, 6] - f4(tile_y)
+        batch[j, 7] = footprints[k, 7] - f4(tile_y)
+    for i in range(last, min(end, last + BATCH)):
+        prefetch_row(footprints, members[i])
 
 
 @kernel
@@ -68,6 +71,16 @@ def _row_is_live(state, y):
     for x in range(TILE):
         live |= state[y * TILE + x] > f4(0.0)
     return live
+
+
+@kernel
+def _live_rows(state, y_low, y_high):
+    """Narrow the range of rows to those where a pixel still goes on."""
+    while y_low <= y_high and not _row_is_live(state, y_low):
+        y_low += 1
+    while y_high >= y_low and not _row_is_live(state, y_high):
+        y_high -= 1
+    return y_low, y_high
 
 
 @kernel
@@ -125,17 +138,16 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, f4(left) + f4(0.5), f4(top) + f4(0.5), batch)
+            _gather(footprints, members, start, stop, end, left, top, batch)
             for i in range(start, stop):
                 k = np.uint64(members[i])
                 j = np.uint64(i - start)
                 batch[j, 8], batch[j, 9], batch[j, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
+            for i in range(stop, min(end, stop + BATCH)):
+                prefetch_row(colors, members[i])
             _blend(state, batch, stop - start, y_low, y_high)
             start = stop
-            while y_low <= y_high and not _row_is_live(state, y_low):
-                y_low += 1
-            while y_high >= y_low and not _row_is_live(state, y_high):
-                y_high -= 1
+            y_low, y_high = _live_rows(state, y_low, y_high)
         for y in range(num_y):
             for x in range(num_x):
                 i = np.uint64(y * TILE + x)
@@ -148,43 +160,34 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
 
 @kernel
 def _sum_weights(state, batch, count, y_low, y_high, slots, start):
-    """Per Gaussian of a batch: weights times planes 1 to 4, summed over the tile."""
+    """Per Gaussian of a batch: weights times planes 1 to 4, summed over the tile; plane 5 holds the weights."""
     for j in range(count):
         y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
         mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-        for x in range(TILE):
-            i = np.uint64(x)
-            state[i + A1] = f4(0.0)
-            state[i + A2] = f4(0.0)
-            state[i + A3] = f4(0.0)
-            state[i + A4] = f4(0.0)
         for y in range(y0, y1 + 1):
             dy = f4(y) - my
             top = lnop - decay * dy * dy
             centre = rate * (mx + slope * dy)
             row = np.uint64(y * TILE)
             for x in range(TILE):
-                lane = np.uint64(x)
-                i = row + lane
+                i = row + np.uint64(x)
                 d = rate * f4(x) - centre
                 a = _alpha(top - d * d)
                 t = state[i]
                 w = a * t
                 left = t - w
                 stop = left <= MIN_TRANSMITTANCE
-                w = f4(0.0) if stop else w
-                state[lane + A1] += w * state[i + P1]
-                state[lane + A2] += w * state[i + P2]
-                state[lane + A3] += w * state[i + P3]
-                state[lane + A4] += w * state[i + P4]
+                state[i + P5] = f4(0.0) if stop else w
                 state[i] = -abs(t) if stop else left
         s1, s2, s3, s4 = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
-        for x in range(TILE):
-            i = np.uint64(x)
-            s1 += state[i + A1]
-            s2 += state[i + A2]
-            s3 += state[i + A3]
-            s4 += state[i + A4]
+        first = np.uint64(y0 * TILE)
+        for x in range((y1 - y0 + 1) * TILE):
+            i = first + np.uint64(x)
+            w = state[i + P5]
+            s1 += w * state[i + P1]
+            s2 += w * state[i + P2]
+            s3 += w * state[i + P3]
+            s4 += w * state[i + P4]
         slots[start + j, 0], slots[start + j, 1], slots[start + j, 2], slots[start + j, 3] = s1, s2, s3, s4
 
 
@@ -203,7 +206,7 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
         slots: ``[intersections,CHANNELS]`` float32, written in the tiles' part.
     """
     height, width, channels = image.shape
-    state = np.empty(5 * PLANE + CHANNELS * TILE, np.float32)
+    state = np.empty(6 * PLANE, np.float32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(first, last):
         left, top = tile % columns * TILE, tile // columns * TILE
@@ -218,13 +221,10 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, f4(left) + f4(0.5), f4(top) + f4(0.5), batch)
+            _gather(footprints, members, start, stop, end, left, top, batch)
             _sum_weights(state, batch, stop - start, y_low, y_high, slots, start)
             start = stop
-            while y_low <= y_high and not _row_is_live(state, y_low):
-                y_low += 1
-            while y_high >= y_low and not _row_is_live(state, y_high):
-                y_high -= 1
+            y_low, y_high = _live_rows(state, y_low, y_high)
         slots[start:end] = f4(0.0)
 
 
@@ -240,7 +240,9 @@ def add_slots(members, slots, ids, first, sums):
         sums: ``[n,c]`` float32, added to.
     """
     num = min(CHANNELS, sums.shape[1] - first)
+    last = members.shape[0] - 1
     for i in range(members.shape[0]):
+        prefetch_row(sums, ids[members[min(i + BATCH, last)]])
         k = ids[members[i]]
         for c in range(num):
             sums[k, first + c] += slots[i, c]
@@ -308,10 +310,7 @@ def contributions(footprints, members, offsets, columns, height, width, mass, pe
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, f4(left) + f4(0.5), f4(top) + f4(0.5), batch)
+            _gather(footprints, members, start, stop, end, left, top, batch)
             _mass_and_peak(state, batch, stop - start, y_low, y_high, start, members, mass, peak)
             start = stop
-            while y_low <= y_high and not _row_is_live(state, y_low):
-                y_low += 1
-            while y_high >= y_low and not _row_is_live(state, y_high):
-                y_high -= 1
+            y_low, y_high = _live_rows(state, y_low, y_high)

@@ -15,15 +15,15 @@ def connectivity_table() -> np.ndarray:
 
     Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the pixel's label. The label's cells of
     the ring must form one 4-connected part that touches the pixel by an edge; counted as edge cells less the
-    corners that join two of them (Yokoi's connectivity number).
+    corners that join two of them (Yokoi's connectivity number); a closed ring has as many of both.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     edges, corners = cells[:, 0::2], cells[:, 1::2]
     joined = edges * corners * np.roll(edges, -1, axis=1)
-    return (edges.sum(1) - joined.sum(1) == 1).astype(np.uint8)
+    return ((edges.sum(1) - joined.sum(1) == 1) | cells.all(1)).astype(np.uint8)
 
 
-@kernel
+@kernel(inline=True)
 def ring_mask(labels, y, x, label):
     """Bits of the eight neighbours (N, NE, E, SE, S, SW, W, NW) that have ``label``."""
     return (
@@ -89,7 +89,7 @@ def sweep(labels, pixels, rows, table, spread, backward):
             f4 = spread * np.float32(x - 1)
             best, best_label = distance(rows, own, f0, f1, f2, f3, f4) * rows[own, LEAVE], own
             for label in (north, east, south, west):
-                if label < 0 or label == own or label == best_label:
+                if label < 0 or label == own or label == best_label:  # noqa: SIM109 - faster
                     continue
                 cost = distance(rows, label, f0, f1, f2, f3, f4) * rows[label, JOIN]
                 if cost < best:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import gsmerge
+from gsmerge.cli import main
 
 from .conftest import Run, listing
 
@@ -58,6 +59,8 @@ def test_json_report(scene_copy: Path, run: Run) -> None:
     assert document["input"]["sha256"] == hashlib.sha256(ply.read_bytes()).hexdigest()
     assert document["input"]["bytes"] == ply.stat().st_size
     assert document["input"]["num_gaussians"] == VIEWS * HEIGHT * WIDTH
+    assert [document["input"][name] for name in ("num_views", "height", "width")] == [VIEWS, HEIGHT, WIDTH]
+    assert (document["input"]["opacity_encoding"], document["input"]["num_nonfinite"]) == ("logit", 0)
     assert document["output"]["bytes"] == out.stat().st_size
     assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
     assert document["ratio"] == pytest.approx(document["output"]["num_gaussians"] / (VIEWS * HEIGHT * WIDTH))
@@ -151,10 +154,12 @@ def test_render(made_scene: Path, tmp_path: Path, run: Run) -> None:
     assert outcome.code == 0, outcome.err
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
     assert names == [f"view_{i:02d}.png" for i in range(VIEWS)]
-    for name in names:
-        photo = cv2.imread(str(made_scene / "images" / name)).astype(float)
+    photos = [cv2.imread(str(made_scene / "images" / name)).astype(float) for name in names]
+    for i, name in enumerate(names):
         render = cv2.imread(str(tmp_path / "frames" / name)).astype(float)
-        assert np.abs(photo - render).mean() < 12
+        errors = [np.abs(photo - render).mean() for photo in photos]
+        assert int(np.argmin(errors)) == i
+        assert errors[i] < 20
 
 
 def test_preview(scene_copy: Path, run: Run) -> None:
@@ -169,3 +174,28 @@ def test_preview(scene_copy: Path, run: Run) -> None:
 
 def test_version(run: Run) -> None:
     assert run("--version").out == f"gsmerge {gsmerge.__version__}\n"
+
+
+@pytest.mark.parametrize(("words", "offered"), [("gsmerge com", "compact"), ("gsmerge compact --overw", "--overwrite")])
+def test_shell_completion(
+    words: str, offered: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("_GSMERGE_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit) as end:
+        main([])
+    assert end.value.code == 0
+    assert capsys.readouterr().out.split() == [offered]
+
+
+def test_notes_about_the_input_are_told(scene_copy: Path, run: Run) -> None:
+    """Photos of twice the grid's size in the camera file: intrinsics are scaled, and that is said."""
+    path = scene_copy / "transforms.json"
+    data = json.loads(path.read_text())
+    data |= {key: 2 * data[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    path.write_text(json.dumps(data))
+    outcome = run("compact", scene_copy, *SMALL, "--json", "--report", scene_copy / "report.json")
+    assert outcome.code == 0
+    assert any("scaled from 192 x 128" in note for note in json.loads(outcome.out)["notes"])
+    assert "scaled from 192 x 128" in run("compact", scene_copy, *SMALL, "--overwrite").err

@@ -25,7 +25,7 @@ class Broken:
         (KeyError("lost"), 1, "gsmerge: error: unexpected error: KeyError: 'lost'; run again with --debug\n"),
         (ValueError("two\nlines"), 1, "gsmerge: error: unexpected error: ValueError: two; run again with --debug\n"),
         (MemoryError(), 1, "gsmerge: error: out of memory; use a smaller scene or fewer --threads\n"),
-        (KeyboardInterrupt(), 130, "gsmerge: error: interrupted; nothing was written\n"),
+        (KeyboardInterrupt(), 130, "gsmerge: error: interrupted\n"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
 )

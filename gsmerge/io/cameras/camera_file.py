@@ -89,6 +89,9 @@ def make_camera_file(
         full[i, :3] = pose[:3]
     K = np.asarray(Ks, np.float64).reshape(-1, 3, 3)
     _check(path, full, K, names)
+    negative = next((f"{w} x {h}" for w, h in sizes if w < 0 or h < 0), None)
+    if negative is not None:
+        raise SceneError(path, f"expected a positive image size, found {negative}")
     return CameraFile(
         path=str(path),
         viewmats=torch.from_numpy(to_viewmats(full, convention)),

@@ -49,8 +49,10 @@ def read_da3(path: Path) -> CameraFile:
 
 def holds_images(path: Path) -> bool:
     """Whether an npz has the images themselves; False if it cannot be read."""
+    if not zipfile.is_zipfile(path):
+        return False
     try:
-        with np.load(path) as arrays:
+        with path.open("rb") as file, np.load(file) as arrays:
             return any(name in arrays.files for name in _IMAGES)
     except (OSError, ValueError, zipfile.BadZipFile):
         return False
@@ -59,15 +61,13 @@ def holds_images(path: Path) -> bool:
 def _load(path: Path) -> dict[str, np.ndarray]:
     """The arrays that matter; depth only for its shape, so the confidence is never decompressed."""
     wanted = {*_EXTRINSICS, *_INTRINSICS, *_IMAGES}
+    if not zipfile.is_zipfile(path):
+        raise SceneError(path, "expected a readable .npz file, found something else")
     try:
-        with np.load(path) as stored:
-            if not hasattr(stored, "files"):
-                raise SceneError(path, "expected an .npz with several arrays, found a single one")
+        with path.open("rb") as file, np.load(file) as stored:
             has_images = any(name in stored.files for name in _IMAGES)
             wanted |= set() if has_images else set(_DEPTHS)
             return {name: stored[name] for name in stored.files if name in wanted}
-    except FileNotFoundError as error:
-        raise SceneError(path, "no such file") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error
 

@@ -29,10 +29,10 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
             rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
             centre = np.array(entry["position"], np.float64).reshape(3, 1)
             fx, fy, width, height = (float(entry[key]) for key in ("fx", "fy", "width", "height"))
-        except (TypeError, ValueError) as error:
+            sizes.append((round(width), round(height)))
+        except (TypeError, ValueError, ArithmeticError) as error:
             raise SceneError(path, f"view {name}: expected numbers ({error})") from error
         poses.append(np.concatenate([rotation, centre], 1))
         Ks.append(np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]))
-        sizes.append((round(width), round(height)))
         names.append(name)
     return make_camera_file(path, "INRIA cameras.json", C2W_OPENCV, poses, Ks, sizes, names)

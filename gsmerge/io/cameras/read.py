@@ -25,6 +25,7 @@ CAMERA_PLACES = (
     "exports/npz/results.npz",
     "exports/mini_npz/results.npz",
     "results.npz",
+    "0",
     ".",
 )
 

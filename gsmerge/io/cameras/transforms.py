@@ -40,7 +40,7 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
         try:
             poses.append(np.array(frame["transform_matrix"], np.float64))
             K, size = _intrinsics(path, name, {**common, **frame})
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ArithmeticError) as error:
             raise SceneError(path, f"view {name}: expected numbers ({error})") from error
         names.append(name)
         Ks.append(K)

@@ -1,0 +1,136 @@
+"""The blending weights of one view, written out: entry by entry (pixel, weight), intersection by intersection."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy import float32 as f4
+
+from gsmerge.kernels.jit import kernel
+from gsmerge.kernels.project import LN_CUT, TILE
+from gsmerge.kernels.raster import BATCH, MIN_TRANSMITTANCE, P1, PLANE, _alpha, _gather, _live_rows, _open_tile
+
+LANES = 4  # channels of an image row: one vector register
+
+
+@kernel
+def _batch_weights(state, batch, j, y0, y1):
+    """Blend one Gaussian over rows of a tile; plane 1 holds its weights."""
+    mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
+    for y in range(y0, y1 + 1):
+        dy = f4(y) - my
+        top = lnop - decay * dy * dy
+        centre = rate * (mx + slope * dy)
+        row = np.uint64(y * TILE)
+        for x in range(TILE):
+            i = row + np.uint64(x)
+            d = rate * f4(x) - centre
+            a = _alpha(top - d * d)
+            t = state[i]
+            w = a * t
+            left = t - w
+            stop = left <= MIN_TRANSMITTANCE
+            state[i + P1] = f4(0.0) if stop else w
+            state[i] = -abs(t) if stop else left
+
+
+@kernel
+def _columns(batch, j, width):
+    """First and last column of the tile that a Gaussian of the batch can touch."""
+    mx, rate, slope, decay, lnop = batch[j, 0], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
+    reach = np.sqrt(max(lnop - LN_CUT, f4(0.0)) * (f4(1.0) / (rate * rate) + slope * slope / decay)) + f4(0.01)
+    return int(max(mx - reach, f4(0.0))), int(min(mx + reach, f4(width - 1)))
+
+
+@kernel
+def list_weights(footprints, members, offsets, columns, height, width):
+    """All weights of a view that are not zero.
+
+    Args:
+        footprints: ``[m,FOOTPRINT]`` float32.
+        members: ``[intersections]`` int32 tile lists.
+        offsets: ``[tiles + 1]`` int64 starts of the lists.
+        columns: Tiles per row.
+        height: Of the image, pixels.
+        width: Of the image, pixels.
+
+    Returns:
+        ``starts [intersections + 1]`` int64, ``pixels`` int32 (row-major) and ``weights`` float32.
+    """
+    starts = np.zeros(members.shape[0] + 1, np.int64)
+    pixels = np.empty(max(1024, 48 * height * width), np.int32)
+    weights = np.empty(pixels.shape[0], np.float32)
+    state, batch = np.empty(2 * PLANE, np.float32), np.empty((BATCH, 12), np.float32)
+    count = 0
+    for tile in range(offsets.shape[0] - 1):
+        left, top = tile % columns * TILE, tile // columns * TILE
+        _open_tile(state, min(TILE, width - left), min(TILE, height - top))
+        y_low, y_high = 0, min(TILE, height - top) - 1
+        start, end = offsets[tile], offsets[tile + 1]
+        while start < end and y_low <= y_high:
+            stop = min(end, start + BATCH)
+            _gather(footprints, members, start, stop, end, left, top, batch)
+            if count + BATCH * PLANE > pixels.shape[0]:
+                more = np.empty(2 * pixels.shape[0], np.int32)
+                more[:count] = pixels[:count]
+                pixels = more
+                heavier = np.empty(more.shape[0], np.float32)
+                heavier[:count] = weights[:count]
+                weights = heavier
+            for j in range(stop - start):
+                y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
+                _batch_weights(state, batch, j, y0, y1)
+                x0, x1 = _columns(batch, j, min(TILE, width - left))
+                for y in range(y0, y1 + 1):
+                    lane, pixel = np.uint64(PLANE + y * TILE), (top + y) * width + left
+                    for x in range(x0, x1 + 1):
+                        w = state[lane + np.uint64(x)]
+                        pixels[np.uint64(count)] = pixel + x
+                        weights[np.uint64(count)] = w
+                        count += 1 if w > f4(0.0) else 0
+                starts[start + j + 1] = count
+            start = stop
+            y_low, y_high = _live_rows(state, y_low, y_high)
+        starts[start + 1 : end + 1] = count
+    return starts, pixels[:count].copy(), weights[:count].copy()
+
+
+@kernel
+def spread(starts, pixels, weights, members, colors, image):
+    """Add weights times ``colors [m,LANES]`` to ``image [pixels,LANES]``."""
+    for i in range(members.shape[0]):
+        k = members[i]
+        a, b, c, d = colors[k, 0], colors[k, 1], colors[k, 2], colors[k, 3]
+        for e in range(starts[i], starts[i + 1]):
+            p, w = np.uint64(pixels[e]), weights[e]
+            image[p, 0] += w * a
+            image[p, 1] += w * b
+            image[p, 2] += w * c
+            image[p, 3] += w * d
+
+
+@kernel
+def collect(starts, pixels, weights, members, image, sums):
+    """Add weights times ``image [pixels,LANES]`` to ``sums [m,LANES]`` float64."""
+    for i in range(members.shape[0]):
+        a, b, c, d = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
+        for e in range(starts[i], starts[i + 1]):
+            p, w = np.uint64(pixels[e]), weights[e]
+            a += w * image[p, 0]
+            b += w * image[p, 1]
+            c += w * image[p, 2]
+            d += w * image[p, 3]
+        k = members[i]
+        sums[k, 0] += a
+        sums[k, 1] += b
+        sums[k, 2] += c
+        sums[k, 3] += d
+
+
+@kernel
+def peaks(starts, weights, members, out):
+    """Raise ``out [m]`` to the largest weight of every Gaussian."""
+    for i in range(members.shape[0]):
+        most = f4(0.0)
+        for e in range(starts[i], starts[i + 1]):
+            most = max(most, weights[e])
+        out[members[i]] = max(out[members[i]], most)

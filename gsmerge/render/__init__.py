@@ -1,0 +1,26 @@
+"""Rendering on the CPU: images of Gaussians, and what every Gaussian adds to them.
+
+:func:`render` makes images. The stages that need more than images work per view: :func:`plan_view` projects, sorts
+and bins once; :func:`composite`, :func:`splat_adjoint` and :func:`contributions` then walk the same plan with the
+same blending weights. The conventions are gsplat's: 0.3 px dilation, alpha clamped at 0.99, contributions below
+1/255 cut, a pixel stops before its transmittance would reach 1e-4, pixel centres at +0.5.
+
+Results do not depend on the number of threads: every Gaussian is projected and every tile blended alone, and what is
+summed over tiles is summed in the order of the tiles.
+"""
+
+from gsmerge.render.blend import composite, contributions, splat_adjoint
+from gsmerge.render.images import Rendering, render
+from gsmerge.render.plan import Splats, ViewPlan, plan_view, prepare
+
+__all__ = [
+    "Rendering",
+    "Splats",
+    "ViewPlan",
+    "composite",
+    "contributions",
+    "plan_view",
+    "prepare",
+    "render",
+    "splat_adjoint",
+]

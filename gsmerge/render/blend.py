@@ -1,0 +1,125 @@
+"""Blending along a plan, and its transpose."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gsmerge.kernels import harmonics, raster
+from gsmerge.render.plan import Array, ViewPlan, pieces
+from gsmerge.threads import parallel_map, use_threads
+
+
+def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
+    """Ranges of tiles with about equally many intersections."""
+    num = len(pieces(len(plan.members), threads))
+    cuts = np.searchsorted(plan.offsets, len(plan.members) * np.arange(1, num) / num)
+    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
+    return list(pairwise(edges.tolist()))
+
+
+def background_color(background: ArrayLike) -> Array:
+    """Three numbers from one or three."""
+    try:
+        return np.broadcast_to(np.asarray(background, np.float32), (3,)).copy()
+    except (TypeError, ValueError):
+        raise ValueError(f"expected a background of 1 or 3 numbers, got {background!r}") from None
+
+
+def view_colors(plan: ViewPlan) -> Array:
+    """``[m,3]`` colours of the plan's Gaussians seen from its view, not below 0."""
+    colors, splats = np.empty((len(plan.ids), 3), np.float32), plan.splats
+    with use_threads() as threads:
+        parallel_map(
+            lambda span: harmonics.view_colors(splats.means, splats.sh0, splats.shN, plan.ids, plan.eye, *span, colors),
+            pieces(len(plan.ids), threads),
+        )
+    return colors
+
+
+def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Array]:
+    """Image and remaining transmittance from the ``[m,3]`` colours of the plan's Gaussians."""
+    image = np.empty((plan.height, plan.width, 3), np.float32)
+    transmittance = np.empty((plan.height, plan.width), np.float32)
+
+    def tiles(span: tuple[int, int]) -> None:
+        raster.blend(
+            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span, background, image, transmittance
+        )
+
+    with use_threads() as threads:
+        parallel_map(tiles, _tile_ranges(plan, threads))
+    return image, transmittance
+
+
+def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
+    """Blend the Gaussians of a view front to back.
+
+    Args:
+        plan: The view.
+        colors: ``[n,3]`` of all Gaussians, any sign, taken as they are. None: their spherical harmonics seen from
+            this view, not below 0.
+        background: What shines through, 1 or 3 numbers.
+
+    Returns:
+        ``[h,w,3]`` image and ``[h,w]`` remaining transmittance, float32.
+
+    Raises:
+        ValueError: If ``colors`` or ``background`` has another shape.
+    """
+    if colors is None:
+        return blend(plan, view_colors(plan), background_color(background))
+    if colors.shape != (len(plan.splats), 3):
+        raise ValueError(f"colors: expected shape {[len(plan.splats), 3]}, got {list(colors.shape)}")
+    return blend(plan, np.ascontiguousarray(colors[plan.ids], np.float32), background_color(background))
+
+
+def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
+    """Sum, for every Gaussian, its blending weight times the image over the pixels.
+
+    The transpose of :func:`composite` (without background) as a linear map from colours to images.
+
+    Args:
+        plan: The view.
+        image: ``[h,w,c]``; four channels cost little more than one.
+
+    Returns:
+        ``[n,c]`` float32.
+
+    Raises:
+        ValueError: If the image has another size than the view.
+    """
+    if image.ndim != 3 or image.shape[:2] != (plan.height, plan.width):
+        raise ValueError(f"image: expected shape {[plan.height, plan.width, 'c']}, got {list(image.shape)}")
+    sums = np.zeros((len(plan.splats), image.shape[2]), np.float32)
+    slots = np.empty((len(plan.members), raster.CHANNELS), np.float32)
+
+    def tiles(span: tuple[int, int]) -> None:
+        raster.weighted_sums(plan.footprints, plan.members, plan.offsets, plan.columns, *span, part, slots)
+
+    with use_threads() as threads:
+        for first in range(0, image.shape[2], raster.CHANNELS):
+            part = np.ascontiguousarray(image[..., first : first + raster.CHANNELS], np.float32)
+            parallel_map(tiles, _tile_ranges(plan, threads))
+            raster.add_slots(plan.members, slots, plan.ids, first, sums)
+    return sums
+
+
+def contributions(plan: ViewPlan) -> tuple[Array, Array]:
+    """Sum and maximum over the pixels of every Gaussian's blending weight.
+
+    Args:
+        plan: The view.
+
+    Returns:
+        ``[n]`` sums (pixels) and ``[n]`` maxima, float32; 0 for Gaussians that are not seen.
+    """
+    parts = np.zeros((2, len(plan.ids)), np.float32)
+    raster.contributions(
+        plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, parts[0], parts[1]
+    )
+    mass, peak = np.zeros((2, len(plan.splats)), np.float32)
+    mass[plan.ids], peak[plan.ids] = parts
+    return mass, peak

@@ -1,0 +1,267 @@
+"""What is drawn where: projection, depth order and tile lists of one view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from gsmerge.kernels import binning
+from gsmerge.kernels import project as projection
+from gsmerge.threads import parallel_map, use_threads
+from gsmerge.types import Gaussians
+
+Array = NDArray[Any]
+
+PIECE = 1 << 15  # Gaussians or intersections that are worth handing to another thread
+MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are kept in 16 bits
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """Gaussians as the kernels take them: contiguous float32 arrays.
+
+    Args:
+        means: ``[n,3]`` world positions less ``origin``.
+        quats: ``[n,4]`` wxyz.
+        scales: ``[n,3]`` linear.
+        opacities: ``[n]`` in [0, 1].
+        sh0: ``[n,1,3]``.
+        shN: ``[n,k-1,3]``.
+        origin: ``[3]`` float64, subtracted from the means before they were rounded to float32.
+    """
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh0: Array
+    shN: Array
+    origin: Array
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPlan:
+    """What is drawn where in one view.
+
+    Args:
+        splats: The Gaussians.
+        ids: ``[m]`` int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
+        footprints: ``[m,8]`` float32, see :mod:`gsmerge.kernels.project`.
+        depths: ``[m]`` float32, camera z.
+        members: ``[intersections]`` int32 rows of ``ids``, tile after tile, nearest first.
+        offsets: ``[tiles+1]`` int64 starts of the tiles' lists.
+        eye: ``[3]`` float32, the camera's centre less ``splats.origin``.
+        width: Image width, pixels.
+        height: Image height, pixels.
+    """
+
+    splats: Splats
+    ids: Array
+    footprints: Array
+    depths: Array
+    members: Array
+    offsets: Array
+    eye: Array
+    width: int
+    height: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles per row."""
+        return -(-self.width // projection.TILE)
+
+    @property
+    def lines(self) -> int:
+        """Rows of tiles."""
+        return -(-self.height // projection.TILE)
+
+
+def _float32(tensor: Tensor) -> Array:
+    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+
+
+def _spread_origin(means: Tensor) -> Array:
+    """Zero, or where the Gaussians are when they are so far from zero that float32 would blur them."""
+    sample = means[:: max(1, len(means) // 4096)].detach().double()
+    sample = sample[torch.isfinite(sample).all(1)]
+    if len(sample) == 0:
+        return np.zeros(3)
+    centre = sample.median(0).values
+    spread = (sample - centre).abs().median(0).values.max()
+    return centre.cpu().numpy() if centre.abs().max() > 16 * spread else np.zeros(3)
+
+
+def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
+    """Gaussians as float32 arrays, without copying what already is.
+
+    Args:
+        gaussians: n Gaussians; means may be float64, for scenes in geographic coordinates.
+        origin: ``[3]`` world point that becomes the arrays' zero. None: the world's zero, unless the scene is far
+            away from it compared with its size.
+
+    Returns:
+        The arrays.
+    """
+    start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
+    means = gaussians.means
+    if start.any():
+        means = means.double() - torch.from_numpy(start).to(means.device)
+    return Splats(
+        means=_float32(means),
+        quats=_float32(gaussians.quats),
+        scales=_float32(gaussians.scales),
+        opacities=_float32(gaussians.opacities),
+        sh0=_float32(gaussians.sh0),
+        shN=_float32(gaussians.shN),
+        origin=start,
+    )
+
+
+def pieces(count: int, threads: int) -> list[tuple[int, int]]:
+    """Ranges for the pool, some per thread as they may take unequally long; no result depends on where they end."""
+    num = 1 if threads == 1 else max(1, min(4 * threads, count // PIECE))
+    return [(count * i // num, count * (i + 1) // num) for i in range(num)]
+
+
+def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool) -> Array:
+    """The numbers of a camera in the kernels' order, all but the depth range."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    # Directions are clamped 15 % of the image outside it, where the first-order projection breaks down (gsplat).
+    spare_x, spare_y = 0.15 * width / fx, 0.15 * height / fy
+    camera = np.zeros(projection.CAMERA, np.float32)
+    camera[projection.ROTATION : projection.SHIFT] = viewmat[:3, :3].ravel()
+    camera[projection.SHIFT : projection.FX] = viewmat[:3, 3]
+    camera[projection.FX : projection.NEAR] = fx, fy, cx, cy, width, height
+    camera[projection.EPS2D] = eps2d
+    camera[projection.LIMIT_X : projection.LIMIT_Y] = (width - cx) / fx + spare_x, -cx / fx - spare_x
+    camera[projection.LIMIT_Y : projection.ANTIALIASED] = (height - cy) / fy + spare_y, -cy / fy - spare_y
+    camera[projection.ANTIALIASED] = antialiased
+    return camera
+
+
+def _visible(splats: Splats, opacities: Array, keep: Array, camera: Array, threads: int) -> Array:
+    """Ids of the Gaussians that may touch the image, ascending."""
+
+    def cull(span: tuple[int, int]) -> Array:
+        ids = np.empty(span[1] - span[0] + 1, np.int32)
+        return ids[: projection.cull(splats.means, splats.scales, opacities, keep, camera, *span, ids)].copy()
+
+    return np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
+
+
+def _aligned_rows(count: int, width: int) -> Array:
+    """``[count,width]`` float32 starting at a cache line, so that no short row lies across two."""
+    line = 16
+    buffer = np.empty(count * width + line, np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % line
+    return buffer[start : start + count * width].reshape(count, width)
+
+
+def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
+    """Footprints, depths and tile boxes of the listed Gaussians."""
+    m = len(ids)
+    footprints, depths = _aligned_rows(m, projection.FOOTPRINT), np.empty(m, np.float32)
+    boxes = np.empty((m, 4), np.int16)
+
+    def project(span: tuple[int, int]) -> None:
+        part = slice(*span)
+        lnops = np.log(np.minimum(opacities[ids[part]], np.float32(1)))
+        projection.project(
+            splats.means, splats.quats, splats.scales, lnops, ids[part], camera,
+            footprints[part], depths[part], boxes[part],
+        )  # fmt: skip
+
+    parallel_map(project, pieces(m, threads))
+    return footprints, depths, boxes
+
+
+def _bin(order: Array, boxes: Array, lines: int, columns: int, threads: int) -> tuple[Array, Array]:
+    """Tile lists and their starts."""
+    # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
+    boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
+    spans = pieces(len(order), threads)
+    counts = np.stack(parallel_map(lambda span: binning.count_tiles(boxes[slice(*span)], lines, columns), spans))
+    offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
+    cursors = offsets[:-1] + np.cumsum(counts, 0) - counts
+    members = np.empty(offsets[-1], np.int32)
+
+    def deal(piece: tuple[tuple[int, int], Array]) -> None:
+        part = slice(*piece[0])
+        binning.deal_tiles(order[part], boxes[part], columns, piece[1], members)
+
+    parallel_map(deal, zip(spans, cursors, strict=True))
+    return members, offsets
+
+
+def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
+    if viewmat.shape != (4, 4) or K.shape != (3, 3):
+        raise ValueError(f"expected a [4,4] view matrix and [3,3] K, got {list(viewmat.shape)} and {list(K.shape)}")
+    if not (0 < width <= MAX_SIZE and 0 < height <= MAX_SIZE):
+        raise ValueError(f"expected an image size from 1 to {MAX_SIZE} pixels per side, got {width} x {height}")
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
+
+
+def plan_view(
+    splats: Splats,
+    viewmat: ArrayLike,
+    K: ArrayLike,
+    width: int,
+    height: int,
+    *,
+    eps2d: float = 0.3,
+    antialiased: bool = False,
+    near: float = 0.01,
+    far: float = 1e10,
+    opacities: Array | None = None,
+    keep: Array | None = None,
+) -> ViewPlan:
+    """Project, sort by depth and bin into tiles, for one view.
+
+    Args:
+        splats: n Gaussians, from :func:`prepare`.
+        viewmat: ``[4,4]`` world to camera.
+        K: ``[3,3]`` intrinsics, pixels, without skew.
+        width: Image width, pixels.
+        height: Image height, pixels.
+        eps2d: Dilation of the footprints, pixels squared.
+        antialiased: Lower the opacity by what the dilation adds to the footprint (Mip-Splatting's 2D filter).
+        near: Nearest depth drawn (exclusive), world units, above 0.
+        far: Farthest depth drawn (exclusive).
+        opacities: ``[n]`` in place of the Gaussians' own.
+        keep: ``[n]`` bool or uint8, False leaves a Gaussian out.
+
+    Returns:
+        The plan; its size goes with what is visible, not with n.
+
+    Raises:
+        ValueError: If sizes do not fit together, or a number is outside its range.
+    """
+    viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
+    _check_view(viewmat, K, width, height)
+    if not (0 < near < far and eps2d >= 0):
+        raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
+    opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
+    keep = np.empty(0, np.uint8) if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
+    if opacities.shape != (len(splats),) or len(keep) not in (0, len(splats)):
+        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {len(keep)}")
+
+    viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin
+    camera = _camera(viewmat, K, width, height, eps2d, antialiased)
+    camera[projection.NEAR], camera[projection.FAR] = near, far
+    columns, lines = -(-width // projection.TILE), -(-height // projection.TILE)
+    with use_threads() as threads:
+        ids = _visible(splats, opacities, keep, camera, threads)
+        footprints, depths, boxes = _project(splats, opacities, ids, camera, threads)
+        order = binning.depth_order(depths.view(np.uint32))
+        members, offsets = _bin(order, boxes, lines, columns, threads)
+    eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
+    return ViewPlan(splats, ids, footprints, depths, members, offsets, eye, width, height)

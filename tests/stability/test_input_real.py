@@ -1,0 +1,47 @@
+"""One real scene, where the measuring data is at hand."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from gsmerge.errors import SceneError
+from gsmerge.io import load_scene
+
+
+def shared_folder(root: Path) -> Path:
+    return Path(os.environ.get("GSMERGE_SHARED", root.parent / "shared"))
+
+
+@pytest.fixture
+def exporter(root: Path) -> ModuleType:
+    path = shared_folder(root) / "tools" / "ff_export.py"
+    if not path.is_file():
+        pytest.skip("no measuring data (GSMERGE_SHARED)")
+    spec = importlib.util.spec_from_file_location("ff_export", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_plain_export_lines_up(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
+    ply = exporter.export(shared_folder(root) / "scenes" / "eval" / "lightfield", tmp_path, "plain", max_views=2)
+    loaded = load_scene(ply)
+    assert len(loaded.scene) == 2
+    assert loaded.alignment.ok
+    assert loaded.alignment.worst_px < 0.25  # the exporter moves means by up to a quarter of a pixel
+    assert loaded.alignment.share_within_1px > 0.999
+    assert loaded.scene.images is not None
+    assert loaded.notes == ()
+
+
+def test_a_pruned_export_is_refused(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
+    ply = exporter.export(shared_folder(root) / "scenes" / "eval" / "lightfield", tmp_path, "da3", max_views=2)
+    with pytest.raises(SceneError, match="expected one Gaussian per pixel"):
+        load_scene(ply)

@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_scene import (
+    Tiny,
+    frames_of,
+    make_tiny,
+    write_colmap_binary,
+    write_colmap_text,
+    write_images,
+    write_npz,
+    write_transforms,
+)
+
+from gsmerge.errors import SceneError
+from gsmerge.io import find_scene_files, load_scene, read_photos, read_scene, write_ply
+from gsmerge.io.cameras import read_cameras
+from gsmerge.threads import use_threads
+
+
+def rewrite(path: Path, change: Callable[[dict], None]) -> None:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
+    scene = read_scene(tiny_folder)
+    assert len(scene) == 3
+    assert (scene.cameras.width, scene.cameras.height) == (20, 14)
+    assert np.allclose(scene.cameras.viewmats, tiny.w2c)
+    assert np.array_equal((scene.images.numpy() * 255).round(), tiny.images)
+    assert scene.valid.all()
+    assert scene.names == tuple(f"images/{n}" for n in tiny.names)
+    assert torch.allclose(scene.gaussians.means, tiny.gaussians.means)
+
+
+def test_what_was_found_on_the_way(tiny_folder: Path) -> None:
+    loaded = load_scene(tiny_folder / "scene.ply")
+    assert loaded.alignment.ok
+    assert loaded.ply.layout == "17-column export"
+    assert loaded.files.images == tiny_folder / "images"
+    assert loaded.cameras.source == "transforms.json"
+    assert loaded.notes == ()
+
+
+@pytest.mark.parametrize("write", [write_colmap_text, write_colmap_binary])
+def test_colmap_beside_the_ply(tmp_path: Path, tiny: Tiny, write: Callable[[Path, Tiny], None]) -> None:
+    tiny.save(tmp_path, cameras=False)
+    write(tmp_path / "sparse" / "0", tiny)
+    assert np.allclose(read_scene(tmp_path).cameras.viewmats, tiny.w2c)
+
+
+def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
+    tiny.save(tmp_path / "gs_ply", cameras=False, images=False)
+    (tmp_path / "gs_ply" / "scene.ply").rename(tmp_path / "gs_ply" / "0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny)
+    scene = read_scene(tmp_path / "gs_ply" / "0000.ply")
+    assert np.array_equal((scene.images.numpy() * 255).round(), tiny.images)
+    assert scene.names == ("view 0", "view 1", "view 2")
+    other = tiny.save(tmp_path / "other", images=False)
+    named = read_scene(other, images=tmp_path / "exports/npz/results.npz")
+    assert torch.equal(named.images, scene.images)
+
+
+def test_a_scene_without_images(tmp_path: Path, tiny: Tiny) -> None:
+    assert read_scene(tiny.save(tmp_path, images=False)).images is None
+
+
+def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
+    tiny.save(tmp_path, images=False)
+    write_images(tmp_path / "train", tiny)
+    rewrite(tmp_path / "transforms.json", lambda d: [f.update(file_path=f["file_path"].replace("images", "train"))
+                                                     for f in d["frames"]])  # fmt: skip
+    assert np.array_equal((read_scene(tmp_path).images.numpy() * 255).round(), tiny.images)
+    files = find_scene_files(tmp_path)
+    assert files.images is None
+    assert read_photos(files, read_cameras(files.cameras)) is not None
+
+
+def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path / "scene")
+    data = bytearray((folder / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + 11
+    for row in (0, 301):
+        data[start + 68 * row : start + 68 * row + 4] = np.float32(np.nan).tobytes()
+    (folder / "scene.ply").write_bytes(data)
+    scene = read_scene(folder)
+    assert scene.valid.sum() == 3 * 14 * 20 - 2
+    assert not scene.valid[0, 0, 0]
+    assert not scene.valid[1, 1, 1]  # 301 = 280 + 20 + 1
+    assert scene.gaussians.opacities[301] == 0
+
+
+def test_views_in_the_order_of_their_names(tiny_folder: Path, tiny: Tiny) -> None:
+    rewrite(tiny_folder / "transforms.json", lambda data: data["frames"].reverse())
+    loaded = load_scene(tiny_folder)
+    assert loaded.scene.names == tuple(f"images/{n}" for n in tiny.names)  # 2, 10, 11: numbers, not letters
+    assert loaded.cameras.names == loaded.scene.names
+    assert np.allclose(loaded.scene.cameras.viewmats, tiny.w2c)
+    assert np.array_equal((loaded.scene.images.numpy() * 255).round(), tiny.images)
+    assert loaded.notes == ("views are in the order of the image names, not of the camera file",)
+
+
+def test_cameras_of_a_resized_image_are_scaled(tiny_folder: Path, tiny: Tiny) -> None:
+    data = frames_of(tiny)
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        data[key] *= 4
+    (tiny_folder / "transforms.json").write_text(json.dumps(data))
+    loaded = load_scene(tiny_folder)
+    assert np.allclose(loaded.scene.cameras.Ks, tiny.K)
+    assert loaded.notes == ("intrinsics scaled from 80 x 56 to the images' 20 x 14",)
+
+
+def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
+    swapped = replace(tiny, images=tiny.images[::-1])
+    write_images(tiny_folder / "images", swapped)
+    notes = load_scene(tiny_folder).notes
+    assert notes == ("2 of 3 images do not look like their Gaussians, for example images/a b/2.png",)
+
+
+def test_one_and_many_threads_read_alike(tiny_folder: Path) -> None:
+    scenes = []
+    for count in (1, 2, 8):
+        with use_threads(count):
+            scenes.append(read_scene(tiny_folder))
+    for scene in scenes[1:]:
+        assert torch.equal(scene.images, scenes[0].images)
+        assert torch.equal(scene.gaussians.quats, scenes[0].gaussians.quats)
+
+
+# What does not fit
+
+
+def test_no_cameras(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path, cameras=False)
+    with pytest.raises(SceneError, match=r"no cameras found beside it \(looked for transforms\.json.*--cameras"):
+        read_scene(folder)
+
+
+@pytest.mark.parametrize(
+    ("rows", "hint"),
+    [
+        (slice(0, 560), "that is 2 views of this size"),
+        (slice(0, 839), "pixels were dropped or merged by the exporter"),
+        (slice(0, 3 * 10 * 7), "that is 7 x 10 per view"),
+        (list(range(840)) * 2, "that is 2 Gaussians per pixel"),
+        (list(range(840)) * 2 + [0], "give the cameras and images that belong to it"),
+    ],
+)
+def test_the_number_of_gaussians_is_explained(tmp_path: Path, tiny: Tiny, rows: slice | list, hint: str) -> None:
+    folder = tiny.save(tmp_path)
+    few = tiny.gaussians[rows]
+    write_ply(folder / "scene.ply", few, overwrite=True)
+    expected = (
+        rf"expected one Gaussian per pixel, 3 x 14 x 20 = 840 \(views x height x width\), found {len(few)}; {hint}"
+    )
+    with pytest.raises(SceneError, match=expected):
+        read_scene(folder)
+
+
+def test_a_trimmed_border_is_named(tmp_path: Path) -> None:
+    large = make_tiny(40, 30)
+    folder = large.save(tmp_path)
+    write_ply(folder / "scene.ply", large.gaussians[: 3 * 24 * 14], overwrite=True)
+    with pytest.raises(SceneError, match="that is 14 x 24 per view: 8 pixels were trimmed at every border"):
+        read_scene(folder)
+
+
+def test_images_that_are_not_the_grid_s(tiny_folder: Path, tiny: Tiny) -> None:
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        cv2.imwrite(str(tiny_folder / "images" / name), cv2.resize(image, (40, 28)))
+    with pytest.raises(SceneError, match="images: expected images of the Gaussian grid's size 20 x 14, found 40 x 28"):
+        read_scene(tiny_folder)
+
+
+def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
+    rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
+    with pytest.raises(SceneError, match=r"expected cameras of the images' size 20 x 14 .* found 30 x 14; crop"):
+        read_scene(tiny_folder)
+    rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=14, h=20))
+    with pytest.raises(SceneError, match="found 14 x 20; width and height are swapped"):
+        read_scene(tiny_folder)
+
+
+def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path, images=False)
+    rewrite(folder / "transforms.json", lambda data: data.update(w=14, h=20))
+    with pytest.raises(SceneError, match="the cameras fit with width and height swapped"):
+        read_scene(folder)
+
+
+def test_too_few_images(tiny_folder: Path, tiny: Tiny) -> None:
+    (tiny_folder / "images" / tiny.names[1]).unlink()
+    with pytest.raises(SceneError, match=r"expected 3 images, one per camera, found 2 and none for images/a b/10\.png"):
+        read_scene(tiny_folder)
+
+
+def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    two = {"extrinsics": tiny.w2c[:2], "intrinsics": np.tile(tiny.K, (2, 1, 1)), "depth": None}
+    write_npz(tmp_path / "two.npz", tiny, image=tiny.images[:2], **two)
+    with pytest.raises(SceneError, match="expected 3 images, one per camera, found 2"):
+        read_scene(tiny_folder, images=tmp_path / "two.npz")
+
+
+def test_the_wrong_convention_says_which_would_fit(tiny_folder: Path, tiny: Tiny) -> None:
+    def opencv(data: dict) -> None:
+        for frame, pose in zip(data["frames"], tiny.c2w, strict=True):
+            frame["transform_matrix"] = pose.tolist()
+
+    rewrite(tiny_folder / "transforms.json", opencv)
+    with pytest.raises(SceneError) as error:
+        read_scene(tiny_folder)
+    assert "own pixels, found a median of up to inf px and" in str(error.value)
+    assert "the poses fit when read as camera-to-world matrices with OpenCV axes" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder: Path, tiny: Tiny) -> None:
+    strange = tiny.c2w.copy()
+    strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
+    write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
+    with pytest.raises(SceneError, match=r"found a median of up to [0-9.]+ px and 100 % .*no other convention fits"):
+        read_scene(tiny_folder)
