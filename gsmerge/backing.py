@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -60,7 +61,7 @@ def encode_backing(scene: PixelScene, members: Members, groups: Groups, options:
 def _view_slices(views: np.ndarray, num_views: int) -> list[slice]:
     """The rows of every view's groups (groups are in order of view)."""
     edges = np.searchsorted(views, np.arange(num_views + 1))
-    return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def _camera(scene: PixelScene, view: int) -> tuple[np.ndarray, float, float]:
@@ -85,9 +86,9 @@ def _draw_in_members(
         factors = np.ones(pixels)
         own = starts[groups.start : groups.stop + 1]
         draw_in(own - own[0], ids[own[0] : own[-1]] - view * pixels, inverse, 1 / abs(fx), factors)
-        factors = factors.astype(np.float32)[:, None]
-        means[rows] = eye + (means[rows] - eye) * factors
-        scales[rows] *= factors
+        shrink = factors.astype(np.float32)[:, None]
+        means[rows] = eye + (means[rows] - eye) * shrink
+        scales[rows] *= shrink
 
     parallel_map(one_view, enumerate(_view_slices(views, len(scene))))
     return replace(members, means=means, scales=scales)

@@ -80,10 +80,5 @@ def _children(features: FeatureGaussians, members: Members, count: int) -> Gauss
     sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
     moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), child_ids)
     gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
-    return to_gaussians(
-        moments.covars,
-        moments.extinctions * gains,
-        spreads,
-        torch.from_numpy(moments.means),
-        torch.from_numpy(moments.sh),
-    )
+    means, sh = torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
+    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh)

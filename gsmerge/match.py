@@ -57,17 +57,9 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     covars = features.covars.double().numpy()[front].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[:, 0].double().numpy()[front]
     scores = np.empty(neighbors.shape)
-    edge_scores(
-        neighbors,
-        means,
-        np.ascontiguousarray(covars),
-        colors,
-        views,
-        options.max_color,
-        options.match == "aabb",
-        scores,
-    )
-    if options.match == "aabb":
+    boxes = options.match == "aabb"
+    edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, views, options.max_color, boxes, scores)
+    if boxes:
         found, num_found = connected_components(neighbors, scores, options.overlap)
     else:
         order = np.lexsort((*means.T, -features.weights.numpy()[front]))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.kernels.pool import decompose, pool
-from gsmerge.threads import available_threads, parallel_map
+from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
 
 MIN_SCALE = 1e-12
@@ -141,8 +141,3 @@ def feature_to_gaussians(features: FeatureGaussians) -> Gaussians:
         features.means,
         torch.cat([features.sh0, features.shN], 1),
     )
-
-
-def num_tasks(rows: int) -> int:
-    """How many pieces of work ``rows`` groups make."""
-    return max(1, min(available_threads(), rows // ROWS_PER_TASK))

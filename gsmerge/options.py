@@ -55,14 +55,15 @@ class CompactOptions:
         Raises:
             ValueError: If a name is unknown.
         """
-        changed, left = self, dict(settings)
+        changes: dict[str, Any] = {}
+        left = dict(settings)
         for f in fields(self):
             value = getattr(self, f.name)
             if is_dataclass(value) and not isinstance(value, type):
                 own = {g.name: left.pop(g.name) for g in fields(value) if g.name in left}
-                changed = replace(changed, **{f.name: replace(value, **own)}) if own else changed
+                changes[f.name] = replace(value, **own)
             elif f.name in left:
-                changed = replace(changed, **{f.name: left.pop(f.name)})
+                changes[f.name] = left.pop(f.name)
         if left:
             raise ValueError(f"unknown setting {sorted(left)[0]!r}; known: {', '.join(sorted(self.to_dict()))}")
-        return changed
+        return replace(self, **changes)

@@ -143,9 +143,9 @@ def _merged_features(scene: PixelScene, members: Members, options: CompactOption
         coarse_groups = segment(pictures, options.segment, coarse) if coarse else None
     with run.stage("encode"):
         features = encode(scene, members, groups, options.encode)
-        backing = encode_backing(scene, members, coarse_groups, options.backing) if coarse_groups else None
-    if robust:
+    if coarse_groups is not None:
         with run.stage("robust"):
+            backing = encode_backing(scene, members, coarse_groups, options.backing)
             features, choice = choose_merge(features, backing, scene_photos(scene, 2), options.robust)
             run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
     with run.stage("match"):

@@ -123,7 +123,7 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
             squares = np.einsum("hwc,hwc->hw", image, image)
             return splat_adjoint(plan, np.dstack([np.ones_like(squares), image, squares]))
 
-        sums = np.sum(parallel_map(testimony, range(len(photos))), axis=0, dtype=np.float64)
+        sums = np.stack(parallel_map(testimony, range(len(photos)))).sum(0, dtype=np.float64)
         mass = sums[:, 0]
         error = (colors**2).sum(1) * mass - 2 * (colors * sums[:, 1:4]).sum(1) + sums[:, 4]
         error = np.maximum(error, 0) / (3 * mass + 1e-9)

@@ -250,11 +250,8 @@ class FeatureGaussians:
     @staticmethod
     def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
         """All groups of all parts in order."""
-        columns = {
-            f.name: torch.cat([getattr(p, f.name) for p in parts])
-            for f in fields(FeatureGaussians)
-            if f.name != "starts"
-        }
+        names = [f.name for f in fields(FeatureGaussians) if f.name != "starts"]
+        columns = {name: torch.cat([getattr(p, name) for p in parts]) for name in names}
         sizes = torch.cat([p.starts[1:] - p.starts[:-1] for p in parts])
         starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
         return FeatureGaussians(starts=starts, **columns)

@@ -43,8 +43,10 @@ class ViewWeights:
 
 def view_weights(plan: ViewPlan) -> ViewWeights:
     """Write out the weights of a planned view."""
-    found = kernels.list_weights(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width)
-    return ViewWeights(plan.ids, plan.members, *found, plan.height, plan.width)
+    starts, pixels, weights = kernels.list_weights(
+        plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width
+    )
+    return ViewWeights(plan.ids, plan.members, starts, pixels, weights, plan.height, plan.width)
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:

@@ -22,16 +22,10 @@ def bhattacharyya(mean_a, cov_a, mean_b, cov_b, half):
     if det <= 0.0:
         return 0.0
     x, y, z = mean_b[0] - mean_a[0], mean_b[1] - mean_a[1], mean_b[2] - mean_a[2]
-    xx, xy, xz = (
-        half[3] * half[5] - half[4] ** 2,
-        half[2] * half[4] - half[1] * half[5],
-        half[1] * half[4] - half[2] * half[3],
-    )
-    yy, yz, zz = (
-        half[0] * half[5] - half[2] ** 2,
-        half[1] * half[2] - half[0] * half[4],
-        half[0] * half[3] - half[1] ** 2,
-    )
+    # adjugate of the mean covariance
+    xx, yy, zz = half[3] * half[5] - half[4] ** 2, half[0] * half[5] - half[2] ** 2, half[0] * half[3] - half[1] ** 2
+    xy, xz = half[2] * half[4] - half[1] * half[5], half[1] * half[4] - half[2] * half[3]
+    yz = half[1] * half[2] - half[0] * half[4]
     distance = (xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)) / det
     volume = np.sqrt(max(_det(cov_a), 0.0)) * np.sqrt(max(_det(cov_b), 0.0))
     return np.exp(-0.125 * distance) * np.sqrt(volume / det)

@@ -32,12 +32,12 @@ def group_members(labels, count):
 
 @kernel(inline=True)
 def _largest(a, b, c):
-    return max(a, max(b, c))
+    return max(a, b, c)
 
 
 @kernel(inline=True)
 def _two_largest_product(a, b, c):
-    return max(a * b, max(a * c, b * c))
+    return max(a * b, a * c, b * c)
 
 
 @kernel
