@@ -60,7 +60,7 @@ def sketches() -> dict[tuple[str, str], Method]:
 
     return {
         ("rdseg", "fast"): lambda image, count: sketch.rdseg(image, count, mult=1.0),
-        ("rdseg", "default"): lambda image, count: sketch.rdseg(image, count),
+        ("rdseg", "default"): sketch.rdseg,
         ("rdseg", "best"): lambda image, count: sketch.rdseg(image, count, mult=3.0, pre=1),
         ("bass-st", "default"): bass_st,
     }
@@ -89,7 +89,9 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setNumThreads(1)
     pictures, others = photos(), sketches()
-    print(f"{'density':>7} {'method':8} {'preset':8} {'proxy':>6} {'splat':>6} {'ms':>7} {'/bass-st':>8} {'/sketch':>8}")
+    print(
+        f"{'density':>7} {'method':8} {'preset':8} {'proxy':>6} {'splat':>6} {'ms':>7} {'/bass-st':>8} {'/sketch':>8}"
+    )
     for density in options.density or DENSITIES:
         reference = None
         for name, preset in RUNS:

@@ -20,12 +20,12 @@ class BackingOptions:
     """The layer behind the surfaces.
 
     Args:
-        backing: Coarse Gaussians per pixel of a view; they are part of the count that is asked for.
+        backing: Share of the superpixels asked for that goes to this layer.
         push: Distance behind the surface, as a share of the depth.
         backing_spread: Factor on the standard deviations.
     """
 
-    backing: float = 0.003
+    backing: float = 0.07
     push: float = 0.1
     backing_spread: float = 1.2
 

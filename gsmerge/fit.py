@@ -33,7 +33,9 @@ class FitOptions:
         iterations: Conjugate-gradient steps.
         pull: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
         huber: Colour error beyond which a pixel counts less (moving things, reflections).
-        max_gain: Largest exposure difference between views that is compensated, as a factor.
+        min_gain: Exposure of a view against the mean, as a factor, from which on it is compensated; smaller
+            differences come from holes and highlights as often as from the camera.
+        max_gain: Largest exposure factor that is believed.
         holdout: Share of the photos' blocks that decides whether the fit is accepted.
         prune: Leave out Gaussians that contribute less than this to every pixel of every photo that they lie in.
     """
@@ -41,9 +43,10 @@ class FitOptions:
     fit: Fit = "color"
     fit_level: int = 2
     iterations: int = 6
-    pull: float = 0.05
+    pull: float = 0.03
     huber: float = 0.2
-    max_gain: float = 1.6
+    min_gain: float = 1.15
+    max_gain: float = 2.0
     holdout: float = 0.1
     prune: float = 1 / 255
 
@@ -242,9 +245,11 @@ def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: 
         return robust, np.clip(ratio, 1 / options.max_gain, options.max_gain)
 
     weights, gains = zip(*parallel_map(one_view, range(len(system.photos))), strict=True)
-    gains = np.stack(gains)
-    gains /= np.exp(np.log(gains).mean(0))
-    return replace(system, weights=list(weights), gains=gains)
+    factors = np.stack(gains)
+    factors /= np.exp(np.log(factors).mean(0))
+    if np.abs(np.log(factors)).max() < np.log(options.min_gain):
+        factors[:] = 1
+    return replace(system, weights=list(weights), gains=factors)
 
 
 def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> torch.Tensor:

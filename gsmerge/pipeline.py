@@ -137,7 +137,7 @@ def _merged_features(scene: PixelScene, members: Members, options: CompactOption
     with run.stage("segment"):
         height, width = scene.cameras.height, scene.cameras.width
         count = count_for(options.segment, height, width)
-        coarse = min(round(options.backing.backing * height * width), count // 2) if robust else 0
+        coarse = min(max(1, round(options.backing.backing * count)), count - 1) if robust else 0
         pictures = scene.images if scene.images is not None else _own_colors(scene)
         groups = segment(pictures, options.segment, count - coarse)
         coarse_groups = segment(pictures, options.segment, coarse) if coarse else None

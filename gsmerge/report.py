@@ -14,17 +14,18 @@ from gsmerge import __version__
 
 SCHEMA_VERSION = 1
 
-# Seconds on one processor, per million pixels of all views together (or Gaussians, which is the same number).
-# Measured on the scenes of benchmarks/; they only have to be right within a factor of two.
-COST_FIXED = 2.0
-COST_READ = 0.4
-COST_SEGMENT = {"fast": 1.0, "default": 2.0, "best": 4.0}
-COST_MERGE = 1.5
-COST_ROBUST = 6.0
-COST_FIT = 3.0
-BYTES_FIXED = 400_000_000  # interpreter, torch and numba
-BYTES_PER_GAUSSIAN = 160
-BYTES_PER_PIXEL = 40  # the photo as floats and what segmentation and rendering keep of it
+# Processor seconds per million pixels of all views together (or Gaussians, which is the same number), kernels compiled.
+# Measured on twelve views of 256 x 480; they only have to be right within a factor of two.
+COST_FIXED = 1.5  # imports
+COST_READ = 0.7
+COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5}
+COST_MERGE = 0.5
+COST_SCORE = 1.3  # rendering the photos from input and output
+COST_ROBUST = 1.6
+COST_FIT = 0.9
+BYTES_FIXED = 350_000_000  # interpreter, torch and numba
+BYTES_PER_GAUSSIAN = 240
+BYTES_PER_PIXEL = 100  # the photo as floats and what segmentation and rendering keep of it
 
 
 def file_sha256(path: Path) -> str:
@@ -166,7 +167,7 @@ def plan_document(
     pixels = views * height * width
     robust = bool(options["robust"]) and photos and views >= 3
     fit = options["fit"] if photos else "none"
-    work = COST_READ + COST_MERGE + COST_SEGMENT.get(options["preset"], COST_SEGMENT["best"])
+    work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
     work += COST_ROBUST * robust + COST_FIT * (fit != "none")
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {

@@ -59,7 +59,9 @@ def _gather(footprints, members, first, last, end, tile_x, tile_y, batch):
 
 @kernel
 def _open_tile(state, columns, lines):
-    """All light passes; lanes outside the image have stopped."""
+    """All light passes, the other planes are zero; lanes outside the image have stopped."""
+    for i in range(PLANE, state.shape[0]):
+        state[i] = f4(0.0)
     for y in range(TILE):
         for x in range(TILE):
             state[y * TILE + x] = f4(1.0) if (x < columns) & (y < lines) else f4(-1.0)
@@ -132,7 +134,6 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
     for tile in range(first, last):
         left, top = tile % columns * TILE, tile // columns * TILE
         num_x, num_y = min(TILE, width - left), min(TILE, height - top)
-        state[PLANE:] = f4(0.0)
         _open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
@@ -158,36 +159,42 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
                 transmittance[top + y, left + x] = t
 
 
+@kernel(inline=True)
+def _weights(state, batch, j, y0, y1):
+    """Blend one Gaussian over rows y0 to y1 of a tile; plane 1 receives its weights."""
+    mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
+    for y in range(y0, y1 + 1):
+        dy = f4(y) - my
+        top = lnop - decay * dy * dy
+        centre = rate * (mx + slope * dy)
+        row = np.uint64(y * TILE)
+        for x in range(TILE):
+            i = row + np.uint64(x)
+            d = rate * f4(x) - centre
+            a = _alpha(top - d * d)
+            t = state[i]
+            w = a * t
+            left = t - w
+            stop = left <= MIN_TRANSMITTANCE
+            state[i + P1] = f4(0.0) if stop else w
+            state[i] = -abs(t) if stop else left
+
+
 @kernel
 def _sum_weights(state, batch, count, y_low, y_high, slots, start):
-    """Per Gaussian of a batch: weights times planes 1 to 4, summed over the tile; plane 5 holds the weights."""
+    """Per Gaussian of a batch: weights times planes 2 to 5, summed over the tile."""
     for j in range(count):
         y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-        mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-        for y in range(y0, y1 + 1):
-            dy = f4(y) - my
-            top = lnop - decay * dy * dy
-            centre = rate * (mx + slope * dy)
-            row = np.uint64(y * TILE)
-            for x in range(TILE):
-                i = row + np.uint64(x)
-                d = rate * f4(x) - centre
-                a = _alpha(top - d * d)
-                t = state[i]
-                w = a * t
-                left = t - w
-                stop = left <= MIN_TRANSMITTANCE
-                state[i + P5] = f4(0.0) if stop else w
-                state[i] = -abs(t) if stop else left
+        _weights(state, batch, j, y0, y1)
         s1, s2, s3, s4 = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
         first = np.uint64(y0 * TILE)
         for x in range((y1 - y0 + 1) * TILE):
             i = first + np.uint64(x)
-            w = state[i + P5]
-            s1 += w * state[i + P1]
-            s2 += w * state[i + P2]
-            s3 += w * state[i + P3]
-            s4 += w * state[i + P4]
+            w = state[i + P1]
+            s1 += w * state[i + P2]
+            s2 += w * state[i + P3]
+            s3 += w * state[i + P4]
+            s4 += w * state[i + P5]
         slots[start + j, 0], slots[start + j, 1], slots[start + j, 2], slots[start + j, 3] = s1, s2, s3, s4
 
 
@@ -211,12 +218,11 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
     for tile in range(first, last):
         left, top = tile % columns * TILE, tile // columns * TILE
         num_x, num_y = min(TILE, width - left), min(TILE, height - top)
-        state[PLANE:] = f4(0.0)
         _open_tile(state, num_x, num_y)
         for y in range(num_y):
             for x in range(num_x):
                 for c in range(channels):
-                    state[(c + 1) * PLANE + y * TILE + x] = image[top + y, left + x, c]
+                    state[(c + 2) * PLANE + y * TILE + x] = image[top + y, left + x, c]
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
@@ -225,7 +231,9 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
             _sum_weights(state, batch, stop - start, y_low, y_high, slots, start)
             start = stop
             y_low, y_high = _live_rows(state, y_low, y_high)
-        slots[start:end] = f4(0.0)
+        for i in range(start, end):
+            for c in range(CHANNELS):
+                slots[i, c] = f4(0.0)
 
 
 @kernel
@@ -249,46 +257,26 @@ def add_slots(members, slots, ids, first, sums):
 
 
 @kernel
-def _mass_and_peak(state, batch, count, y_low, y_high, start, members, mass, peak):
-    """Add a batch's weights to the masses, raise the peaks."""
+def _mass_and_peak(state, bits, batch, count, y_low, y_high, start, members, totals):
+    """Add a batch's weights to the masses, raise the peaks. ``bits`` is ``state`` seen as integers."""
     for j in range(count):
         y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-        mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-        for x in range(TILE):
-            i = np.uint64(x)
-            state[i + P1] = f4(0.0)
-            state[i + P2] = f4(0.0)
-        for y in range(y0, y1 + 1):
-            dy = f4(y) - my
-            top = lnop - decay * dy * dy
-            centre = rate * (mx + slope * dy)
-            row = np.uint64(y * TILE)
-            for x in range(TILE):
-                lane = np.uint64(x)
-                i = row + lane
-                d = rate * f4(x) - centre
-                a = _alpha(top - d * d)
-                t = state[i]
-                w = a * t
-                left = t - w
-                stop = left <= MIN_TRANSMITTANCE
-                w = f4(0.0) if stop else w
-                most = state[lane + P2]
-                state[lane + P1] += w
-                state[lane + P2] = w if w > most else most
-                state[i] = -abs(t) if stop else left
-        total, most = f4(0.0), f4(0.0)
-        for x in range(TILE):
-            i = np.uint64(x)
-            total += state[i + P1]
-            most = max(most, state[i + P2])
-        k = members[start + j]
-        mass[k] += total
-        peak[k] = max(peak[k], most)
+        _weights(state, batch, j, y0, y1)
+        total, most = f4(0.0), np.int32(0)
+        first = np.uint64(y0 * TILE)
+        for x in range((y1 - y0 + 1) * TILE):
+            i = first + np.uint64(x) + P1
+            total += state[i]
+            # as integers: floats that are not negative have the same order, and LLVM vectorises this maximum
+            most = max(most, bits[i])
+        bits[P2] = most
+        k = np.uint64(members[start + j])
+        totals[k, 0] += total
+        totals[k, 1] = max(totals[k, 1], state[P2])
 
 
 @kernel
-def contributions(footprints, members, offsets, columns, height, width, mass, peak):
+def contributions(footprints, members, offsets, columns, height, width, totals):
     """Sum and maximum over the pixels of every Gaussian's weight.
 
     Args:
@@ -298,10 +286,10 @@ def contributions(footprints, members, offsets, columns, height, width, mass, pe
         columns: Tiles per row.
         height: Of the image, pixels.
         width: Of the image, pixels.
-        mass: ``[m]`` float32, added to.
-        peak: ``[m]`` float32, raised.
+        totals: ``[m,2]`` float32: sums, added to, and maxima, raised.
     """
     state = np.empty(3 * PLANE, np.float32)
+    bits = state.view(np.int32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(offsets.shape[0] - 1):
         left, top = tile % columns * TILE, tile // columns * TILE
@@ -311,6 +299,8 @@ def contributions(footprints, members, offsets, columns, height, width, mass, pe
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
             _gather(footprints, members, start, stop, end, left, top, batch)
-            _mass_and_peak(state, batch, stop - start, y_low, y_high, start, members, mass, peak)
+            for i in range(start, stop):
+                prefetch_row(totals, members[i])
+            _mass_and_peak(state, bits, batch, stop - start, y_low, y_high, start, members, totals)
             start = stop
             y_low, y_high = _live_rows(state, y_low, y_high)

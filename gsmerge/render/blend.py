@@ -116,10 +116,8 @@ def contributions(plan: ViewPlan) -> tuple[Array, Array]:
     Returns:
         ``[n]`` sums (pixels) and ``[n]`` maxima, float32; 0 for Gaussians that are not seen.
     """
-    parts = np.zeros((2, len(plan.ids)), np.float32)
-    raster.contributions(
-        plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, parts[0], parts[1]
-    )
+    totals = np.zeros((len(plan.ids), 2), np.float32)
+    raster.contributions(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, totals)
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)
-    mass[plan.ids], peak[plan.ids] = parts
+    mass[plan.ids], peak[plan.ids] = totals.T
     return mass, peak

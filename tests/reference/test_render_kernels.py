@@ -1,0 +1,130 @@
+"""The renderer's kernels one by one, against obvious twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from renderer import footprints, view_colors
+
+from gsmerge import Gaussians
+from gsmerge.kernels import binning, harmonics
+from gsmerge.render import plan_view, prepare
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.empty(0),
+        np.ones(1),
+        np.ones(100),
+        RNG.uniform(0.01, 100, 5000),
+        RNG.lognormal(0, 20, 5000),
+        RNG.choice([0.5, 0.5000001, 2.0, 1e30], 1000),
+        np.array([1e-38, 3e38, 1.0]),
+    ],
+    ids=["none", "one", "equal", "usual", "wide", "ties", "extremes"],
+)
+def test_depth_order_is_a_stable_sort(values: np.ndarray) -> None:
+    depths = values.astype(np.float32)
+    np.testing.assert_array_equal(binning.depth_order(depths.view(np.uint32)), np.argsort(depths, kind="stable"))
+
+
+def random_boxes(count: int, lines: int, columns: int) -> np.ndarray:
+    """First and exclusive last column and row; every fifth one empty."""
+    x, y = np.sort(RNG.integers(0, columns + 1, (count, 2)), 1), np.sort(RNG.integers(0, lines + 1, (count, 2)), 1)
+    boxes = np.concatenate([x, y], 1).astype(np.int16)
+    boxes[(boxes[:, 1] == boxes[:, 0]) | (boxes[:, 3] == boxes[:, 2])] = 0
+    boxes[::5] = 0
+    return boxes
+
+
+@pytest.mark.parametrize(("lines", "columns"), [(1, 1), (1, 9), (9, 1), (5, 7)])
+def test_tile_lists(lines: int, columns: int) -> None:
+    boxes, order = random_boxes(200, lines, columns), RNG.permutation(200).astype(np.int32)
+    wanted: list[list[int]] = [[] for _ in range(lines * columns)]
+    for k, (x0, x1, y0, y1) in zip(order.tolist(), boxes[order].tolist(), strict=True):
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                wanted[y * columns + x].append(k)
+    counts = binning.count_tiles(boxes, lines, columns)
+    assert counts.tolist() == [len(tile) for tile in wanted]
+    members, starts = np.full(counts.sum(), -1, np.int32), np.cumsum(counts) - counts
+    binning.deal_tiles(order, boxes[order], columns, starts.copy(), members)
+    assert members.tolist() == [k for tile in wanted for k in tile]
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_view_colors(degree: int) -> None:
+    means = RNG.normal(size=(50, 3)).astype(np.float32)
+    sh0 = RNG.normal(size=(50, 1, 3)).astype(np.float32)
+    shN = RNG.normal(size=(50, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
+    eye, ids = np.array([0.3, -2.0, 1.0], np.float32), np.arange(1, 50, 2, dtype=np.int32)
+    colors = np.full((25, 3), -1, np.float32)
+    harmonics.view_colors(means, sh0, shN, ids, eye, 0, 25, colors)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = -torch.from_numpy(eye).double()
+    sh = torch.from_numpy(np.concatenate([sh0, shN], 1)).double()
+    np.testing.assert_allclose(colors, view_colors(torch.from_numpy(means).double(), sh, viewmat)[ids], atol=1e-5)
+    assert (colors == 0).any()
+
+
+def test_footprints() -> None:
+    """Position, precision and rows of what a plan holds; a row is listed if a pixel column could reach 1/255."""
+    generator = torch.Generator().manual_seed(0)
+    n, width, height = 300, 60, 40
+    means = torch.randn(n, 3, generator=generator) * 0.6 + torch.tensor([0.0, 0, 3])
+    gaussians = Gaussians(
+        means, torch.randn(n, 4, generator=generator), torch.exp(torch.randn(n, 3, generator=generator) - 3),
+        torch.rand(n, generator=generator), torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
+    )  # fmt: skip
+    K = torch.tensor([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    plan = plan_view(prepare(gaussians), viewmat, K, width, height)
+    positions, covars, depths = footprints(
+        means.double(), gaussians.quats.double(), gaussians.scales.double(), viewmat, K, width, height
+    )
+    ids = plan.ids
+    mean_x, mean_y, rate_x, slope, rate_y, lnop, first, last = plan.footprints.T.astype(np.float64)
+    np.testing.assert_allclose(np.stack([mean_x, mean_y], 1), positions[ids], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(plan.depths, depths[ids], rtol=1e-5)
+    conics = torch.linalg.inv(covars + 0.3 * torch.eye(2, dtype=torch.float64))[ids].numpy()
+    np.testing.assert_allclose(2 * rate_x**2, conics[:, 0, 0], rtol=1e-3)
+    np.testing.assert_allclose(-2 * rate_x**2 * slope, conics[:, 0, 1], rtol=1e-2, atol=1e-4)
+    np.testing.assert_allclose(2 * (rate_x**2 * slope**2 + rate_y), conics[:, 1, 1], rtol=1e-3)
+    np.testing.assert_allclose(np.exp(lnop), gaussians.opacities[ids], rtol=1e-5)
+
+    rows = np.arange(height)[:, None] + 0.5
+    reached = (lnop - rate_y * (rows - mean_y) ** 2 >= np.log(1 / 255)) & np.isin(np.arange(len(ids)), plan.members)
+    listed = (rows - 0.5 >= first) & (rows - 0.5 <= last)
+    assert (listed | ~reached).all()
+    assert (listed == reached)[:, reached.any(0)].mean() > 0.999
+
+
+def test_no_gaussian_that_adds_light_is_missing() -> None:
+    """Culling and boxes drop only what stays below 1/255 in every pixel."""
+    generator = torch.Generator().manual_seed(1)
+    n, width, height = 2000, 50, 40
+    means = torch.randn(n, 3, generator=generator) * 2 + torch.tensor([0.0, 0, 2])
+    gaussians = Gaussians(
+        means, torch.randn(n, 4, generator=generator), torch.exp(torch.randn(n, 3, generator=generator) * 1.5 - 3),
+        torch.rand(n, generator=generator), torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
+    )  # fmt: skip
+    K = torch.tensor([[50.0, 0, 25], [0, 50.0, 20], [0, 0, 1]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    plan = plan_view(prepare(gaussians), viewmat, K, width, height)
+    positions, covars, depths = footprints(
+        means.double(), gaussians.quats.double(), gaussians.scales.double(), viewmat, K, width, height
+    )
+    conics = torch.linalg.inv(covars + 0.3 * torch.eye(2, dtype=torch.float64))
+    ys, xs = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    offsets = torch.stack([xs, ys], -1).double().reshape(1, -1, 2) - positions[:, None]
+    alphas = gaussians.opacities[:, None] * torch.exp(-0.5 * torch.einsum("npi,nij,npj->np", offsets, conics, offsets))
+    visible = (alphas.amax(1) > 1.001 / 255) & (depths > 0.01)
+    drawn = set(plan.ids[np.unique(plan.members)].tolist())
+    assert set(torch.nonzero(visible)[:, 0].tolist()) <= drawn
+    # boxes have corners that their ellipses do not fill, and culling only looks at the longest axis
+    assert visible.sum() > 0.9 * len(drawn)
+    assert len(drawn) > 0.6 * len(plan.ids)

@@ -1,0 +1,156 @@
+"""The written-out blending weights against the renderer and against a dense matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from renderer import render_reference
+
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.render import ViewPlan, composite, contributions, plan_view, prepare, splat_adjoint
+from gsmerge.types import Gaussians
+from gsmerge.weights import ViewWeights, apply, apply_transposed, peak_weights, view_weights
+
+WIDTH, HEIGHT = 45, 37  # not multiples of a tile
+K = np.array([[40.0, 0, 21.3], [0, 42.0, 19.1], [0, 0, 1]])
+
+
+def random_gaussians(n: int, seed: int, opacity: float = 0.5) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    means = normal(n, 3) * torch.tensor([0.9, 0.8, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
+    return Gaussians(
+        means,
+        torch.nn.functional.normalize(normal(n, 4), dim=1),
+        torch.exp(normal(n, 3) * 0.9 - 3),
+        torch.rand(n, generator=generator) ** opacity,
+        normal(n, 1, 3),
+        torch.zeros(n, 0, 3),
+    )
+
+
+def planned(gaussians: Gaussians) -> tuple[ViewPlan, ViewWeights]:
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    return plan, view_weights(plan)
+
+
+def dense(weights: ViewWeights, count: int) -> np.ndarray:
+    """``[pixels,n]``."""
+    matrix = np.zeros((HEIGHT * WIDTH, count))
+    for i, member in enumerate(weights.members):
+        entries = slice(weights.starts[i], weights.starts[i + 1])
+        np.add.at(matrix, (weights.pixels[entries], weights.ids[member]), weights.weights[entries])
+    return matrix
+
+
+# many faint ones exceed the first buffer; opaque ones stop pixels early
+CASES = [(200, 0, 0.5), (3000, 1, 0.05), (3000, 2, 3.0), (1, 3, 0.5)]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_entries_are_sound(case: tuple[int, int, float]) -> None:
+    plan, weights = planned(random_gaussians(*case))
+    assert len(weights.starts) == len(plan.members) + 1
+    assert weights.starts[0] == 0
+    assert (np.diff(weights.starts) >= 0).all()
+    assert weights.starts[-1] == len(weights.pixels) == len(weights.weights)
+    assert (weights.weights > 0).all()
+    assert (weights.pixels >= 0).all()
+    assert (weights.pixels < HEIGHT * WIDTH).all()
+    owners = weights.ids[np.repeat(weights.members, np.diff(weights.starts))].astype(np.int64)
+    assert len(np.unique(owners * HEIGHT * WIDTH + weights.pixels)) == len(owners)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_apply_matches_composite_and_the_dense_matrix(case: tuple[int, int, float]) -> None:
+    gaussians = random_gaussians(*case)
+    plan, weights = planned(gaussians)
+    colors = np.random.default_rng(0).normal(size=(len(gaussians), 3))
+    image = apply(weights, colors)
+    assert_allclose(image, composite(plan, colors)[0], atol=2e-5)
+    assert_allclose(image, (dense(weights, len(gaussians)) @ colors).reshape(HEIGHT, WIDTH, 3), atol=2e-5)
+
+
+def test_rows_sum_to_what_is_opaque() -> None:
+    gaussians = random_gaussians(500, 4)
+    plan, weights = planned(gaussians)
+    alphas = apply(weights, np.ones((500, 1)))[..., 0]
+    assert_allclose(alphas, 1 - composite(plan)[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_transposed_matches_the_adjoint_and_the_dense_matrix(channels: int) -> None:
+    gaussians = random_gaussians(400, 5)
+    plan, weights = planned(gaussians)
+    image = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, channels))
+    sums = apply_transposed(weights, image)
+    assert sums.shape == (len(plan.ids), channels)
+    assert_allclose(sums, splat_adjoint(plan, image)[plan.ids], atol=2e-4)
+    wanted = dense(weights, 400).T @ image.reshape(-1, channels)
+    assert_allclose(sums, wanted[plan.ids], atol=2e-4)
+    left_out = np.setdiff1d(np.arange(400), plan.ids)
+    assert not wanted[left_out].any()
+
+
+def test_apply_and_transposed_are_adjoint() -> None:
+    gaussians = random_gaussians(300, 6)
+    plan, weights = planned(gaussians)
+    rng = np.random.default_rng(2)
+    colors, image = rng.normal(size=(300, 3)), rng.normal(size=(HEIGHT, WIDTH, 3))
+    forward = float((apply(weights, colors).astype(float) * image).sum())
+    backward = float((colors[plan.ids] * apply_transposed(weights, image)).sum())
+    assert forward == pytest.approx(backward, rel=1e-4)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_peaks_and_masses_match_contributions(case: tuple[int, int, float]) -> None:
+    gaussians = random_gaussians(*case)
+    plan, weights = planned(gaussians)
+    mass, peak = contributions(plan)
+    assert_allclose(peak_weights(weights), peak[plan.ids], atol=1e-6)
+    assert_allclose(apply_transposed(weights, np.ones((HEIGHT, WIDTH, 1)))[:, 0], mass[plan.ids], rtol=1e-4, atol=1e-4)
+
+
+def test_weights_match_the_slow_renderer() -> None:
+    gaussians = random_gaussians(200, 7)
+    _, weights = planned(gaussians)
+    wanted = render_reference(
+        gaussians.means.double(), gaussians.quats.double(), gaussians.scales.double(), gaussians.opacities.double(),
+        torch.zeros(200, 3, dtype=torch.float64), torch.eye(4, dtype=torch.float64), torch.from_numpy(K),
+        WIDTH, HEIGHT,
+    ).weights  # fmt: skip
+    error = np.abs(dense(weights, 200).T - wanted.reshape(200, -1).numpy())
+    assert np.quantile(error, 0.999) < 1e-5
+    assert error.max() < 0.02  # single pixels where a threshold falls the other way
+
+
+def test_needles_lose_no_pixel() -> None:
+    """Columns are cut to what a thin slanted Gaussian can touch; nothing that blends may fall outside."""
+    gaussians = random_gaussians(300, 8)
+    needles = Gaussians(
+        gaussians.means, gaussians.quats, torch.tensor([0.7, 1e-4, 1e-4]).expand(300, 3), gaussians.opacities,
+        gaussians.sh0, gaussians.shN,
+    )  # fmt: skip
+    slanted = quat_to_rotmat(needles.quats)[:, :2, 0].abs().amin(1)
+    assert (slanted > 0.1).sum() > 100
+    plan, weights = planned(needles)
+    colors = np.random.default_rng(0).normal(size=(300, 3))
+    assert_allclose(apply(weights, colors), composite(plan, colors)[0], atol=2e-5)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_nothing_in_view(count: int) -> None:
+    gaussians = random_gaussians(5, 9)[:count]
+    behind = Gaussians(
+        gaussians.means - 10, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh0, gaussians.shN
+    )
+    _, weights = planned(behind)
+    assert len(weights.pixels) == 0
+    assert not apply(weights, np.ones((count, 3))).any()
+    assert apply_transposed(weights, np.ones((HEIGHT, WIDTH, 3))).shape == (0, 3)
+    assert peak_weights(weights).shape == (0,)

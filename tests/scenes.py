@@ -1,0 +1,351 @@
+"""Tiny made scenes in memory, and what must hold of every compact scene.
+
+Surfaces are traced analytically: photos are exact, and every pixel gets one Gaussian on the surface that it sees,
+the size of its footprint, flat along the viewing ray, of random opacity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge import Cameras, Gaussians, PixelScene, compact, render
+from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.pipeline import CompactReport, CompactResult
+from gsmerge.types import SH_C0, FeatureGaussians
+
+Texture = Callable[[np.ndarray], np.ndarray]
+FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+MISS = 1e30
+
+
+@dataclass(frozen=True)
+class Surface:
+    """``trace(eyes [n,3], rays [n,3])`` gives distances along the rays, MISS where there is none."""
+
+    trace: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    texture: Texture
+
+
+def waves(seed: int = 0, rate: float = 6.0) -> Texture:
+    """A smooth, colourful texture of world positions that does not repeat."""
+    rng = np.random.default_rng(seed)
+    turns, phases = rng.normal(size=(3, 4, 3)) * rate, rng.uniform(0, 6.28, (3, 4))
+
+    def texture(points: np.ndarray) -> np.ndarray:
+        swings = np.sin(np.einsum("ckd,nd->nck", turns, points) + phases).sum(-1)
+        return 0.5 + 0.11 * swings
+
+    return texture
+
+
+def flat(*rgb: float) -> Texture:
+    """One colour."""
+    return lambda points: np.broadcast_to(np.array(rgb), points.shape)
+
+
+def plane(depth: float, texture: Texture, *, left: float = -MISS, right: float = MISS) -> Surface:
+    """The plane z = depth between two x."""
+
+    def trace(eyes: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        distances = (depth - eyes[:, 2]) / rays[:, 2]
+        x = eyes[:, 0] + distances * rays[:, 0]
+        return np.where((distances > 0) & (x > left) & (x < right), distances, MISS)
+
+    return Surface(trace, texture)
+
+
+def ball(centre: Sequence[float], radius: float, texture: Texture) -> Surface:
+    """A sphere."""
+
+    def trace(eyes: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        a, offset = (rays**2).sum(1), eyes - np.array(centre)
+        b, c = (offset * rays).sum(1), (offset**2).sum(1) - radius**2
+        inside = b * b - a * c
+        distances = (-b - np.sqrt(np.maximum(inside, 0))) / a
+        return np.where((inside > 0) & (distances > 0), distances, MISS)
+
+    return Surface(trace, texture)
+
+
+def wall(seed: int = 0) -> list[Surface]:
+    """A textured wall."""
+    return [plane(3.0, waves(seed))]
+
+
+def two_planes() -> list[Surface]:
+    """Half of the view is nearer."""
+    return [plane(2.2, waves(1), right=0.0), plane(3.2, waves(2))]
+
+
+def pole(width: float = 0.13) -> list[Surface]:
+    """A thin white pole in front of a darker textured wall."""
+    dim = waves(3)
+    return [
+        plane(2.0, flat(0.95, 0.95, 0.9), left=-width / 2, right=width / 2),
+        plane(3.0, lambda points: 0.5 * dim(points)),
+    ]
+
+
+def room() -> list[Surface]:
+    """A ball in front of a wall."""
+    return [ball((0.2, 0.1, 2.6), 0.5, waves(5, 8.0)), plane(3.4, waves(4))]
+
+
+def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8, start: float = -0.5) -> Cameras:
+    """Cameras side by side over ``span`` of x, looking at (0, 0, 3)."""
+    viewmats = []
+    for view in range(num_views):
+        x = span * (start + (view / (num_views - 1) if num_views > 1 else 0.5))
+        viewmats.append(look_at(np.array([x, 0.15 * x, 0.0]), np.array([0.0, 0.0, 3.0])))
+    return Cameras(torch.stack(viewmats), intrinsics(num_views, width, height), width, height)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> Tensor:
+    """World to camera, OpenCV axes, y down."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(np.array([0.0, 1.0, 0.0]), z)
+    x /= np.linalg.norm(x)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return torch.from_numpy(viewmat)
+
+
+def intrinsics(num_views: int, width: int, height: int) -> Tensor:
+    """A lens whose focal length is the image's width."""
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return K.expand(num_views, 3, 3).clone()
+
+
+def trace(surfaces: Sequence[Surface], cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World positions ``[v,hw,3]``, depths ``[v,hw]`` and colours ``[v,hw,3]`` of every pixel's centre."""
+    ys, xs = np.meshgrid(np.arange(cameras.height) + 0.5, np.arange(cameras.width) + 0.5, indexing="ij")
+    pixels = np.stack([xs.ravel(), ys.ravel(), np.ones(xs.size)], 1)
+    points, depths, colors = [], [], []
+    for viewmat, K, eye in zip(cameras.viewmats.numpy(), cameras.Ks.numpy(), cameras.centres.numpy(), strict=True):
+        rays = pixels @ np.linalg.inv(K).T @ viewmat[:3, :3]  # of unit depth
+        found = np.stack([s.trace(np.broadcast_to(eye, rays.shape), rays) for s in surfaces])
+        nearest, depth = found.argmin(0), found.min(0)
+        assert (depth < MISS).all(), "every ray must meet a surface"
+        where = eye + depth[:, None] * rays
+        shades = np.stack([s.texture(where) for s in surfaces])
+        points.append(where)
+        depths.append(depth)
+        colors.append(shades[nearest, np.arange(len(where))])
+    return np.stack(points), np.stack(depths), np.clip(np.stack(colors), 0, 1)
+
+
+def make_scene(
+    surfaces: Sequence[Surface],
+    cameras: Cameras,
+    *,
+    seed: int = 0,
+    noise: float = 0.0,
+    opacity: tuple[float, float] = (0.6, 0.95),
+    degree: int = 0,
+    photos: bool = True,
+) -> PixelScene:
+    """One Gaussian per pixel on the surfaces.
+
+    Args:
+        surfaces: What is seen.
+        cameras: The views.
+        seed: Of opacities, depth noise and higher harmonics.
+        noise: Standard deviation of the depth, as a share of it.
+        opacity: Least and largest opacity.
+        degree: Of the spherical harmonics; those above degree 0 are small and random.
+        photos: With the exact images.
+    """
+    rng = np.random.default_rng(seed)
+    points, depths, colors = trace(surfaces, cameras)
+    if noise:
+        eyes = cameras.centres.numpy()[:, None]
+        factors = np.exp(noise * rng.normal(size=depths.shape))
+        points, depths = eyes + (points - eyes) * factors[..., None], depths * factors
+    count, shape = depths.size, (len(cameras), cameras.height, cameras.width)
+    sizes = 0.6 * depths / cameras.Ks[:, 0, 0, None].numpy()
+    scales = sizes[..., None] * np.array([1.0, 1.0, 0.3]) * rng.uniform(0.9, 1.1, (*depths.shape, 3))
+    quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].transpose(1, 2))[:, None].expand(*depths.shape, 4)
+
+    def column(values: np.ndarray, *width: int) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).reshape(count, *width)
+
+    gaussians = Gaussians(
+        means=torch.from_numpy(points).reshape(count, 3),
+        quats=quats.reshape(count, 4).float(),
+        scales=column(scales, 3),
+        opacities=column(rng.uniform(*opacity, count)),
+        sh0=column((colors - 0.5) / SH_C0, 1, 3),
+        shN=column(0.05 * rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)), (degree + 1) ** 2 - 1, 3),
+    )
+    images = torch.from_numpy(colors.astype(np.float32)).reshape(*shape, 3) if photos else None
+    return PixelScene(gaussians, cameras, images, torch.ones(shape, dtype=torch.bool), names(len(cameras)))
+
+
+def names(count: int) -> tuple[str, ...]:
+    """Names of views."""
+    return tuple(f"{view:03d}.png" for view in range(count))
+
+
+def take_views(scene: PixelScene, order: Sequence[int]) -> PixelScene:
+    """The scene's views in another order, repeated or left out."""
+    size = scene.pixels_per_view
+    rows = torch.cat([torch.arange(view * size, (view + 1) * size) for view in order])
+    index = torch.tensor(order)
+    return PixelScene(
+        scene.gaussians[rows],
+        scene.cameras[index],
+        None if scene.images is None else scene.images[index],
+        scene.valid[index],
+        names(len(order)),
+    )
+
+
+def move(scene: PixelScene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> PixelScene:
+    """The scene after x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
+    turn, offset = torch.from_numpy(rotation).double(), torch.from_numpy(shift).double()
+    g, viewmats = scene.gaussians, scene.cameras.viewmats.clone()
+    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
+    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ offset
+    moved = replace(
+        g,
+        means=factor * (g.means.double() @ turn.T) + offset,
+        quats=rotmat_to_quat(turn @ quat_to_rotmat(g.quats.double())).float(),
+        scales=g.scales * factor,
+    )
+    return replace(scene, gaussians=moved, cameras=replace(scene.cameras, viewmats=viewmats))
+
+
+def rotmat_to_quat(rotmats: Tensor) -> Tensor:
+    """``[...,4]`` wxyz of rotations ``[...,3,3]``, through the eigenvector of the largest eigenvalue (Bar-Itzhack)."""
+    r = rotmats
+    k = torch.zeros(*r.shape[:-2], 4, 4, dtype=r.dtype)
+    k[..., 0, 0] = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
+    for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        k[..., 0, i + 1] = k[..., i + 1, 0] = r[..., m, j] - r[..., j, m]
+        k[..., i + 1, i + 1] = r[..., i, i] - r[..., j, j] - r[..., m, m]
+        k[..., i + 1, j + 1] = k[..., j + 1, i + 1] = r[..., i, j] + r[..., j, i]
+    quats = torch.linalg.eigh(k).eigenvectors[..., -1]
+    return torch.where(quats[..., :1] < 0, -quats, quats)
+
+
+def random_rotation(seed: int) -> np.ndarray:
+    """``[3,3]``."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def images_of(gaussians: Gaussians, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Images ``[c,h,w,3]`` and alphas ``[c,h,w]`` over black, float64."""
+    drawn = render(gaussians, cameras)
+    return drawn.images.double().numpy(), drawn.alphas[..., 0].double().numpy()
+
+
+def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:
+    """PSNR (dB) over all views of a scene with photos."""
+    assert scene.images is not None
+    image = np.clip(images_of(gaussians, scene.cameras)[0], 0, 1)
+    return float(-10 * np.log10(((image - scene.images.double().numpy()) ** 2).mean()))
+
+
+def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
+    """``compact`` with the invariants checked; a tenth of the pixels unless told."""
+    if "superpixels" not in settings:
+        settings = {"density": 0.1, **settings}
+    result = compact(scene, **settings)
+    assert_invariants(result.gaussians, scene)
+    assert_consistent(result.report, scene, result.gaussians)
+    return result
+
+
+def plain(scene: PixelScene, **settings: Any) -> Gaussians:
+    """The merge alone: no choice by photos, no fit."""
+    return compacted(scene, **{"robust": False, "fit": "none", **settings}).gaussians
+
+
+def assert_invariants(gaussians: Gaussians, scene: PixelScene) -> None:
+    """What must hold of the Gaussians of every compact scene."""
+    for name in FIELDS:
+        assert torch.isfinite(getattr(gaussians, name)).all(), name
+    assert (gaussians.opacities > 0).all()
+    assert (gaussians.opacities < 1).all()
+    assert (gaussians.scales > 0).all()
+    assert torch.allclose(gaussians.quats.norm(dim=1), torch.ones(len(gaussians)), atol=1e-5)
+    covars = covariances(gaussians.quats.double(), gaussians.scales.double())
+    smallest = torch.linalg.eigvalsh(covars)[:, 0] if len(gaussians) else torch.zeros(0)
+    assert (smallest >= -1e-9 * covars.diagonal(dim1=1, dim2=2).sum(1)).all()
+    assert len(gaussians) <= int(scene.valid.sum())
+    if (scene.gaussians.opacities[scene.valid.reshape(-1)] > 1 / 255).all():
+        assert len(gaussians) >= 1
+    assert gaussians.sh_degree <= scene.gaussians.sh_degree
+    drawn = render(gaussians, scene.cameras)
+    assert torch.isfinite(drawn.images).all()
+    assert torch.isfinite(drawn.alphas).all()
+
+
+def assert_consistent(report: CompactReport, scene: PixelScene, gaussians: Gaussians) -> None:
+    """The report tells what the run did."""
+    assert (report.num_input, report.num_output) == (len(scene.gaussians), len(gaussians))
+    assert (report.psnr_before is None) == (report.psnr_after is None) == (scene.images is None)
+    assert all(seconds >= 0 for seconds in report.seconds.values())
+    assert report.peak_memory_bytes > 0
+
+
+def assert_same_set(one: Gaussians, other: Gaussians, *, atol: float, unit: float = 1.0) -> None:
+    """The same Gaussians in any order: each has a partner with all fields within ``atol``, lengths in ``unit``."""
+    assert len(one) == len(other)
+    a, b = (_rows(g, unit) for g in (one, other))
+    nearest = np.array([np.abs(row - b).max(1).argmin() for row in a], int)
+    error = np.abs(a - b[nearest]).max(1)
+    assert error.max(initial=0) <= atol, f"{(error > atol).sum()} of {len(a)} differ, by up to {error.max():.3g}"
+    assert len(np.unique(nearest)) == len(a)
+
+
+def _rows(gaussians: Gaussians, unit: float) -> np.ndarray:
+    covars = covariances(gaussians.quats.double(), gaussians.scales.double() / unit).flatten(1)
+    columns = [gaussians.means.double() / unit, covars, gaussians.opacities.double()[:, None]]
+    columns += [SH_C0 * gaussians.sh0.double().flatten(1), SH_C0 * gaussians.shN.double().flatten(1)]
+    return torch.cat(columns, 1).numpy()
+
+
+def make_features(
+    means: Any, *, sizes: Any = 0.01, views: Any = None, colors: Any = 0.5, opacities: Any = 0.8, degree: int = 0
+) -> FeatureGaussians:
+    """Ball-shaped Feature Gaussians of one member each (row i of the scene), one view each unless told.
+
+    Args:
+        means: ``[g,3]``.
+        sizes: Standard deviations, ``[g]`` or one; ``[g,3]`` for boxes along the axes.
+        views: ``[g]``.
+        colors: ``[g,3]`` or one, sRGB in [0, 1].
+        opacities: ``[g]`` or one.
+        degree: Of the harmonics, zero above degree 0.
+    """
+    means = torch.as_tensor(np.asarray(means), dtype=torch.float32)
+    g = len(means)
+    scales = torch.as_tensor(np.asarray(sizes), dtype=torch.float32)
+    scales = scales[:, None].expand(g, 3) if scales.shape == (g,) else scales.expand(g, 3)
+    opacity = torch.as_tensor(np.asarray(opacities), dtype=torch.float32).expand(g)
+    return FeatureGaussians(
+        means=means,
+        covars=torch.diag_embed(scales**2),
+        weights=opacity.clone(),
+        masses=opacity * scales.prod(1) * (2 * np.pi) ** 1.5,
+        extinctions=-torch.log1p(-opacity) * scales.sort(1).values[:, 1:].prod(1),
+        gains=torch.ones(g),
+        spreads=torch.ones(g),
+        sh0=((torch.as_tensor(np.asarray(colors), dtype=torch.float32).expand(g, 3) - 0.5) / SH_C0)[:, None],
+        shN=torch.zeros(g, (degree + 1) ** 2 - 1, 3),
+        footprints=scales.mean(1),
+        views=torch.arange(g) if views is None else torch.as_tensor(np.asarray(views)),
+        backing=torch.zeros(g, dtype=torch.bool),
+        starts=torch.arange(g + 1),
+        members=torch.arange(g),
+    )

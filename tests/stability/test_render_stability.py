@@ -1,0 +1,131 @@
+"""Hostile but finite input: no crash, no NaN, nothing outside its range."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsmerge import Cameras, Gaussians
+from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
+
+EXTREMES = [0.0, 1e-30, 1e-8, 0.01, 0.0100001, 0.5, 1.0, 3.0, 1e3, 1e8, 1e20, 1e30]
+
+
+def camera(width: int, height: int) -> Cameras:
+    K = torch.tensor([[50.0, 0, width / 2], [0, 50.0, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return Cameras(torch.eye(4, dtype=torch.float64)[None], K[None], width, height)
+
+
+def make(means: object, quats: object, scales: object, opacities: object, degree: int = 0) -> Gaussians:
+    tensors = [torch.as_tensor(x, dtype=torch.float32) for x in (means, quats, scales, opacities)]
+    n = len(tensors[0])
+    return Gaussians(*tensors, torch.ones(n, 1, 3), torch.ones(n, (degree + 1) ** 2 - 1, 3))
+
+
+def assert_sane(gaussians: Gaussians, cameras: Cameras) -> None:
+    for antialiased in (False, True):
+        rendering = render(gaussians, cameras, 0.5, antialiased=antialiased, with_depths=True)
+        assert rendering.depths is not None
+        for tensor in (rendering.images, rendering.alphas, rendering.depths):
+            assert tensor.isfinite().all()
+        assert rendering.alphas.min() >= 0
+        assert rendering.alphas.max() <= 1
+    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height)
+    image, transmittance = composite(plan, -np.ones((len(gaussians), 3), np.float32))
+    assert np.isfinite(image).all()
+    assert np.isfinite(transmittance).all()
+    mass, peak = contributions(plan)
+    assert np.isfinite(mass).all()
+    assert np.isfinite(peak).all()
+    assert np.isfinite(splat_adjoint(plan, image)).all()
+
+
+signed = st.sampled_from(EXTREMES + [-x for x in EXTREMES])
+row = st.tuples(
+    st.tuples(signed, signed, signed),
+    st.tuples(*[st.sampled_from([0.0, 1.0, -1.0, 1e-20, 1e15])] * 4),
+    st.tuples(*[st.sampled_from(EXTREMES)] * 3),
+    st.sampled_from([0.0, 1 / 255, 0.004, 0.5, 0.99, 1.0]),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(row, min_size=1, max_size=6), st.sampled_from([(1, 1), (16, 16), (17, 33), (3, 40)]))
+def test_extreme_gaussians(rows: list[tuple[object, ...]], size: tuple[int, int]) -> None:
+    assert_sane(make(*(list(column) for column in zip(*rows, strict=True)), degree=1), camera(*size))
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e30])
+def test_scales_of_any_size(scale: float) -> None:
+    gaussians = make([[0, 0, 1.0]] * 3, [[1, 0, 0, 0]] * 3, [[scale] * 3, [scale, 1, 1], [1, 1, scale]], [0.5] * 3)
+    assert_sane(gaussians, camera(20, 20))
+    assert render(gaussians, camera(21, 21)).alphas[0, 10, 10, 0] > 0.4
+
+
+def test_a_gaussian_wider_than_the_world_is_flat() -> None:
+    alphas = render(make([[0, 0, 1.0]], [[1, 0, 0, 0]], [[1e30] * 3], [0.5]), camera(40, 40)).alphas
+    torch.testing.assert_close(alphas, torch.full_like(alphas, 0.5), atol=1e-4, rtol=0)
+
+
+def test_a_zero_quaternion_counts_as_no_rotation() -> None:
+    turned = make([[0, 0, 1.0]], [[0, 0, 0, 0]], [[0.1, 0.02, 0.02]], [0.5])
+    upright = make([[0, 0, 1.0]], [[1, 0, 0, 0]], [[0.1, 0.02, 0.02]], [0.5])
+    torch.testing.assert_close(render(turned, camera(30, 30)).images, render(upright, camera(30, 30)).images)
+
+
+def test_quaternions_of_any_length() -> None:
+    images = [
+        render(make([[0, 0, 1.0]], [[0.5 * f, 0.5 * f, 0.1 * f, 0.7 * f]], [[0.1, 0.02, 0.02]], [0.5]), camera(30, 30))
+        for f in (1.0, 1e-6, 1e6)
+    ]
+    for other in images[1:]:
+        torch.testing.assert_close(other.images, images[0].images, atol=1e-5, rtol=0)
+
+
+def test_rows_that_are_not_finite_are_not_drawn() -> None:
+    nan, inf = float("nan"), float("inf")
+    clean = make([[0, 0, 1.0]] * 3, [[1, 0, 0, 0]] * 3, [[0.1] * 3] * 3, [0.5, 0.0, 0.0])
+    dirty = make([[0, 0, 1.0], [nan] * 3, [inf] * 3], [[1, 0, 0, 0]] * 3, [[0.1] * 3] * 3, [0.5, 1.0, 1.0])
+    torch.testing.assert_close(render(dirty, camera(20, 20)).images, render(clean, camera(20, 20)).images)
+
+
+def test_many_on_one_spot_at_one_depth() -> None:
+    n = 5000
+    gaussians = make([[0, 0, 1.0]] * n, [[1, 0, 0, 0]] * n, [[0.05] * 3] * n, [0.3] * n)
+    assert_sane(gaussians, camera(20, 20))
+    # of equal depth: in the order of the rows, until the pixel stops
+    peak = contributions(plan_view(prepare(gaussians), np.eye(4), camera(1, 1).Ks[0], 1, 1))[1]
+    np.testing.assert_allclose(peak[:20], 0.3 * 0.7 ** np.arange(20), rtol=1e-4)
+    assert (peak[100:] == 0).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 100), (100, 1), (15, 17), (16, 16), (33, 31)])
+def test_image_sizes_that_are_no_multiple_of_a_tile(size: tuple[int, int]) -> None:
+    gaussians = make([[0, 0, 1.0]], [[1, 0, 0, 0]], [[100.0] * 3], [0.5])
+    rendering = render(gaussians, camera(*size))
+    assert rendering.images.shape == (1, size[1], size[0], 3)
+    torch.testing.assert_close(rendering.alphas, torch.full_like(rendering.alphas, 0.5), atol=1e-4, rtol=0)
+
+
+def test_more_tiles_than_sixteen_bits_count() -> None:
+    width = height = 16 * 260
+    K = np.array([[100.0, 0, 0], [0, 100.0, 0], [0, 0, 1]])
+    last = (width - 8) / 100, (height - 8) / 100
+    gaussians = make([[*last, 1.0], [0.08, 0.08, 1.0]], [[1, 0, 0, 0]] * 2, [[0.01] * 3] * 2, [0.5] * 2)
+    plan = plan_view(prepare(gaussians), np.eye(4), K, width, height)
+    assert len(plan.offsets) == 260 * 260 + 1
+    assert plan.members[plan.offsets[-2] : plan.offsets[-1]].tolist() == [0]
+    assert plan.members[: plan.offsets[1]].tolist() == [1]
+
+
+def test_a_very_wide_image() -> None:
+    width = 32767 * 16
+    K = np.array([[100.0, 0, 0], [0, 100.0, 0.5], [0, 0, 1]])
+    gaussians = make([[(width - 0.5) / 100, 0, 1.0]], [[1, 0, 0, 0]], [[0.01] * 3], [0.5])
+    plan = plan_view(prepare(gaussians), np.eye(4), K, width, 1)
+    assert composite(plan)[1][0, -1] == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(ValueError, match="image size"):
+        plan_view(prepare(gaussians), np.eye(4), K, width + 1, 1)

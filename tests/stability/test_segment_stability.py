@@ -1,0 +1,83 @@
+"""The number of threads, the picture's size and real photos."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_psnr
+
+from gsmerge.kernels.regions import pad_labels, region_rows
+from gsmerge.kernels.sweeps import refine
+from gsmerge.segment import METHODS, SegmentOptions, segment, superpixels
+from gsmerge.threads import use_threads
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_do_not_matter(method: str) -> None:
+    images = torch.rand((5, 40, 50, 3), generator=torch.Generator().manual_seed(1))
+    images = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), 3, 1, 1).permute(0, 2, 3, 1).contiguous()
+    options = SegmentOptions(superpixels=150, method=method)
+    alone = torch.stack([superpixels(image, 150, method) for image in images])
+    for threads in (1, 2, 8):
+        with use_threads(threads):
+            assert torch.equal(segment(images, options).labels, alone)
+
+
+def test_positions_stay_exact_in_wide_pictures() -> None:
+    """A superpixel far from the origin is as well placed as one near it."""
+    width, spread = 9000, np.float32(1e-5**0.5)
+    labels = np.repeat(np.arange(3), 3000)[None].repeat(2, 0)
+    rows = region_rows(pad_labels(labels), np.zeros((2, width, 3), np.float32), 3, 3, spread)
+    assert rows[:, 4] / spread == pytest.approx(np.array([1499.5, 4499.5, 7499.5]), abs=2e-3)
+    tile = np.random.default_rng(0).random((12, 30, 3), dtype=np.float32)
+    image = np.tile(tile, (1, width // 30, 1))
+    start = np.arange(12 * 30).reshape(12, 30) // 30 // 3 * 5 + np.arange(30)[None] // 6  # blocks of 3 x 6
+    start = np.concatenate([start + 20 * i for i in range(width // 30)], 1)
+    found = refine(pad_labels(start), image, 20 * width // 30, 2, np.float32(1e-3**0.5))[1:-1, 1:-1]
+    near, far = found[:, 300:330] - 20 * 10, found[:, -600:-570] - 20 * (width // 30 - 20)
+    assert np.count_nonzero(near != start[:, :30]) > 20
+    assert np.array_equal(near, far)
+
+
+@pytest.fixture(scope="module")
+def default_scores() -> dict[int, np.ndarray]:
+    """Density -> mean (proxy, splat) of the six photos, dB."""
+    found = {}
+    for density in DENSITIES:
+        scores = []
+        for image in photos().values():
+            labels = superpixels(image, count_at(image, density)).numpy()
+            scores.append((proxy_psnr(image, labels), splat_psnr(image, labels)))
+        found[density] = np.mean(scores, 0)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("density", "proxy", "splat"), [(5_000, 32.6, 30.0), (12_000, 35.9, 34.0), (23_000, 39.2, 37.9)]
+)
+def test_photos_are_described_well(
+    default_scores: dict[int, np.ndarray], density: int, proxy: float, splat: float
+) -> None:
+    assert default_scores[density][0] >= proxy
+    assert default_scores[density][1] >= splat
+
+
+def test_methods_rank_as_published() -> None:
+    """Saliency seeds beat the hexagonal grid, and that beats SLIC (paper, figure on segmentation); rdseg beats all."""
+    image = photos()["coffee"]
+    count = count_at(image, 12_000)
+    scores = [
+        proxy_psnr(image, superpixels(image, count, method).numpy()) for method in ("rdseg", "bass-st", "bass", "slic")
+    ]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[0] > scores[1] + 2
+
+
+def test_presets_trade_time_for_quality() -> None:
+    image = photos()["china"]
+    count = count_at(image, 12_000)
+    scores = [
+        proxy_psnr(image, superpixels(image, count, preset=preset).numpy()) for preset in ("fast", "default", "best")
+    ]
+    assert scores == sorted(scores)

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge.geometry import covariances
+from gsmerge.moments import MAX_OPACITY, Members, pool_members, principal_axes, scene_members, to_gaussians
+from gsmerge.types import Gaussians
+
+
+def members(count: int, seed: int = 0, coefficients: int = 1, opacity: float | None = None) -> Members:
+    rng = np.random.default_rng(seed)
+    columns = (
+        rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), 0.05 * np.exp(0.3 * rng.normal(size=(count, 3))),
+        np.full(count, opacity) if opacity else rng.uniform(0.2, 0.9, count), rng.normal(size=(count, coefficients, 3)),
+        np.full(count, 0.05),
+    )  # fmt: skip
+    return Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
+
+
+def copies(of: Members, count: int) -> Members:
+    return Members(*(np.repeat(getattr(of, name), count, axis=0) for name in of.__dataclass_fields__))
+
+
+def merged(of: Members) -> Gaussians:
+    """All members as one Gaussian."""
+    m = pool_members(of, np.array([0, len(of.means)]), np.arange(len(of.means)))
+    return to_gaussians(m.covars, m.extinctions, np.ones(1), torch.from_numpy(m.means), torch.from_numpy(m.sh))
+
+
+def own_covariance(of: Members, row: int = 0) -> torch.Tensor:
+    return covariances(torch.from_numpy(of.quats[row]).double(), torch.from_numpy(of.scales[row]).double())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
+    one = members(1, seed, coefficients=16)
+    result = merged(one)
+    covar = covariances(result.quats.double(), result.scales.double())[0]
+    np.testing.assert_allclose(result.means.numpy(), one.means, rtol=1e-6)
+    floor = (0.1 * 0.05) ** 2 * torch.eye(3)
+    np.testing.assert_allclose(covar, own_covariance(one) + floor, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(result.sh0.numpy(), one.sh[:, :1], rtol=1e-6)
+    np.testing.assert_allclose(result.shN.numpy(), one.sh[:, 1:], rtol=1e-6)
+    # the floor makes the disc larger, and the conserved optical depth thinner by as much
+    before, after = np.sort(one.scales[0].astype(float)), np.sort(result.scales[0].double().numpy())
+    depth = -np.log1p(-one.opacities[0]) * before[1:].prod() / after[1:].prod()
+    assert float(result.opacities[0]) == pytest.approx(1 - np.exp(-depth), rel=1e-5)
+    assert float(result.opacities[0]) == pytest.approx(one.opacities[0], rel=0.05)
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+@pytest.mark.parametrize("opacity", [0.1, 0.5])
+def test_stacked_members_add_up_like_layers(count: int, opacity: float) -> None:
+    one = members(1, opacity=opacity)
+    one.footprints[:] = 1e-6  # no floor
+    result = merged(copies(one, count))
+    assert float(result.opacities[0]) == pytest.approx(1 - (1 - opacity) ** count, rel=1e-5)
+    covar = covariances(result.quats.double(), result.scales.double())[0]
+    np.testing.assert_allclose(covar, own_covariance(one), rtol=1e-5, atol=1e-9)
+
+
+def test_many_opaque_layers_stay_finite() -> None:
+    result = merged(copies(members(1, opacity=1.0), 1000))
+    assert float(result.opacities[0]) == pytest.approx(MAX_OPACITY)
+
+
+def test_two_members_by_hand() -> None:
+    """Balls of radius 1 at x = 0 and 4, opacities 0.3 and 0.1: weights 3 to 1."""
+    two = members(2, opacity=0.3)
+    two.opacities[1] = 0.1
+    two.means[:] = [[0, 0, 0], [4, 0, 0]]
+    two.quats[:] = [1, 0, 0, 0]
+    two.scales[:] = 1
+    two.footprints[:] = 1e-6
+    two.sh[:, 0] = [[0, 0, 0], [1, 2, 4]]
+    result = merged(two)
+    np.testing.assert_allclose(result.means[0], [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(result.scales[0].sort().values, [1, 1, 2], rtol=1e-6)
+    np.testing.assert_allclose(result.sh0[0, 0], [0.25, 0.5, 1], rtol=1e-6)
+    depth = -(np.log(0.7) + np.log(0.9)) / 2  # two unit discs over the disc of 2 x 1
+    assert float(result.opacities[0]) == pytest.approx(1 - np.exp(-depth), rel=1e-5)
+
+
+def test_tiles_of_a_sheet_keep_it_closed() -> None:
+    """A square of n x n tiles: the peak optical depth is 12 / 2 pi times the sheet's mean (method reference)."""
+    n, sigma, depth = 40, 0.6, 0.7
+    xs, ys = np.meshgrid(np.arange(n), np.arange(n))
+    sheet = members(n * n, opacity=1 - np.exp(-depth))
+    sheet.means[:] = np.stack([xs.ravel(), ys.ravel(), np.zeros(n * n)], 1)
+    sheet.quats[:] = [1, 0, 0, 0]
+    sheet.scales[:] = [sigma, sigma, 0.1]
+    sheet.footprints[:] = 1e-3
+    result = merged(sheet)
+    mean_depth = depth * 2 * np.pi * sigma**2  # per unit area
+    peak = -np.log1p(-float(result.opacities[0]))
+    assert peak == pytest.approx(mean_depth * 12 / (2 * np.pi), rel=0.01)
+
+
+def test_uniform_weights_without_opacity() -> None:
+    two = members(2)
+    two.opacities[:] = 0
+    result = merged(two)
+    np.testing.assert_allclose(result.means[0], two.means.mean(0), atol=1e-6)
+    assert result.opacities.tolist() == [0]
+
+
+def test_spread_widens_but_does_not_thin() -> None:
+    m = pool_members(members(5), np.array([0, 5]), np.arange(5))
+    tensors = torch.from_numpy(m.means), torch.from_numpy(m.sh)
+    one, two = (to_gaussians(m.covars, m.extinctions, np.array([s]), *tensors) for s in (1.0, 2.0))
+    np.testing.assert_allclose(two.scales, 2 * one.scales)
+    assert torch.equal(two.opacities, one.opacities)
+
+
+def test_many_groups_match_one_by_one() -> None:
+    """More groups than one task takes."""
+    of = members(9000)
+    starts = np.arange(0, 9001, 2)
+    at_once = pool_members(of, starts, np.arange(9000))
+    for g in (0, 4095 // 2, 4096 // 2 + 1, 4499):
+        alone = pool_members(of, np.array([0, 2]), np.arange(2 * g, 2 * g + 2))
+        for name in at_once.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(at_once, name)[g], getattr(alone, name)[0])
+
+
+def test_no_groups() -> None:
+    m = pool_members(members(3), np.array([0]), np.zeros(0, np.int64))
+    assert m.means.shape == (0, 3)
+    assert principal_axes(np.zeros((0, 3, 3)))[0].shape == (0, 3)
+
+
+def test_scales_have_a_floor() -> None:
+    scales, quats = principal_axes(np.zeros((1, 3, 3)))
+    assert (scales > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(quats), 1)
+
+
+def test_footprints_are_depth_over_focal_length() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=1)
+    found = scene_members(scene)
+    assert found.sh.shape == (3 * 24 * 32, 4, 3)
+    _, depths, _ = scenes.trace(scenes.room(), scene.cameras)
+    np.testing.assert_allclose(found.footprints, depths.ravel() / 32, rtol=1e-5)
+    for values in (found.means, found.quats, found.scales, found.opacities, found.sh):
+        assert values.dtype == np.float32
+        assert values.flags.c_contiguous

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import json
+from dataclasses import FrozenInstanceError, fields, is_dataclass
+
+import pytest
+
+from gsmerge import CompactOptions
+
+STAGES = [f.name for f in fields(CompactOptions) if is_dataclass(getattr(CompactOptions(), f.name))]
+
+
+def test_flat_names_are_unique() -> None:
+    options = CompactOptions()
+    names = [f.name for stage in STAGES for f in fields(getattr(options, stage))]
+    names += [f.name for f in fields(options) if f.name not in STAGES]
+    assert len(names) == len(set(names))
+    assert sorted(options.to_dict()) == sorted(names)
+
+
+def test_settings_reach_their_stage() -> None:
+    options = CompactOptions().with_settings(
+        {"k": 2, "density": 0.01, "match": "aabb", "robust": False, "fit": "none", "backing": 0.01, "seed": 3}
+    )
+    assert options.decode.k == 2
+    assert options.segment.density == 0.01
+    assert options.match.match == "aabb"
+    assert options.robust.robust is False
+    assert options.fit.fit == "none"
+    assert options.backing.backing == 0.01
+    assert (options.seed, options.threads) == (3, None)
+    assert options.encode == CompactOptions().encode
+
+
+def test_flat_settings_make_the_same_options() -> None:
+    changed = CompactOptions().with_settings({"k": 4, "overlap": 0.5})
+    assert CompactOptions().with_settings(changed.to_dict()) == changed
+    assert CompactOptions().with_settings({}) == CompactOptions()
+
+
+def test_settings_are_plain_values() -> None:
+    assert json.loads(json.dumps(CompactOptions().to_dict())) == CompactOptions().to_dict()
+
+
+def test_options_are_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        CompactOptions().seed = 1  # type: ignore[misc]
+
+
+def test_unknown_name_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"unknown setting 'kk'; known: .*\bdensity\b.*\bk\b"):
+        CompactOptions().with_settings({"k": 2, "kk": 3})
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_setting_is_documented(stage: str) -> None:
+    options = getattr(CompactOptions(), stage)
+    assert all(f"{f.name}: " in type(options).__doc__ for f in fields(options))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5}, {"method": "voronoi"},
+        {"preset": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
+        {"cluster_size": 0}, {"neighbors": 0}, {"fit_level": 0}, {"holdout": 2.0}, {"iterations": 0}, {"pull": -1.0},
+        {"min_opacity": -1.0}, {"rounds": -1}, {"tolerance": 0.0}, {"overlap": float("nan")},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_values_out_of_range_are_refused_before_any_work(setting: dict) -> None:
+    (name,) = setting
+    with pytest.raises(ValueError, match=name):
+        CompactOptions().with_settings(setting)

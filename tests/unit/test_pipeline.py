@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import scenes
+import torch
+
+from gsmerge import CompactOptions, PixelScene, compact
+from gsmerge.pipeline import STAGES
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
+
+
+def test_report(scene: PixelScene) -> None:
+    result = scenes.compacted(scene)
+    report = result.report
+    assert report.num_input == 3 * 32 * 24
+    assert 0 < report.num_output == len(result.gaussians) < report.num_input
+    assert list(report.seconds) == list(STAGES)
+    assert report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, scene), abs=0.1)
+    assert report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, scene), abs=0.1)
+    assert report.choices["merge"] in report.choices["merge_scores"]
+    assert report.choices["clusters"] <= report.choices["groups"]
+    assert report.options["density"] == 0.1
+
+
+def test_progress_tells_every_stage(scene: PixelScene) -> None:
+    calls: list[tuple[str, int, int]] = []
+    compact(scene, progress=lambda *call: calls.append(call))
+    assert [name for name, _, _ in calls] == [*STAGES, "done"]
+    assert [done for _, done, _ in calls] == list(range(len(STAGES) + 1))
+    assert {total for _, _, total in calls} == {len(STAGES)}
+
+
+def test_without_photos(scene: PixelScene) -> None:
+    result = scenes.compacted(replace(scene, images=None))
+    assert result.report.psnr_before is None
+    assert not {"robust", "fit", "score"} & set(result.report.seconds)
+
+
+def test_two_views_take_the_plain_merge(scene: PixelScene) -> None:
+    result = scenes.compacted(scenes.take_views(scene, [0, 1]))
+    assert "merge" not in result.report.choices
+
+
+def test_options_and_settings_combine(scene: PixelScene) -> None:
+    options = CompactOptions().with_settings({"fit": "none", "robust": False})
+    one = compact(scene, options, superpixels=30)
+    two = compact(scene, superpixels=30, fit="none", robust=False)
+    assert torch.equal(one.gaussians.means, two.gaussians.means)
+    assert one.report.options == two.report.options
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("match", ["overlap", "aabb", "none"])
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_count_is_what_was_asked_for(scene: PixelScene, robust: bool, match: str, k: int) -> None:
+    """The backing layer is part of it."""
+    found = scenes.compacted(scene, superpixels=40, robust=robust, match=match, k=k)
+    assert len(found.gaussians) <= 3 * 40 * k
+    if match == "none" and not robust:
+        assert len(found.gaussians) >= 0.95 * 3 * 40 * k
+
+
+@pytest.mark.parametrize("superpixels", [1, 2, 3, 768])
+def test_extreme_numbers_of_superpixels(scene: PixelScene, superpixels: int) -> None:
+    assert len(scenes.compacted(scene, superpixels=superpixels).gaussians) <= 3 * superpixels
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (16, 16), (40, 1), (1, 40)])
+@pytest.mark.parametrize("views", [1, 3])
+def test_tiny_images(size: tuple[int, int], views: int) -> None:
+    scenes.compacted(scenes.make_scene(scenes.wall(), scenes.arc(views, *size)))
+
+
+@pytest.mark.parametrize("method", ["rdseg", "bass", "bass-st", "slic"])
+def test_every_segmentation(scene: PixelScene, method: str) -> None:
+    assert len(scenes.compacted(scene, method=method, superpixels=40).gaussians) <= 120
+
+
+def test_paper_rule(scene: PixelScene) -> None:
+    scenes.compacted(scene, rule="paper", match="aabb", robust=False, fit="none")
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_keep_their_degree(degree: int) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
+    assert scenes.compacted(scene, k=2).gaussians.sh_degree == degree
+
+
+def test_result_is_in_world_coordinates(scene: PixelScene) -> None:
+    found = scenes.plain(scene)
+    low, high = scene.gaussians.means.aminmax(dim=0)
+    assert found.means.dtype == torch.float64
+    assert (found.means >= low - 0.2).all()
+    assert (found.means <= high + 0.2).all()
+
+
+def test_result_can_be_used_like_any_tensor(scene: PixelScene) -> None:
+    """Changed in place, and differentiated through."""
+    found = compact(scene).gaussians
+    for name in scenes.FIELDS:
+        tensor = getattr(found, name)
+        tensor.add_(0)
+        tensor.clone().requires_grad_().sum().backward()
+        (tensor * torch.ones(1, requires_grad=True)).sum().backward()
+
+
+def test_input_is_left_alone(scene: PixelScene) -> None:
+    before = [getattr(scene.gaussians, name).clone() for name in scenes.FIELDS]
+    assert scene.images is not None
+    images = scene.images.clone()
+    compact(scene)
+    assert all(torch.equal(getattr(scene.gaussians, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
+    assert torch.equal(scene.images, images)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"k": 0}, "k: expected 1 to 8, got 0"),
+        ({"superpixels": 32 * 24 + 1}, "expected at most 768 superpixels"),
+        ({"match": "iou"}, "match: expected"),
+        ({"kk": 1}, "unknown setting 'kk'"),
+        ({"threads": 0}, "expected at least 1 thread"),
+    ],
+)
+def test_wrong_settings_are_refused(scene: PixelScene, settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        compact(scene, **settings)
+
+
+def test_wrong_settings_are_refused_before_any_stage(scene: PixelScene) -> None:
+    calls: list[str] = []
+    with pytest.raises(ValueError, match="k: expected 1 to 8"):
+        compact(scene, k=0, progress=lambda name, *_: calls.append(name))
+    assert calls == []

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import PixelScene
+from gsmerge.backing import BackingOptions, encode_backing
+from gsmerge.encode import EncodeOptions, encode
+from gsmerge.metrics import psnr
+from gsmerge.moments import Members, feature_to_gaussians, principal_axes, scene_members
+from gsmerge.photos import Photos, scene_photos
+from gsmerge.robust import RobustOptions, choose_merge, leave_one_out, weigh
+from gsmerge.segment import SegmentOptions, segment
+from gsmerge.types import FeatureGaussians
+
+NAMES = ["plain", "wide", "wide+back", "plain+weigh", "plain+weigh+back", "wide+weigh", "wide+weigh+back"]
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.02)
+
+
+@pytest.fixture(scope="module")
+def members(scene: PixelScene) -> Members:
+    return scene_members(scene)
+
+
+@pytest.fixture(scope="module")
+def photos(scene: PixelScene) -> Photos:
+    return scene_photos(scene)
+
+
+@pytest.fixture(scope="module")
+def features(scene: PixelScene, members: Members) -> FeatureGaussians:
+    assert scene.images is not None
+    return encode(scene, members, segment(scene.images, SegmentOptions(), 150), EncodeOptions())
+
+
+@pytest.fixture(scope="module")
+def backing(scene: PixelScene, members: Members) -> FeatureGaussians:
+    assert scene.images is not None
+    return encode_backing(scene, members, segment(scene.images, SegmentOptions(), 12), BackingOptions())
+
+
+def test_best_score_wins(features: FeatureGaussians, backing: FeatureGaussians, photos: Photos) -> None:
+    found, choice = choose_merge(features, backing, photos, RobustOptions())
+    assert sorted(choice.scores) == sorted(NAMES)
+    assert choice.scores[choice.name] == max(choice.scores.values())
+    assert leave_one_out(found, photos) == pytest.approx(choice.scores[choice.name], abs=1e-9)
+    assert choice.scores["plain"] == pytest.approx(leave_one_out(features, photos), abs=1e-9)
+    assert bool(found.backing.any()) == choice.name.endswith("back")
+
+
+def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos: Photos, scene: PixelScene) -> None:
+    gaussians = feature_to_gaussians(features)
+    scores = []
+    for view in range(3):
+        image = scenes.images_of(gaussians[features.views != view], scene.cameras[view : view + 1])[0][0]
+        scores.append(psnr(np.clip(image, 0, 1), photos.images[view]))
+    assert leave_one_out(features, photos) == pytest.approx(np.mean(scores), abs=0.01)
+
+
+def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
+    options = RobustOptions()
+    wrong = torch.arange(len(features)) % 10 == 0
+    sh0 = features.sh0.clone()
+    sh0[wrong] = -sh0[wrong] + 1.5
+    gains = weigh(replace(features, sh0=sh0), photos, options)
+    assert torch.isfinite(gains).all()
+    assert float(gains.min()) >= 0.05 * options.boost - 1e-6
+    assert float(gains.max()) <= options.boost + 1e-6
+    assert float(gains[wrong].median()) < 0.5 * float(gains[~wrong].median())
+
+
+def test_unseen_ones_keep_the_boost(features: FeatureGaussians, photos: Photos) -> None:
+    lost = replace(features, means=torch.cat([features.means[:5] - 100, features.means[5:]]))
+    assert weigh(lost, photos, RobustOptions())[:5].tolist() == pytest.approx([3.0] * 5)
+
+
+def test_backing_lies_behind_and_covers_the_image(
+    scene: PixelScene, features: FeatureGaussians, backing: FeatureGaussians
+) -> None:
+    options = BackingOptions()
+    assert backing.backing.all()
+    assert len(backing) == 36
+    eyes = scene.cameras.centres.float()
+    distance = (backing.means - eyes[backing.views]).norm(dim=1)
+    surface = scenes.trace(scenes.room(), scene.cameras)[1]
+    assert float(distance.min()) > (1 + options.push) * surface.min() * 0.95
+    gaussians = feature_to_gaussians(backing)
+    for view in range(3):
+        own = gaussians[backing.views == view]
+        assert scenes.images_of(own, scene.cameras[view : view + 1])[1].mean() > 0.65
+
+
+def test_backing_draws_no_curtain() -> None:
+    """Colours that cross a depth edge: the layer stays near the median depth of each superpixel."""
+    grey = scenes.flat(0.5, 0.5, 0.5)
+    surfaces = [scenes.plane(1.5, grey, right=0.0), scenes.plane(6.0, grey)]
+    edge = scenes.make_scene(surfaces, scenes.arc(1))
+    assert edge.images is not None
+    groups = segment(edge.images, SegmentOptions(), 6)
+    layer = encode_backing(edge, scene_members(edge), groups, BackingOptions(push=0.0))
+    thickness = principal_axes(layer.covars.double().numpy())[0][:, 0]
+    depths = layer.means[:, 2].double().numpy()
+    assert (thickness < 0.3 * depths).all()
