@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +17,7 @@ from gsmerge.decode import decode
 from gsmerge.encode import encode
 from gsmerge.fit import draw, fit_colors, seen
 from gsmerge.match import match
+from gsmerge.memory import peak_memory, release_memory
 from gsmerge.merge import merge
 from gsmerge.metrics import psnr
 from gsmerge.moments import Members, scene_members
@@ -31,6 +30,8 @@ from gsmerge.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, PixelScene
 
 Progress = Callable[[str, int, int], None]
+ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
+NEAR = 0.01  # near plane, in canonical units
 STAGES = ("prepare", "segment", "encode", "robust", "match", "decode", "fit", "score")
 
 
@@ -84,6 +85,7 @@ class _Run:
             self.progress(name, STAGES.index(name), len(STAGES))
         start = time.perf_counter()
         yield
+        release_memory()
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
@@ -113,20 +115,22 @@ def compact(
         features = _merged_features(canonical, members, options, run)
         with run.stage("decode"):
             gaussians = decode(features, members, options.decode)
-        before = after = None
+        del features, members
         if canonical.images is not None:
             with run.stage("fit"):
                 gaussians = _fitted(gaussians, canonical, options, run)
-            with run.stage("score"):
-                photos = scene_photos(canonical)
-                before, after = input_psnr(canonical.gaussians, photos), input_psnr(gaussians, photos)
+        del canonical
         gaussians = frame.leave(gaussians)
+        before = after = None
+        if scene.images is not None:
+            with run.stage("score"):
+                photos, near = scene_photos(scene), NEAR * frame.unit
+                before, after = input_psnr(scene.gaussians, photos, near), input_psnr(gaussians, photos, near)
     if progress:
         progress("done", len(STAGES), len(STAGES))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     counts = len(scene.gaussians), len(gaussians)
     report = CompactReport(
-        *counts, run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak_memory_bytes=peak
+        *counts, run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak_memory()
     )
     return CompactResult(gaussians, report)
 
@@ -175,16 +179,18 @@ def _fitted(gaussians: Gaussians, scene: PixelScene, options: CompactOptions, ru
     return gaussians[keep]
 
 
-def input_psnr(gaussians: Gaussians, photos: Photos) -> float:
-    """Mean PSNR (dB) of the photos rendered from some Gaussians."""
+def input_psnr(gaussians: Gaussians, photos: Photos, near: float) -> float:
+    """Mean PSNR (dB) of the photos rendered from some Gaussians beyond the near plane."""
     splats = prepare(gaussians)
 
     def one_view(view: int) -> float:
         plan = plan_view(
-            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
+            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d, near=near
         )
         return psnr(np.clip(composite(plan)[0], 0, 1), photos.images[view])
 
+    if len(gaussians) > ONE_AT_A_TIME:
+        return float(np.mean([one_view(view) for view in range(len(photos))]))
     return float(np.mean(parallel_map(one_view, range(len(photos)))))
 
 

@@ -25,8 +25,10 @@ class ViewWeights:
     Args:
         ids: ``[m]`` int32: the Gaussians that may touch the image.
         members: ``[intersections]`` int32 rows of ``ids``.
-        starts: ``[intersections + 1]`` int64 into ``pixels`` and ``weights``.
-        pixels: Row-major pixel of each entry, int32.
+        offsets: ``[tiles + 1]`` int64 starts of the tiles' lists in ``members``.
+        columns: Tiles per row.
+        starts: ``[intersections + 1]`` int64 into ``lanes`` and ``weights``.
+        lanes: Pixel of each entry within its tile, row-major, uint8.
         weights: Blending weight of each entry, float32.
         height: Image height, pixels.
         width: Image width, pixels.
@@ -34,8 +36,10 @@ class ViewWeights:
 
     ids: Array
     members: Array
+    offsets: Array
+    columns: int
     starts: Array
-    pixels: Array
+    lanes: Array
     weights: Array
     height: int
     width: int
@@ -43,10 +47,12 @@ class ViewWeights:
 
 def view_weights(plan: ViewPlan) -> ViewWeights:
     """Write out the weights of a planned view."""
-    starts, pixels, weights = kernels.list_weights(
+    starts, lanes, weights = kernels.list_weights(
         plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width
     )
-    return ViewWeights(plan.ids, plan.members, starts, pixels, weights, plan.height, plan.width)
+    return ViewWeights(
+        plan.ids, plan.members, plan.offsets, plan.columns, starts, lanes, weights, plan.height, plan.width
+    )
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:
@@ -54,18 +60,18 @@ def apply(view: ViewWeights, colors: Array) -> Array:
     channels = colors.shape[1]
     rows = np.zeros((len(view.ids), kernels.LANES), np.float32)
     rows[:, :channels] = colors[view.ids]
-    image = np.zeros((view.height * view.width, kernels.LANES), np.float32)
-    kernels.spread(view.starts, view.pixels, view.weights, view.members, rows, image)
-    return image[:, :channels].reshape(view.height, view.width, channels)
+    image = np.empty((view.height, view.width, kernels.LANES), np.float32)
+    kernels.spread(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, rows, image)
+    return image[..., :channels]
 
 
 def apply_transposed(view: ViewWeights, image: Array) -> Array:
     """``W^T image``: sums ``[m,c]`` float64 over ``view.ids`` of ``image [h,w,c]``, up to four channels."""
     channels = image.shape[2]
-    padded = np.zeros((view.height * view.width, kernels.LANES), np.float32)
-    padded[:, :channels] = image.reshape(-1, channels)
+    padded = np.zeros((view.height, view.width, kernels.LANES), np.float32)
+    padded[..., :channels] = image
     sums = np.zeros((len(view.ids), kernels.LANES))
-    kernels.collect(view.starts, view.pixels, view.weights, view.members, padded, sums)
+    kernels.collect(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, padded, sums)
     return sums[:, :channels]
 
 

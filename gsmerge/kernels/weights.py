@@ -1,4 +1,4 @@
-"""The blending weights of one view, written out: entry by entry (pixel, weight), intersection by intersection."""
+"""The blending weights of one view, written out: one (pixel, weight) entry after the other."""
 
 from __future__ import annotations
 
@@ -42,6 +42,14 @@ def _columns(batch, j, width):
 
 
 @kernel
+def _grown(lanes, weights, count):
+    """Buffers of twice the size with the same entries."""
+    more_lanes, more_weights = np.empty(2 * lanes.shape[0], np.uint8), np.empty(2 * lanes.shape[0], np.float32)
+    more_lanes[:count], more_weights[:count] = lanes[:count], weights[:count]
+    return more_lanes, more_weights
+
+
+@kernel
 def list_weights(footprints, members, offsets, columns, height, width):
     """All weights of a view that are not zero.
 
@@ -54,76 +62,87 @@ def list_weights(footprints, members, offsets, columns, height, width):
         width: Of the image, pixels.
 
     Returns:
-        ``starts [intersections + 1]`` int64, ``pixels`` int32 (row-major) and ``weights`` float32.
+        ``starts [intersections + 1]`` int64, ``lanes`` uint8 (pixel within its tile, row-major), ``weights`` float32.
     """
     starts = np.zeros(members.shape[0] + 1, np.int64)
-    pixels = np.empty(max(1024, 48 * height * width), np.int32)
-    weights = np.empty(pixels.shape[0], np.float32)
+    lanes = np.empty(max(BATCH * PLANE, 40 * height * width), np.uint8)
+    weights = np.empty(lanes.shape[0], np.float32)
     state, batch = np.empty(2 * PLANE, np.float32), np.empty((BATCH, 12), np.float32)
     count = 0
     for tile in range(offsets.shape[0] - 1):
         left, top = tile % columns * TILE, tile // columns * TILE
-        _open_tile(state, min(TILE, width - left), min(TILE, height - top))
-        y_low, y_high = 0, min(TILE, height - top) - 1
+        num_x, num_y = min(TILE, width - left), min(TILE, height - top)
+        _open_tile(state, num_x, num_y)
+        y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
             _gather(footprints, members, start, stop, end, left, top, batch)
-            if count + BATCH * PLANE > pixels.shape[0]:
-                more = np.empty(2 * pixels.shape[0], np.int32)
-                more[:count] = pixels[:count]
-                pixels = more
-                heavier = np.empty(more.shape[0], np.float32)
-                heavier[:count] = weights[:count]
-                weights = heavier
+            if count + BATCH * PLANE > lanes.shape[0]:
+                lanes, weights = _grown(lanes, weights, count)
             for j in range(stop - start):
                 y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
                 _batch_weights(state, batch, j, y0, y1)
-                x0, x1 = _columns(batch, j, min(TILE, width - left))
+                x0, x1 = _columns(batch, j, num_x)
                 for y in range(y0, y1 + 1):
-                    lane, pixel = np.uint64(PLANE + y * TILE), (top + y) * width + left
                     for x in range(x0, x1 + 1):
-                        w = state[lane + np.uint64(x)]
-                        pixels[np.uint64(count)] = pixel + x
+                        lane = np.uint64(y * TILE + x)
+                        w = state[lane + P1]
+                        lanes[np.uint64(count)] = lane
                         weights[np.uint64(count)] = w
                         count += 1 if w > f4(0.0) else 0
                 starts[start + j + 1] = count
             start = stop
             y_low, y_high = _live_rows(state, y_low, y_high)
         starts[start + 1 : end + 1] = count
-    return starts, pixels[:count].copy(), weights[:count].copy()
+    return starts, lanes[:count].copy(), weights[:count].copy()
 
 
 @kernel
-def spread(starts, pixels, weights, members, colors, image):
-    """Add weights times ``colors [m,LANES]`` to ``image [pixels,LANES]``."""
-    for i in range(members.shape[0]):
-        k = members[i]
-        a, b, c, d = colors[k, 0], colors[k, 1], colors[k, 2], colors[k, 3]
-        for e in range(starts[i], starts[i + 1]):
-            p, w = np.uint64(pixels[e]), weights[e]
-            image[p, 0] += w * a
-            image[p, 1] += w * b
-            image[p, 2] += w * c
-            image[p, 3] += w * d
+def spread(starts, lanes, weights, members, offsets, columns, colors, image):
+    """Sums of weights times ``colors [m,LANES]`` -> ``image [h,w,LANES]``, every pixel of it."""
+    height, width = image.shape[:2]
+    state = np.empty((PLANE, LANES), np.float32)
+    for tile in range(offsets.shape[0] - 1):
+        state[:] = f4(0.0)
+        for i in range(offsets[tile], offsets[tile + 1]):
+            k = np.uint64(members[i])
+            a, b, c, d = colors[k, 0], colors[k, 1], colors[k, 2], colors[k, 3]
+            for e in range(starts[i], starts[i + 1]):
+                p, w = np.uint64(lanes[e]), weights[e]
+                state[p, 0] += w * a
+                state[p, 1] += w * b
+                state[p, 2] += w * c
+                state[p, 3] += w * d
+        left, top = tile % columns * TILE, tile // columns * TILE
+        for y in range(min(TILE, height - top)):
+            for x in range(min(TILE, width - left)):
+                image[top + y, left + x] = state[y * TILE + x]
 
 
 @kernel
-def collect(starts, pixels, weights, members, image, sums):
-    """Add weights times ``image [pixels,LANES]`` to ``sums [m,LANES]`` float64."""
-    for i in range(members.shape[0]):
-        a, b, c, d = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
-        for e in range(starts[i], starts[i + 1]):
-            p, w = np.uint64(pixels[e]), weights[e]
-            a += w * image[p, 0]
-            b += w * image[p, 1]
-            c += w * image[p, 2]
-            d += w * image[p, 3]
-        k = members[i]
-        sums[k, 0] += a
-        sums[k, 1] += b
-        sums[k, 2] += c
-        sums[k, 3] += d
+def collect(starts, lanes, weights, members, offsets, columns, image, sums):
+    """Add weights times ``image [h,w,LANES]`` to ``sums [m,LANES]`` float64."""
+    height, width = image.shape[:2]
+    state = np.zeros((PLANE, LANES), np.float32)
+    for tile in range(offsets.shape[0] - 1):
+        left, top = tile % columns * TILE, tile // columns * TILE
+        for y in range(min(TILE, height - top)):
+            for x in range(min(TILE, width - left)):
+                state[y * TILE + x] = image[top + y, left + x]
+        for i in range(offsets[tile], offsets[tile + 1]):
+            a, b, c, d = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
+            for e in range(starts[i], starts[i + 1]):
+                p, w = np.uint64(lanes[e]), weights[e]
+                a += w * state[p, 0]
+                b += w * state[p, 1]
+                c += w * state[p, 2]
+                d += w * state[p, 3]
+            k = members[i]
+            sums[k, 0] += a
+            sums[k, 1] += b
+            sums[k, 2] += c
+            sums[k, 3] += d
 
 
 @kernel

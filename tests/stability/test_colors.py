@@ -1,0 +1,132 @@
+"""Exposure, flat and noisy pictures, shine, and what moves (method reference, cases 29 to 31, 40, 54)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.types import SH_C0
+
+
+def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: float = -0.25) -> float:
+    """PSNR (dB) from a place between the views."""
+    camera = scenes.arc(1, start=start)
+    truth = scenes.trace(surfaces, camera)[2].reshape(36, 48, 3)
+    image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
+    return float(-10 * np.log10(((image - truth) ** 2).mean()))
+
+
+def painted(scene: PixelScene, images: torch.Tensor) -> PixelScene:
+    """With other photos, and Gaussians of their colours."""
+    sh0 = ((images.reshape(-1, 1, 3) - 0.5) / SH_C0).float()
+    return replace(scene, images=images.float(), gaussians=replace(scene.gaussians, sh0=sh0))
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4), noise=0.005)
+
+
+# 29: exposure
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_exposure_that_changes_between_views(room: PixelScene, robust: bool) -> None:
+    """Factors with geometric mean one."""
+    assert room.images is not None
+    factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
+    images = 0.8 * room.images * factors
+    steady = scenes.compacted(painted(room, 0.8 * room.images), robust=robust).gaussians
+    varied = scenes.compacted(painted(room, images), robust=robust)
+    surfaces = [scenes.Surface(s.trace, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
+    assert novel_psnr(varied.gaussians, surfaces) > novel_psnr(steady, surfaces) - 0.2
+
+
+# 30, 31: nothing to see, and too much
+
+
+@pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("method", ["rdseg", "bass-st"])
+def test_flat_pictures(room: PixelScene, grey: float, method: str) -> None:
+    assert room.images is not None
+    flat = painted(room, torch.full_like(room.images, grey))
+    result = scenes.compacted(flat, method=method, superpixels=60)
+    assert 1 <= len(result.gaussians) <= 4 * 60
+    colors = 0.5 + SH_C0 * result.gaussians.sh0
+    assert float((colors - grey).abs().max()) < 0.1
+    assert result.report.psnr_after > result.report.psnr_before - 0.5  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("method", ["rdseg", "bass-st"])
+def test_noise_does_not_explode(room: PixelScene, method: str) -> None:
+    assert room.images is not None
+    noise = torch.rand(room.images.shape, generator=torch.Generator().manual_seed(0))
+    result = scenes.compacted(painted(room, noise), method=method, superpixels=60)
+    assert len(result.gaussians) <= 4 * 60
+
+
+# 40: view-dependent colour
+
+
+def shiny(scene: PixelScene, strength: float) -> PixelScene:
+    """Degree 3, the same strong harmonics everywhere, photos rendered from the Gaussians."""
+    coefficients = strength * torch.randn(1, 15, 3, generator=torch.Generator().manual_seed(1))
+    shN = coefficients.expand(len(scene.gaussians), -1, -1).clone()
+    made = replace(scene, gaussians=replace(scene.gaussians, shN=shN))
+    images = scenes.images_of(made.gaussians, scene.cameras)[0].clip(0, 1)
+    return replace(made, images=torch.from_numpy(images).float())
+
+
+@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
+def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
+    scene = shiny(room, 0.3)
+    found = scenes.compacted(scene, **settings).gaussians
+    assert found.sh_degree == 3
+    stripped = replace(found, shN=torch.zeros_like(found.shN))
+    assert scenes.psnr_of(found, scene) > scenes.psnr_of(stripped, scene) + 3
+
+
+def test_equal_harmonics_stay_equal(room: PixelScene) -> None:
+    scene = shiny(room, 0.3)
+    found = scenes.plain(scene)
+    np.testing.assert_allclose(found.shN, scene.gaussians.shN[:1].expand_as(found.shN), atol=1e-5)
+
+
+def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
+    """A base colour below 0 or above 1 that the harmonics bring back."""
+    scene = shiny(room, 0.0)
+    sh0 = scene.gaussians.sh0 - 1.5
+    shN = scene.gaussians.shN.clone()
+    shN[:, 1] = 1.5 * SH_C0 / 0.48860251190292  # z is about 1 towards all views
+    offset = replace(scene, gaussians=replace(scene.gaussians, sh0=sh0, shN=shN))
+    images = scenes.images_of(offset.gaussians, offset.cameras)[0].clip(0, 1)
+    offset = replace(offset, images=torch.from_numpy(images).float())
+    for settings in ({"fit": "none"}, {}):
+        result = scenes.compacted(offset, robust=False, **settings)
+        usual = scenes.compacted(scene, robust=False, **settings)
+        assert result.report.psnr_after > usual.report.psnr_after - 1.0  # type: ignore[operator]
+
+
+# 54: something that moves
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_passer_by_in_one_view_does_not_haunt_the_others(room: PixelScene, robust: bool) -> None:
+    """A red patch in the photo of view 1 and on its Gaussians."""
+    assert room.images is not None
+    images = room.images.clone()
+    images[1, 10:24, 14:28] = torch.tensor([1.0, 0.0, 0.0])
+    haunted = scenes.compacted(painted(room, images), robust=robust).gaussians
+    clean = scenes.compacted(room, robust=robust).gaussians
+    others = room.cameras[torch.tensor([0, 2, 3])]
+    a, b = (scenes.images_of(g, others)[0].clip(0, 1) for g in (haunted, clean))
+    ghost = np.abs(a - b)[:, 8:28, 10:34].mean()
+    unfitted = scenes.compacted(painted(room, images), robust=robust, fit="none").gaussians
+    assert ghost <= 0.1
+    before = np.abs(scenes.images_of(unfitted, others)[0].clip(0, 1) - b)[:, 8:28, 10:34].mean()
+    assert ghost <= before + 0.01

@@ -1,0 +1,239 @@
+"""Hostile groups: coincident, degenerate, oversized, transparent, torn in depth (method reference, cases 1 to 17)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.encode import EncodeOptions, encode
+from gsmerge.geometry import covariances, project, quat_to_rotmat
+from gsmerge.moments import feature_to_gaussians, scene_members
+from gsmerge.types import FeatureGaussians, Groups
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.005)
+
+
+@pytest.fixture(scope="module")
+def small() -> PixelScene:
+    return scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 12))
+
+
+def changed(scene: PixelScene, **columns: torch.Tensor) -> PixelScene:
+    return replace(scene, gaussians=replace(scene.gaussians, **columns))
+
+
+def one_group_per_view(scene: PixelScene) -> FeatureGaussians:
+    labels = torch.zeros(scene.valid.shape, dtype=torch.int32)
+    return encode(scene, scene_members(scene), Groups(labels, (1,) * len(scene)), EncodeOptions())
+
+
+# 1: coincident Gaussians
+
+
+@pytest.mark.parametrize("settings", [{}, {"k": 4}, {"match": "aabb"}, {"robust": False, "fit": "none"}], ids=str)
+def test_all_gaussians_in_one_place(room: PixelScene, settings: dict) -> None:
+    means = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand(len(room.gaussians), 3)
+    first = {name: getattr(room.gaussians, name)[:1].expand_as(getattr(room.gaussians, name)) for name in scenes.FIELDS}
+    scenes.compacted(changed(room, **{**first, "means": means}), **settings)
+
+
+def test_coincident_members_stack(small: PixelScene) -> None:
+    count = small.pixels_per_view
+    same = {name: getattr(small.gaussians, name)[:1].repeat_interleave(count, 0) for name in scenes.FIELDS}
+    same["opacities"] = torch.full((count,), 0.02)
+    merged = feature_to_gaussians(one_group_per_view(changed(small, **same)))
+    one = small.gaussians[:1]
+    footprint = scene_members(small).footprints[0]
+    floor = (0.1 * footprint) ** 2 * torch.eye(3)
+    a, b = (covariances(g.quats.double(), g.scales.double())[0] for g in (merged, one))
+    np.testing.assert_allclose(a, b + floor, rtol=1e-4, atol=1e-8)
+    discs = [float(g.scales[0].double().sort().values[1:].prod()) for g in (merged, one)]
+    wanted = 1 - (1 - 0.02) ** (count * discs[1] / discs[0])
+    assert float(merged.opacities[0]) == pytest.approx(wanted, rel=1e-4)
+
+
+# 2: one member is left as it is
+
+
+def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
+    found = scenes.plain(small, density=1.0)
+    order = torch.cdist(small.gaussians.means, found.means).argmin(1)
+    assert len(order.unique()) == len(found) == len(small.gaussians)
+    own, kept = small.gaussians, found[order]
+    np.testing.assert_allclose(kept.means, own.means, atol=1e-6)
+    np.testing.assert_allclose(kept.sh0, own.sh0, atol=1e-6)
+    np.testing.assert_allclose(kept.opacities, own.opacities, atol=0.03)  # the floor of a tenth of a pixel
+    footprints = torch.from_numpy(scene_members(small).footprints).double()
+    error = covariances(kept.quats.double(), kept.scales.double()) - covariances(own.quats.double(), own.scales.double())
+    assert (error.abs().amax((1, 2)) < 1.01 * (0.1 * footprints) ** 2).all()
+
+
+# 3: rank-deficient groups
+
+
+@pytest.mark.parametrize("axes", [[0], [0, 1]], ids=["line", "sheet"])
+def test_flat_groups_have_a_smallest_scale(small: PixelScene, axes: list[int]) -> None:
+    means = torch.zeros_like(small.gaussians.means) + torch.tensor([0.0, 0.0, 3.0])
+    means[:, axes] = small.gaussians.means[:, axes]
+    scene = changed(small, means=means, scales=torch.full_like(small.gaussians.scales, 1e-9))
+    features = one_group_per_view(scene)
+    found = feature_to_gaussians(features)
+    assert float(found.scales.min()) >= 0.0999 * float(features.footprints[0])
+    rotmat = quat_to_rotmat(found.quats.double())[0]
+    assert float(torch.linalg.det(rotmat)) == pytest.approx(1, abs=1e-6)
+
+
+# 4 to 6: needles, overflow, oversized members
+
+
+def test_needles_are_cut_to_their_neighbours(room: PixelScene) -> None:
+    scales = room.gaussians.scales.clone()
+    scales[::40, 0] *= 1e4
+    clean, found = scenes.plain(room), scenes.plain(changed(room, scales=scales))
+    assert float(found.scales.max()) <= 3 * float(clean.scales.max())
+    assert scenes.psnr_of(found, room) > scenes.psnr_of(clean, room) - 1
+
+
+@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"k": 4}], ids=str)
+def test_scales_at_the_ends_of_the_range(room: PixelScene, settings: dict) -> None:
+    scales = room.gaussians.scales.clone()
+    scales[::30] = 2e17  # exp(40)
+    scales[7::30] = 4e-18  # exp(-40)
+    scales[11::30, 1] = 0
+    found = scenes.compacted(changed(room, scales=scales), **settings)
+    assert float(found.gaussians.scales.max()) < 10
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_oversized_members_cost_less_than_a_decibel(room: PixelScene, robust: bool) -> None:
+    rng = np.random.default_rng(0)
+    scales = room.gaussians.scales.clone()
+    rows = rng.choice(len(scales), len(scales) // 100, replace=False)
+    scales[rows] *= torch.from_numpy(rng.uniform(4, 15, (len(rows), 1)).astype(np.float32))
+    settings = {"robust": robust, "fit": "none"}
+    clean = scenes.compacted(room, **settings).gaussians
+    found = scenes.compacted(changed(room, scales=scales), **settings).gaussians
+    assert scenes.psnr_of(found, room) > scenes.psnr_of(clean, room) - 1
+
+
+# 7: transparent groups
+
+
+@pytest.mark.parametrize("k", [1, 4])
+def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
+    opacities = room.gaussians.opacities.clone().reshape(room.valid.shape)
+    opacities[0] = 0
+    half = changed(room, opacities=opacities.reshape(-1))
+    found = scenes.plain(half, k=k, match="none")
+    others = scenes.plain(scenes.take_views(room, [1, 2]), k=k, match="none")
+    scenes.assert_same_set(found, others, atol=1e-4)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-5])
+def test_wholly_transparent_scene(room: PixelScene, opacity: float) -> None:
+    scene = changed(room, opacities=torch.full_like(room.gaussians.opacities, opacity))
+    scenes.compacted(scene)
+
+
+def test_wholly_opaque_scene(room: PixelScene) -> None:
+    scenes.compacted(changed(room, opacities=torch.ones_like(room.gaussians.opacities)))
+
+
+# 10, 11: quaternions
+
+
+def test_sign_and_length_of_quaternions_do_not_matter(room: PixelScene) -> None:
+    rng = np.random.default_rng(0)
+    factors = torch.from_numpy(rng.choice([-1, 1], (len(room.gaussians), 1)) * rng.uniform(0.01, 100, (1,))).float()
+    before, after = scenes.plain(room), scenes.plain(changed(room, quats=room.gaussians.quats * factors))
+    scenes.assert_same_set(before, after, atol=1e-5)
+
+
+def test_zero_quaternions_mean_no_rotation(room: PixelScene) -> None:
+    zero, one = room.gaussians.quats.clone(), room.gaussians.quats.clone()
+    zero[::3], one[::3] = 0, torch.tensor([1.0, 0, 0, 0])
+    settings = {"robust": False, "fit": "none"}
+    a, b = (scenes.compacted(changed(room, quats=q), **settings).gaussians for q in (zero, one))
+    scenes.assert_same_set(a, b, atol=1e-6)
+
+
+def test_tiny_changes_make_tiny_changes(room: PixelScene) -> None:
+    """Axes may flip, covariances must not."""
+    nudge = 1e-7 * torch.randn(room.gaussians.means.shape, generator=torch.Generator().manual_seed(0)).double()
+    moved = changed(room, means=room.gaussians.means + nudge)
+    found = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
+    a, b = (covariances(g.quats.double(), g.scales.double()) for g in found)
+    assert float((a - b).abs().max()) < 1e-6
+
+
+# 14: something huge and near
+
+
+def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
+    """In the corner of view 0; the others must not notice."""
+    means, scales = room.gaussians.means.clone(), room.gaussians.scales.clone()
+    eye = room.cameras.centres[0]
+    means[0] = eye + 0.02 * (means[0] - eye)
+    scales[0] = 5.0
+    settings = {"robust": False, "fit": "none"}
+    clean = scenes.compacted(room, **settings).gaussians
+    found = scenes.compacted(changed(room, means=means, scales=scales), **settings).gaussians
+    others = scenes.take_views(room, [1, 2])
+    assert abs(scenes.psnr_of(found, others) - scenes.psnr_of(clean, others)) < 0.1
+
+
+# 15, 16: depth edges
+
+
+@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
+def test_sky_and_foreground_stay_apart(settings: dict) -> None:
+    sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(1e6, scenes.flat(0.1, 0.2, 1.0))]
+    scene = scenes.make_scene(sky, scenes.arc(3))
+    found = scenes.compacted(scene, **settings).gaussians
+    depths = project(found.means, scene.cameras)[1][0]
+    assert ((depths < 3) | (depths > 5e5)).all()
+    assert scene.images is not None
+    far = scenes.trace(sky, scene.cameras)[1].reshape(scene.valid.shape) > 1e5
+
+    def sky_psnr(gaussians: Gaussians) -> float:
+        image = np.clip(scenes.images_of(gaussians, scene.cameras)[0], 0, 1)
+        return float(-10 * np.log10(((image - scene.images.numpy()) ** 2)[far].mean()))  # type: ignore[union-attr]
+
+    assert sky_psnr(found) > sky_psnr(scene.gaussians) - 0.5
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
+    """Two grey walls, 2 and 4 away: what is merged lies on the one or on the other."""
+    grey = scenes.flat(0.5, 0.5, 0.5)
+    scene = scenes.make_scene([scenes.plane(2.0, grey, right=0.03), scenes.plane(4.0, grey)], scenes.arc(2))
+    found = scenes.plain(scene, k=k)
+    torn = (found.means[:, 2] - 2).abs().minimum((found.means[:, 2] - 4).abs()) > 0.2
+    assert not torn.any()
+
+
+# 17: thin things
+
+
+@pytest.mark.parametrize("settings", [{}, {"k": 2}, {"robust": False, "fit": "none"}], ids=str)
+def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
+    """Two pixels wide; contrast against the wall beside it."""
+    scene = scenes.make_scene(scenes.pole(), scenes.arc(3))
+    between = scenes.arc(1, start=-0.25)
+    _, depths, _ = scenes.trace(scenes.pole(), between)
+    pole = (depths < 2.5).reshape(36, 48)
+    wall = ~pole & (np.roll(pole, 4, 1) | np.roll(pole, -4, 1))
+
+    def contrast(gaussians: Gaussians) -> float:
+        image = scenes.images_of(gaussians, between)[0][0].mean(-1)
+        return float(image[pole].mean() - image[wall].mean())
+
+    assert contrast(scenes.compacted(scene, **settings).gaussians) >= 0.5 * contrast(scene.gaussians) > 0.1

@@ -1,0 +1,108 @@
+"""Clusters that must not form (method reference, cases 18 to 20)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Cameras
+from gsmerge.match import MatchOptions, match
+from gsmerge.merge import merge
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.types import FeatureGaussians
+
+SIZE = 0.05
+
+
+def diameters(features: FeatureGaussians, **settings: object) -> np.ndarray:
+    """Largest distance within each cluster, in standard deviations."""
+    clusters = match(features, MatchOptions(**settings)).clusters.numpy()  # type: ignore[arg-type]
+    means = features.means.double().numpy()
+    own = [means[clusters == c] for c in np.unique(clusters)]
+    return np.array([np.linalg.norm(m[:, None] - m[None], axis=-1).max() for m in own]) / SIZE
+
+
+def chain(count: int, apart: float) -> FeatureGaussians:
+    """In a row along x, views taking turns, each overlapping the next."""
+    means = np.stack([apart * SIZE * np.arange(count), np.zeros(count), np.full(count, 3.0)], 1)
+    return scenes.make_features(means, sizes=SIZE, views=np.arange(count) % 7)
+
+
+@pytest.mark.parametrize("apart", [0.2, 0.5, 1.0, 1.5])
+def test_chain_of_a_thousand_does_not_collapse(apart: float) -> None:
+    features = chain(1000, apart)
+    found = diameters(features)
+    assert found.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
+    assert len(found) >= 250
+
+
+def test_chained_wall_stays_covered() -> None:
+    """A closed wall of Feature Gaussians, each matching its neighbours, before and after merging."""
+    n = 32
+    xs, ys = np.meshgrid(np.arange(n), np.arange(n))
+    means = np.stack([xs.ravel() - n / 2, ys.ravel() - n / 2, np.full(n * n, 3.0 / SIZE)], 1) * [1.2, 1.2, 1] * SIZE
+    wall = scenes.make_features(means, sizes=SIZE, views=(xs + 3 * ys).ravel() % 7, opacities=0.9)
+    merged = merge(wall, match(wall, MatchOptions()))
+    assert len(merged) < len(wall)
+    camera = scenes.arc(1, 32, 24)
+    before, after = (scenes.images_of(feature_to_gaussians(f), camera)[1] for f in (wall, merged))
+    assert after.mean() >= 0.95 * before.mean()
+    assert after.min() >= 0.9 * before.min()
+
+
+def test_wall_seen_by_many_views_does_not_collapse() -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(6, 32, 24, span=0.2))
+    alone, found = scenes.plain(scene, match="none"), scenes.plain(scene)
+    assert 0.15 * len(alone) < len(found) < len(alone)
+    coverage = [scenes.images_of(g, scene.cameras)[1].mean() for g in (alone, found)]
+    assert coverage[1] >= 0.95 * coverage[0]
+
+
+def opposite_cameras(width: int = 32, height: int = 24) -> Cameras:
+    """In front of and behind z = 3."""
+    centre = np.array([0.0, 0.0, 3.0])
+    viewmats = [scenes.look_at(np.array([0.0, 0.0, z]), centre) for z in (0.0, 6.0)]
+    return Cameras(torch.stack(viewmats), scenes.intrinsics(2, width, height), width, height)
+
+
+@pytest.mark.parametrize("method", ["overlap", "aabb"])
+def test_two_sides_of_a_sheet_are_not_merged(method: str) -> None:
+    """One colour, two footprints apart, each side seen by its own view."""
+    grey, cameras = scenes.flat(0.5, 0.5, 0.5), opposite_cameras()
+    footprint = 3 / cameras.width
+    sides = [scenes.plane(3 - footprint, grey), scenes.plane(3 + footprint, grey)]
+    scene = scenes.make_scene(sides, cameras)
+    found = scenes.compacted(scene, match=method, fit="none")
+    assert found.report.choices["clusters"] == found.report.choices["groups"]
+    off = (found.gaussians.means[:, 2] - 3).abs() / footprint
+    assert ((off - 1).abs() < 0.2).all()
+
+
+@pytest.mark.parametrize("method", ["overlap", "aabb"])
+def test_repeated_texture_is_not_merged(method: str) -> None:
+    """Every Feature Gaussian looks like every other, and none is near another."""
+    rng = np.random.default_rng(0)
+    means = np.stack(np.meshgrid(*[np.arange(6)] * 3), -1).reshape(-1, 3) * 5.0 * SIZE
+    features = scenes.make_features(means, sizes=SIZE, views=rng.integers(0, 4, len(means)))
+    assert match(features, MatchOptions(match=method)).count == len(means)  # type: ignore[arg-type]
+
+
+def test_merging_again_changes_little() -> None:
+    """Case 46: a second pass over merged Feature Gaussians."""
+    from gsmerge.encode import EncodeOptions, encode
+    from gsmerge.moments import scene_members
+    from gsmerge.segment import SegmentOptions, segment
+
+    scene = scenes.make_scene(scenes.room(), scenes.arc(4), noise=0.005)
+    assert scene.images is not None
+    features = encode(scene, scene_members(scene), segment(scene.images, SegmentOptions(), 170), EncodeOptions())
+    passes = [merge(features, match(features, MatchOptions()))]
+    for _ in range(2):
+        passes.append(merge(passes[-1], match(passes[-1], MatchOptions())))
+    found = [feature_to_gaussians(f) for f in passes]
+    psnrs = [scenes.psnr_of(g, scene) for g in found]
+    lumas = [scenes.images_of(g, scene.cameras)[0].mean() for g in found]
+    assert np.abs(np.diff(psnrs)).max() < 0.2
+    assert np.abs(np.diff(lumas)).max() < 1 / 255

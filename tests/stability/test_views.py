@@ -1,0 +1,147 @@
+"""Few, repeated, disjoint, turned and misplaced views (method reference, cases 21 to 27)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Cameras, PixelScene
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.005)
+
+
+# 21: one view several times
+
+
+@pytest.mark.parametrize("times", [2, 3, 6])
+def test_repeated_view_counts_once(room: PixelScene, times: int) -> None:
+    single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * times)
+    one, many = scenes.plain(single), scenes.plain(repeated)
+    assert len(many) <= 1.05 * len(one)
+
+
+@pytest.mark.parametrize("times", [2, 3, 6])
+def test_repeated_view_looks_the_same(room: PixelScene, times: int) -> None:
+    """Layers add up, so coverage may only grow."""
+    single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * times)
+    one, many = scenes.plain(single), scenes.plain(repeated)
+    assert scenes.psnr_of(many, single) > scenes.psnr_of(one, single) - 0.2
+
+
+def test_repeated_view_with_everything_on(room: PixelScene) -> None:
+    single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * 3)
+    one, many = scenes.compacted(single).gaussians, scenes.compacted(repeated).gaussians
+    assert len(many) <= 1.05 * len(one)
+    assert scenes.psnr_of(many, single) > scenes.psnr_of(one, single) - 0.5
+
+
+# 22: no baseline
+
+
+def test_pure_rotation() -> None:
+    eye = np.zeros(3)
+    viewmats = [scenes.look_at(eye, np.array([x, 0.0, 3.0])) for x in (-0.4, 0.0, 0.4)]
+    cameras = Cameras(torch.stack(viewmats), scenes.intrinsics(3, 48, 36), 48, 36)
+    scene = scenes.make_scene(scenes.wall(), cameras)
+    result = scenes.compacted(scene)
+    assert result.report.choices["fit"]["accepted"]
+    assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(scene.gaussians, scene) - 3
+
+
+# 23: one view
+
+
+def test_single_view(room: PixelScene) -> None:
+    single = scenes.take_views(room, [1])
+    matched, apart = scenes.compacted(single), scenes.compacted(single, match="none")
+    for name in scenes.FIELDS:
+        assert torch.equal(getattr(matched.gaussians, name), getattr(apart.gaussians, name))
+    assert "merge" not in matched.report.choices
+    fit = matched.report.choices["fit"]
+    assert fit["holdout_after"] > fit["holdout_before"] > 10
+
+
+# 24: views that share nothing
+
+
+def test_disjoint_views_are_merged_like_single_ones() -> None:
+    surfaces = scenes.wall()
+    near = scenes.arc(1)
+    shift = torch.eye(4, dtype=torch.float64)
+    shift[0, 3] = -30
+    far = replace(near, viewmats=near.viewmats @ shift)
+    both = Cameras(torch.cat([near.viewmats, far.viewmats]), torch.cat([near.Ks, far.Ks]), near.width, near.height)
+    together = scenes.plain(scenes.make_scene(surfaces, both))
+    scene = scenes.make_scene(surfaces, both)
+    apart = [scenes.plain(scenes.take_views(scene, [view])) for view in (0, 1)]
+    assert len(together) == len(apart[0]) + len(apart[1])
+    left = together.means[:, 0] < 15
+    scenes.assert_same_set(together[left], apart[0], atol=1e-4)
+    scenes.assert_same_set(together[~left], apart[1], atol=1e-4)
+
+
+# 25: order
+
+
+@pytest.mark.parametrize("order", [[2, 0, 1], [1, 0, 2]])
+@pytest.mark.parametrize("k", [1, 2])
+def test_order_of_views_does_not_matter(room: PixelScene, order: list[int], k: int) -> None:
+    one, other = scenes.plain(room, k=k), scenes.plain(scenes.take_views(room, order), k=k)
+    scenes.assert_same_set(one, other, atol=1e-4)
+
+
+def test_order_of_views_does_not_matter_to_the_choice_of_merge(room: PixelScene) -> None:
+    one, other = scenes.compacted(room, fit="none"), scenes.compacted(scenes.take_views(room, [2, 0, 1]), fit="none")
+    assert one.report.choices["merge"] == other.report.choices["merge"]
+    scenes.assert_same_set(one.gaussians, other.gaussians, atol=1e-3)
+
+
+def test_order_of_views_hardly_matters_to_the_fit(room: PixelScene) -> None:
+    """Other blocks are held out, so colours may differ by a little."""
+    one, other = scenes.compacted(room), scenes.compacted(scenes.take_views(room, [2, 0, 1]))
+    assert len(one.gaussians) == len(other.gaussians)
+    assert scenes.psnr_of(one.gaussians, room) == pytest.approx(scenes.psnr_of(other.gaussians, room), abs=0.1)
+
+
+# 27: wrong poses
+
+
+def misplaced(scene: PixelScene, degrees: float) -> PixelScene:
+    """Views 1 and 2 with their Gaussians turned about their own eyes, one to either side."""
+    means, viewmats = scene.gaussians.means.clone().reshape(3, -1, 3), scene.cameras.viewmats.clone()
+    for view, sign in ((1, 1), (2, -1)):
+        angle = np.deg2rad(sign * degrees)
+        turn = torch.eye(4, dtype=torch.float64)
+        turn[0, 0] = turn[2, 2] = np.cos(angle)
+        turn[0, 2], turn[2, 0] = np.sin(angle), -np.sin(angle)
+        old = viewmats[view].clone()
+        viewmats[view] = turn @ old
+        camera = means[view] @ old[:3, :3].T + old[:3, 3]
+        means[view] = (camera - viewmats[view, :3, 3]) @ viewmats[view, :3, :3]
+    gaussians = replace(scene.gaussians, means=means.reshape(-1, 3))
+    return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
+
+
+DEGREES = (0.0, 0.2, 1.0, 5.0, 20.0)
+
+
+def test_wrong_poses_degrade_step_by_step(room: PixelScene) -> None:
+    found = [scenes.compacted(misplaced(room, degrees)).report.psnr_after for degrees in DEGREES[:4]]
+    assert all(value is not None for value in found)
+    assert (np.diff(np.array(found, float)) < 0.5).all()
+
+
+@pytest.mark.parametrize("degrees", DEGREES)
+def test_fit_never_hurts_under_wrong_poses(room: PixelScene, degrees: float) -> None:
+    scene = misplaced(room, degrees)
+    fitted, unfitted = scenes.compacted(scene), scenes.compacted(scene, fit="none")
+    fit = fitted.report.choices["fit"]
+    assert fit["accepted"] == (fit["holdout_after"] > fit["holdout_before"])
+    assert fitted.report.psnr_after > unfitted.report.psnr_after - 0.1  # type: ignore[operator]
