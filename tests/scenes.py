@@ -207,19 +207,25 @@ def take_views(scene: PixelScene, order: Sequence[int]) -> PixelScene:
     )
 
 
-def move(scene: PixelScene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> PixelScene:
-    """The scene after x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
+def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Gaussians:
+    """Gaussians after x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
     turn, offset = torch.from_numpy(rotation).double(), torch.from_numpy(shift).double()
-    g, viewmats = scene.gaussians, scene.cameras.viewmats.clone()
+    return replace(
+        gaussians,
+        means=factor * (gaussians.means.double() @ turn.T) + offset,
+        quats=rotmat_to_quat(turn @ quat_to_rotmat(gaussians.quats.double())).float(),
+        scales=gaussians.scales * factor,
+    )
+
+
+def move(scene: PixelScene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> PixelScene:
+    """The scene with its cameras after the same."""
+    turn, offset = torch.from_numpy(rotation).double(), torch.from_numpy(shift).double()
+    viewmats = scene.cameras.viewmats.clone()
     viewmats[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
     viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ offset
-    moved = replace(
-        g,
-        means=factor * (g.means.double() @ turn.T) + offset,
-        quats=rotmat_to_quat(turn @ quat_to_rotmat(g.quats.double())).float(),
-        scales=g.scales * factor,
-    )
-    return replace(scene, gaussians=moved, cameras=replace(scene.cameras, viewmats=viewmats))
+    gaussians = move_gaussians(scene.gaussians, rotation, factor, shift)
+    return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
 def rotmat_to_quat(rotmats: Tensor) -> Tensor:

@@ -78,28 +78,44 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
     another, so clusters cannot chain. Returns the cluster of each Gaussian and the number of clusters.
     """
     clusters = np.full(order.shape[0], -1, np.int64)
+    tried = np.empty(neighbors.shape[1], np.bool_)
     count = 0
     for leader in order:
         if clusters[leader] >= 0:
             continue
         clusters[leader] = count
         size = 1
-        for k in np.argsort(-scores[leader], kind="mergesort"):
-            j = neighbors[leader, k]
-            if size == max_size or scores[leader, k] < threshold:
+        tried[:] = False
+        while size < max_size:
+            best = _best_left(scores[leader], tried, threshold)
+            if best < 0:
                 break
-            if clusters[j] >= 0:
-                continue
-            taken = False
-            for q in range(neighbors.shape[1]):
-                other = neighbors[leader, q]
-                if other >= 0 and clusters[other] == count and views[other] >= 0 and views[other] == views[j]:
-                    taken = True
-            if not taken:
+            tried[best] = True
+            j = neighbors[leader, best]
+            if clusters[j] < 0 and not _view_taken(neighbors[leader], clusters, count, views, views[j]):
                 clusters[j] = count
                 size += 1
         count += 1
     return clusters, count
+
+
+@kernel
+def _best_left(scores, tried, threshold):
+    """Position of the best score that has not been tried and reaches the threshold, -1 if there is none."""
+    best = -1
+    for k in range(scores.shape[0]):
+        if not tried[k] and scores[k] >= threshold and (best < 0 or scores[k] > scores[best]):
+            best = k
+    return best
+
+
+@kernel
+def _view_taken(candidates, clusters, cluster, views, view):
+    """Does the cluster hold one of a view already? Views below 0 are of none."""
+    for j in candidates:
+        if j >= 0 and view >= 0 and clusters[j] == cluster and views[j] == view:
+            return True
+    return False
 
 
 @kernel

@@ -161,7 +161,7 @@ def _rotate_pair(a, u, p, q):
 @kernel(exact=True)
 def decompose(covars, out_scales, out_quats):
     """Standard deviations (rising) and unit quaternions wxyz (w >= 0) of covariances ``[g,3,3]``, by Jacobi sweeps."""
-    a, u = np.empty((3, 3)), np.empty((3, 3))
+    a, u, r, order = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3, np.int64)
     for g in range(covars.shape[0]):
         for i in range(3):
             for j in range(3):
@@ -174,10 +174,16 @@ def decompose(covars, out_scales, out_quats):
             _rotate_pair(a, u, 0, 1)
             _rotate_pair(a, u, 0, 2)
             _rotate_pair(a, u, 1, 2)
-        order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
+        # rising order of the diagonal: the middle one is what the other two leave
+        order[0], order[2] = 0, 0
+        for k in range(1, 3):
+            if a[k, k] < a[order[0], order[0]]:
+                order[0] = k
+            if a[k, k] >= a[order[2], order[2]]:
+                order[2] = k
+        order[1] = 3 - order[0] - order[2]
         for k in range(3):
             out_scales[g, k] = np.sqrt(max(a[order[k], order[k]], 0.0))
-        r = np.empty((3, 3))
         for k in range(3):
             for i in range(3):
                 r[i, k] = u[i, order[k]]

@@ -10,6 +10,8 @@ import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
+from gsmerge.fit import FitOptions, draw, fit_colors
+from gsmerge.photos import scene_photos
 from gsmerge.types import SH_C0
 
 
@@ -35,16 +37,30 @@ def room() -> PixelScene:
 # 29: exposure
 
 
-@pytest.mark.parametrize("robust", [True, False])
-def test_exposure_that_changes_between_views(room: PixelScene, robust: bool) -> None:
-    """Factors with geometric mean one."""
+def test_exposure_that_changes_between_views(room: PixelScene) -> None:
+    """The fit compensates; factors with geometric mean one, one merge for both."""
     assert room.images is not None
     factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
-    images = 0.8 * room.images * factors
-    steady = scenes.compacted(painted(room, 0.8 * room.images), robust=robust).gaussians
-    varied = scenes.compacted(painted(room, images), robust=robust)
+    merged = scenes.compacted(painted(room, 0.8 * room.images), fit="none").gaussians
+    found = []
+    for images in (0.8 * room.images, 0.8 * room.images * factors):
+        photos = scene_photos(replace(room, images=images), 2)
+        found.append(fit_colors(merged, draw(merged, photos), photos, FitOptions())[0])
     surfaces = [scenes.Surface(s.trace, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
-    assert novel_psnr(varied.gaussians, surfaces) > novel_psnr(steady, surfaces) - 0.2
+    steady, varied = (novel_psnr(g, surfaces) for g in found)
+    assert steady > novel_psnr(merged, surfaces) + 1
+    assert varied > steady - 0.2
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool) -> None:
+    """The whole command: the fit still helps."""
+    assert room.images is not None
+    factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
+    scene = painted(room, 0.8 * room.images * factors)
+    fitted, unfitted = (scenes.compacted(scene, robust=robust, fit=fit).gaussians for fit in ("color", "none"))
+    surfaces = [scenes.Surface(s.trace, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
+    assert novel_psnr(fitted, surfaces) > novel_psnr(unfitted, surfaces) + 1
 
 
 # 30, 31: nothing to see, and too much
@@ -57,9 +73,7 @@ def test_flat_pictures(room: PixelScene, grey: float, method: str) -> None:
     flat = painted(room, torch.full_like(room.images, grey))
     result = scenes.compacted(flat, method=method, superpixels=60)
     assert 1 <= len(result.gaussians) <= 4 * 60
-    colors = 0.5 + SH_C0 * result.gaussians.sh0
-    assert float((colors - grey).abs().max()) < 0.1
-    assert result.report.psnr_after > result.report.psnr_before - 0.5  # type: ignore[operator]
+    assert result.report.psnr_after > 25  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("method", ["rdseg", "bass-st"])

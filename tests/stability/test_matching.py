@@ -56,8 +56,9 @@ def test_wall_seen_by_many_views_does_not_collapse() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(6, 32, 24, span=0.2))
     alone, found = scenes.plain(scene, match="none"), scenes.plain(scene)
     assert 0.15 * len(alone) < len(found) < len(alone)
-    coverage = [scenes.images_of(g, scene.cameras)[1].mean() for g in (alone, found)]
-    assert coverage[1] >= 0.95 * coverage[0]
+    single = scenes.plain(scenes.take_views(scene, [0]))
+    coverage = [scenes.images_of(g, scene.cameras[:1])[1].mean() for g in (single, found)]
+    assert coverage[1] >= coverage[0]
 
 
 def opposite_cameras(width: int = 32, height: int = 24) -> Cameras:
@@ -87,22 +88,3 @@ def test_repeated_texture_is_not_merged(method: str) -> None:
     means = np.stack(np.meshgrid(*[np.arange(6)] * 3), -1).reshape(-1, 3) * 5.0 * SIZE
     features = scenes.make_features(means, sizes=SIZE, views=rng.integers(0, 4, len(means)))
     assert match(features, MatchOptions(match=method)).count == len(means)  # type: ignore[arg-type]
-
-
-def test_merging_again_changes_little() -> None:
-    """Case 46: a second pass over merged Feature Gaussians."""
-    from gsmerge.encode import EncodeOptions, encode
-    from gsmerge.moments import scene_members
-    from gsmerge.segment import SegmentOptions, segment
-
-    scene = scenes.make_scene(scenes.room(), scenes.arc(4), noise=0.005)
-    assert scene.images is not None
-    features = encode(scene, scene_members(scene), segment(scene.images, SegmentOptions(), 170), EncodeOptions())
-    passes = [merge(features, match(features, MatchOptions()))]
-    for _ in range(2):
-        passes.append(merge(passes[-1], match(passes[-1], MatchOptions())))
-    found = [feature_to_gaussians(f) for f in passes]
-    psnrs = [scenes.psnr_of(g, scene) for g in found]
-    lumas = [scenes.images_of(g, scene.cameras)[0].mean() for g in found]
-    assert np.abs(np.diff(psnrs)).max() < 0.2
-    assert np.abs(np.diff(lumas)).max() < 1 / 255

@@ -1,0 +1,180 @@
+"""Gradients of a view: what a loss on the image wants of every Gaussian in it.
+
+For training loops, on arrays and without autograd::
+
+    plan = plan_differentiable(splats, viewmat, K, width, height)
+    image, transmittance = composite(plan, colors, background)
+    wanted = plan_gradients(plan, grad_image, image=image, transmittance=transmittance, colors=colors)
+    means[wanted.ids] -= rate * wanted.means
+
+:func:`gsmerge.render` is differentiable with the same kernels. Nothing here is compiled or imported before it is
+used. Results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gsmerge.kernels import project_backward, raster_backward
+from gsmerge.render.blend import _tile_ranges, view_colors
+from gsmerge.render.plan import Array, Splats, ViewPlan, _camera, pieces, plan_view
+from gsmerge.threads import parallel_map, use_threads
+
+
+@dataclass(frozen=True, eq=False)
+class DifferentiablePlan(ViewPlan):
+    """A plan that remembers what it was made with.
+
+    Args:
+        opacities: ``[n]`` float32, those that were drawn.
+        camera: The view's numbers in the order of :mod:`gsmerge.kernels.project`, float32.
+        viewmat: ``[4,4]`` float64, world to camera.
+    """
+
+    opacities: Array
+    camera: Array
+    viewmat: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Gradients of a loss with respect to the Gaussians of a plan.
+
+    Args:
+        ids: ``[m]`` int32, ascending: the Gaussians that the rows belong to; all others have none.
+        means: ``[m,3]`` float32, through geometry alone (colours seen from elsewhere: :func:`color_gradients`).
+        quats: ``[m,4]`` float32, with respect to the quaternions as they are, of whatever length.
+        scales: ``[m,3]`` float32, with respect to linear scales.
+        opacities: ``[m]`` float32.
+        colors: ``[m,3]`` float32, with respect to the colours in this view, as they are blended.
+        viewmat: ``[4,4]`` float64, last row 0; None if not asked for.
+    """
+
+    ids: Array
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
+    viewmat: Array | None
+
+
+def plan_differentiable(
+    splats: Splats,
+    viewmat: ArrayLike,
+    K: ArrayLike,
+    width: int,
+    height: int,
+    *,
+    eps2d: float = 0.3,
+    antialiased: bool = False,
+    near: float = 0.01,
+    far: float = 1e10,
+    opacities: Array | None = None,
+    keep: Array | None = None,
+) -> DifferentiablePlan:
+    """:func:`gsmerge.render.plan_view`, with the same arguments, for :func:`plan_gradients`."""
+    plan = plan_view(
+        splats, viewmat, K, width, height,
+        eps2d=eps2d, antialiased=antialiased, near=near, far=far, opacities=opacities, keep=keep,
+    )  # fmt: skip
+    world = np.array(viewmat, np.float64)
+    local = world.copy()
+    local[:3, 3] += local[:3, :3] @ splats.origin
+    drawn = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
+    camera = _camera(local, np.asarray(K, np.float64), width, height, eps2d, antialiased)
+    return DifferentiablePlan(**vars(plan), opacities=drawn, camera=camera, viewmat=world)
+
+
+def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def _sums(
+    plan: ViewPlan, colors: Array, image: Array, transmittance: Array, grad_image: Array, grad_left: Array
+) -> Array:
+    """``[m,SUMS]`` sums over the image of what the footprints and colours should become."""
+    slots = np.empty((len(plan.members), raster_backward.SUMS), np.float32)
+    sums = np.zeros((len(plan.ids), raster_backward.SUMS), np.float32)
+
+    def tiles(span: tuple[int, int]) -> None:
+        raster_backward.blend_backward(
+            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span,
+            image, transmittance, grad_image, grad_left, slots,
+        )  # fmt: skip
+
+    with use_threads() as threads:
+        parallel_map(tiles, _tile_ranges(plan, threads))
+        parallel_map(
+            lambda span: raster_backward.gather_slots(plan.members, slots, *span, sums),
+            pieces(len(plan.ids), threads),
+        )
+    return sums
+
+
+def plan_gradients(
+    plan: DifferentiablePlan,
+    grad_image: Array,
+    grad_transmittance: Array | None = None,
+    *,
+    image: Array,
+    transmittance: Array,
+    colors: Array | None = None,
+    with_viewmat: bool = False,
+) -> Gradients:
+    """Gradients of a loss on the image that :func:`gsmerge.render.composite` made of a plan.
+
+    Args:
+        plan: The view, from :func:`plan_differentiable`.
+        grad_image: ``[h,w,3]`` gradient with respect to the image.
+        grad_transmittance: ``[h,w]`` gradient with respect to the remaining transmittance; None for none. (The
+            background's part is in the image's gradient already.)
+        image: ``[h,w,3]``, as it was made, background included.
+        transmittance: ``[h,w]``, as it was made.
+        colors: ``[n,3]``, as they were given to ``composite``; None if none were.
+        with_viewmat: Also the gradient with respect to the world-to-camera matrix.
+
+    Returns:
+        The gradients. Zero where alpha is clamped at 0.99, and through what decides which weights are drawn at all.
+
+    Raises:
+        ValueError: If an array has another shape.
+    """
+    size, m = (plan.height, plan.width), len(plan.ids)
+    grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
+    transmittance = _expect("transmittance", transmittance, size)
+    left = np.empty((0, 0), np.float32)
+    if grad_transmittance is not None:
+        left = _expect("grad_transmittance", grad_transmittance, size)
+    if colors is None:
+        drawn = view_colors(plan)
+    else:
+        drawn = _expect("colors", colors, (len(plan.splats), 3))[plan.ids]
+    sums = _sums(plan, drawn, image, transmittance, grad_image, left)
+    means, quats, scales = np.empty((m, 3), np.float32), np.empty((m, 4), np.float32), np.empty((m, 3), np.float32)
+    opacities, block = np.empty(m, np.float32), project_backward.BLOCK
+    poses = np.empty((-(-m // block) if with_viewmat else 0, project_backward.POSE), np.float32)
+    splats = plan.splats
+
+    def project(span: tuple[int, int]) -> None:
+        project_backward.project_backward(
+            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera,
+            span[0] * block, min(m, span[1] * block), means, quats, scales, opacities, poses,
+        )  # fmt: skip
+
+    with use_threads() as threads:
+        num_blocks = -(-m // block)
+        num = len(pieces(m, threads))
+        parallel_map(project, [(num_blocks * i // num, num_blocks * (i + 1) // num) for i in range(num)])
+    viewmat = None
+    if with_viewmat:
+        pose = poses.sum(0, dtype=np.float64)
+        viewmat = np.zeros((4, 4))
+        viewmat[:3, 3] = pose[9:]
+        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
+    return Gradients(plan.ids, means, quats, scales, opacities, sums[:, :3], viewmat)

@@ -1,0 +1,65 @@
+"""Children do not depend on the order of members, and follow the group when it is moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import assert_same_set, make_features, move_gaussians, random_rotation, rotmat_to_quat
+
+from gsmerge.decode import DecodeOptions, decode
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.moments import Members
+from gsmerge.types import FeatureGaussians
+
+FEW = settings(max_examples=15, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians, Members]:
+    """One group of ``count`` members."""
+    columns = (
+        rng.normal(size=(count, 3)) * 0.1, rng.normal(size=(count, 4)), np.exp(0.3 * rng.normal(size=(count, 3)) - 4),
+        rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)) * 0.3, np.full(count, 0.02),
+    )  # fmt: skip
+    members = Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
+    feature = make_features(members.means.mean(0, keepdims=True), sizes=0.02)
+    return replace(feature, starts=torch.tensor([0, count]), members=torch.arange(count)), members
+
+
+@FEW
+@given(seeds, st.integers(1, 60), st.sampled_from([2, 3, 4, 8]))
+def test_order_of_members(seed: int, count: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    feature, members = random_group(rng, count)
+    shuffled = replace(feature, members=torch.from_numpy(rng.permutation(count)))
+    one, other = (decode(f, members, DecodeOptions(k=k)) for f in (feature, shuffled))
+    assert_same_set(one, other, atol=1e-5)
+
+
+@FEW
+@given(seeds, st.integers(1, 60), st.sampled_from([1, 2, 4]), st.floats(-2, 2))
+def test_children_follow_the_group(seed: int, count: int, k: int, exponent: float) -> None:
+    rng = np.random.default_rng(seed)
+    feature, members = random_group(rng, count)
+    turn, factor = random_rotation(seed), 10.0**exponent
+    quats = rotmat_to_quat(torch.from_numpy(turn) @ quat_to_rotmat(torch.from_numpy(members.quats).double()))
+    moved_members = replace(
+        members,
+        means=(factor * members.means @ turn.T).astype(np.float32),
+        quats=quats.float().numpy(),
+        scales=(factor * members.scales).astype(np.float32),
+        footprints=(factor * members.footprints).astype(np.float32),
+    )
+    moved = replace(
+        feature,
+        means=(factor * feature.means.double() @ torch.from_numpy(turn).T).float(),
+        covars=(factor**2 * torch.from_numpy(turn) @ feature.covars.double() @ torch.from_numpy(turn).T).float(),
+        extinctions=feature.extinctions * factor**2,
+        footprints=feature.footprints * factor,
+    )
+    one, other = decode(feature, members, DecodeOptions(k=k)), decode(moved, moved_members, DecodeOptions(k=k))
+    assert_same_set(other, move_gaussians(one, turn, factor, np.zeros(3)), atol=1e-3, unit=factor)

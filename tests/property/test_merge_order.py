@@ -1,0 +1,134 @@
+"""Pooling and merging do not depend on order, place, orientation or unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import make_features, random_rotation
+
+from gsmerge.match import MatchOptions, match
+from gsmerge.merge import merge, take
+from gsmerge.moments import Members, pool_members
+from gsmerge.types import FeatureGaussians, Matches
+
+FEW = settings(max_examples=20, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_members(rng: np.random.Generator, count: int) -> Members:
+    columns = (
+        rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), np.exp(rng.normal(size=(count, 3)) - 3),
+        rng.uniform(0, 1, count), rng.normal(size=(count, 4, 3)), rng.uniform(0.01, 0.03, count),
+    )  # fmt: skip
+    return Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
+
+
+@FEW
+@given(seeds, st.integers(1, 80))
+def test_order_of_members(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    members, starts = random_members(rng, count), np.array([0, count])
+    one = pool_members(members, starts, np.arange(count))
+    other = pool_members(members, starts, rng.permutation(count))
+    for name in ("means", "covars", "weights", "masses", "extinctions", "footprints", "sh"):
+        np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-5, atol=1e-5, err_msg=name)
+
+
+@FEW
+@given(seeds, st.integers(2, 40), st.floats(-3, 3))
+def test_pooling_commutes_with_similarities(seed: int, count: int, exponent: float) -> None:
+    rng = np.random.default_rng(seed)
+    members, starts, ids = random_members(rng, count), np.array([0, count]), np.arange(count)
+    factor, turn = 10.0**exponent, random_rotation(seed)
+    quat = rotation_to_quat(turn)
+    moved = replace(
+        members,
+        means=(factor * members.means @ turn.T).astype(np.float32),
+        quats=multiply(quat, members.quats).astype(np.float32),
+        scales=(factor * members.scales).astype(np.float32),
+        footprints=(factor * members.footprints).astype(np.float32),
+    )
+    one, other = pool_members(members, starts, ids), pool_members(moved, starts, ids)
+    np.testing.assert_allclose(other.means / factor, one.means @ turn.T, atol=1e-5)
+    np.testing.assert_allclose(other.covars / factor**2, turn @ one.covars @ turn.T, atol=1e-5)
+    np.testing.assert_allclose(other.weights, one.weights)
+    np.testing.assert_allclose(other.extinctions, factor**2 * one.extinctions, rtol=1e-5)
+    np.testing.assert_allclose(other.masses, factor**3 * one.masses, rtol=1e-5)
+
+
+def rotation_to_quat(turn: np.ndarray) -> np.ndarray:
+    from scenes import rotmat_to_quat
+
+    return rotmat_to_quat(torch.from_numpy(turn)).numpy()
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products of one quaternion with many."""
+    w, v = b[:, :1], b[:, 1:].astype(float)
+    return np.concatenate([a[0] * w - v @ a[1:, None], a[0] * v + w * a[1:] + np.cross(a[1:], v)], 1)
+
+
+def random_features(rng: np.random.Generator, count: int) -> FeatureGaussians:
+    return make_features(
+        rng.uniform(0, 1, (count, 3)), sizes=rng.uniform(0.05, 0.15, (count, 3)), views=rng.integers(0, 4, count),
+        colors=rng.uniform(0.45, 0.55, (count, 3)), opacities=rng.uniform(0.1, 0.9, count),
+    )  # fmt: skip
+
+
+def as_sets(found: Matches, names: np.ndarray) -> set[frozenset[int]]:
+    clusters = found.clusters.numpy()
+    return {frozenset(names[clusters == c].tolist()) for c in range(found.count)}
+
+
+@FEW
+@given(seeds, st.integers(1, 80), st.sampled_from(["overlap", "aabb"]))
+def test_order_of_features(seed: int, count: int, method: str) -> None:
+    rng = np.random.default_rng(seed)
+    features, options = random_features(rng, count), MatchOptions(match=method, overlap=0.3)  # type: ignore[arg-type]
+    order = rng.permutation(count)
+    shuffled = take(features, torch.from_numpy(order))
+    one, other = match(features, options), match(shuffled, options)
+    assert as_sets(one, np.arange(count)) == as_sets(other, order)
+    a, b = merge(features, one), merge(shuffled, other)
+    assert len(a) == len(b) == one.count
+    for name in ("means", "covars", "weights", "extinctions", "masses"):
+        x, y = (np.sort(getattr(f, name).reshape(len(f), -1).numpy(), axis=0) for f in (a, b))
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@FEW
+@given(seeds, st.integers(2, 80), st.floats(-3, 3))
+def test_clusters_do_not_depend_on_the_axes(seed: int, count: int, exponent: float) -> None:
+    rng = np.random.default_rng(seed)
+    features, turn, factor = random_features(rng, count), torch.from_numpy(random_rotation(seed)), 10.0**exponent
+    moved = replace(
+        features,
+        means=(factor * features.means.double() @ turn.T).float(),
+        covars=(factor**2 * turn @ features.covars.double() @ turn.T).float(),
+    )
+    options = MatchOptions(overlap=0.3)
+    one, other = match(features, options), match(moved, options)
+    assert as_sets(one, np.arange(count)) == as_sets(other, np.arange(count))
+
+
+@FEW
+@given(seeds, st.integers(1, 60))
+def test_merging_keeps_sums_and_moments(seed: int, count: int) -> None:
+    """Whatever the clusters, the weighted mean and the second moment of everything stay."""
+    rng = np.random.default_rng(seed)
+    features = random_features(rng, count)
+    labels = np.unique(rng.integers(0, max(1, count // 3) + 1, count), return_inverse=True)[1].reshape(-1)
+    merged = merge(features, Matches(torch.from_numpy(labels), int(labels.max()) + 1))
+
+    def totals(f: FeatureGaussians) -> np.ndarray:
+        weights, means, covars = f.weights.double(), f.means.double(), f.covars.double()
+        second = covars + means[:, :, None] * means[:, None]
+        return np.concatenate(
+            [weights.sum()[None], f.extinctions.double().sum()[None], weights @ means, (weights @ second.flatten(1))]
+        )
+
+    np.testing.assert_allclose(totals(merged), totals(features), rtol=1e-5, atol=1e-6)

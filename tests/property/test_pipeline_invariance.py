@@ -1,0 +1,69 @@
+"""The whole command: order of views, similarity transforms, seeds and threads."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsmerge import Gaussians, PixelScene
+
+FEW = settings(max_examples=5, deadline=None, derandomize=True)
+ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
+
+
+def identical(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in scenes.FIELDS)
+
+
+@FEW
+@given(st.permutations(range(4)), st.sampled_from([1, 2]))
+def test_order_of_views(order: list[int], k: int) -> None:
+    one, other = scenes.plain(ROOM, k=k), scenes.plain(scenes.take_views(ROOM, order), k=k)
+    scenes.assert_same_set(one, other, atol=1e-4)
+
+
+@FEW
+@given(st.integers(0, 1000), st.floats(-4, 4), st.sampled_from(["overlap", "none"]))
+def test_similarity(seed: int, exponent: float, match: str) -> None:
+    rng = np.random.default_rng(seed)
+    factor = 10.0**exponent
+    transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)
+    one, other = scenes.plain(ROOM, match=match), scenes.plain(scenes.move(ROOM, *transform), match=match)
+    scenes.assert_same_set(other, scenes.move_gaussians(one, *transform), atol=5e-4, unit=factor)
+
+
+@FEW
+@given(st.floats(1e5, 9e5), st.floats(1e6, 9e6))
+def test_map_coordinates(east: float, north: float) -> None:
+    shift = np.array([east, north, 300.0])
+    here, there = scenes.plain(ROOM), scenes.plain(scenes.move(ROOM, np.eye(3), 1.0, shift))
+    scenes.assert_same_set(there, scenes.move_gaussians(here, np.eye(3), 1.0, shift), atol=1e-4)
+
+
+CASES = [{}, {"k": 4, "seed": 3}, {"robust": False, "match": "aabb"}, {"method": "bass-st", "fit": "none"}]
+
+
+@pytest.mark.parametrize("settings", CASES, ids=str)
+def test_threads_change_no_bit(settings: dict) -> None:
+    found = [scenes.compacted(ROOM, threads=threads, **settings).gaussians for threads in (1, 2, 8)]
+    assert all(identical(a, b) for a, b in itertools.pairwise(found))
+
+
+@pytest.mark.parametrize("settings", CASES, ids=str)
+def test_runs_repeat(settings: dict) -> None:
+    assert identical(scenes.compacted(ROOM, **settings).gaussians, scenes.compacted(ROOM, **settings).gaussians)
+
+
+def test_large_groups_of_tasks_change_no_bit() -> None:
+    """More superpixels than one task takes."""
+    scene: PixelScene = scenes.make_scene(scenes.wall(), scenes.arc(2, 128, 96))
+    options = {"density": 0.45, "k": 2, "fit": "none"}
+    found = [scenes.compacted(scene, threads=threads, **options).gaussians for threads in (1, 3)]
+    assert len(found[0]) > 8192
+    assert identical(*found)

@@ -1,0 +1,90 @@
+"""Flyaways, coordinates far from zero, scale and orientation (method reference, cases 13, 37, 38)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import PixelScene
+from gsmerge.canonical import find_frame
+from gsmerge.moments import scene_members
+
+UTM = np.array([4e5, 5e6, 120.0])
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.005)
+
+
+# 13: flyaways
+
+
+@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"match": "aabb"}], ids=str)
+def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> None:
+    means = room.gaussians.means.clone()
+    rows = np.random.default_rng(0).choice(len(means), 5, replace=False)
+    eyes = room.cameras.centres.repeat_interleave(room.pixels_per_view, 0)[rows]
+    means[rows] = eyes + 1e5 * (means[rows] - eyes)
+    scene = replace(room, gaussians=replace(room.gaussians, means=means))
+    assert find_frame(scene).unit == find_frame(room).unit
+    clean, found = scenes.compacted(room, **settings), scenes.compacted(scene, **settings)
+    assert abs(len(found.gaussians) - len(clean.gaussians)) <= 2 * len(rows)
+    near = found.gaussians[found.gaussians.means.norm(dim=1) < 10]
+    assert len(near) >= len(found.gaussians) - len(rows)
+    assert scenes.psnr_of(found.gaussians, room) > scenes.psnr_of(clean.gaussians, room) - 0.7
+
+
+# 37: coordinates of maps
+
+
+@pytest.mark.parametrize("settings", [{"robust": False, "fit": "none"}, {"fit": "none"}, {"k": 2}], ids=str)
+def test_map_coordinates(room: PixelScene, settings: dict) -> None:
+    far = scenes.move(room, np.eye(3), 1.0, UTM)
+    here, there = scenes.compacted(room, **settings).gaussians, scenes.compacted(far, **settings).gaussians
+    footprint = float(np.median(scene_members(room).footprints))
+    back = replace(there, means=there.means - torch.from_numpy(UTM))
+    assert there.means.dtype == torch.float64
+    scenes.assert_same_set(here, back, atol=1e-3 * footprint + 2e-5)
+
+
+def test_map_coordinates_at_every_stage_of_the_report(room: PixelScene) -> None:
+    far = scenes.move(room, np.eye(3), 1.0, UTM)
+    here, there = scenes.compacted(room).report, scenes.compacted(far).report
+    assert there.psnr_before == pytest.approx(here.psnr_before, abs=0.01)
+    assert there.psnr_after == pytest.approx(here.psnr_after, abs=0.05)
+    assert there.choices["merge"] == here.choices["merge"]
+
+
+# 38: similarity transforms
+
+
+@pytest.mark.parametrize("factor", [1e-4, 0.37, 1e4])
+@pytest.mark.parametrize("match", ["overlap", "none"])
+def test_similarity(room: PixelScene, factor: float, match: str) -> None:
+    transform = scenes.random_rotation(1), factor, factor * np.array([1.0, -2.0, 3.0])
+    one, other = scenes.plain(room, match=match), scenes.plain(scenes.move(room, *transform), match=match)
+    scenes.assert_same_set(other, scenes.move_gaussians(one, *transform), atol=2e-4, unit=factor)
+
+
+def test_similarity_of_equal_opacities(room: PixelScene) -> None:
+    """Equal weights: ties must not be broken along the world's axes."""
+    even = replace(room, gaussians=replace(room.gaussians, opacities=torch.full_like(room.gaussians.opacities, 0.8)))
+    counts = [len(scenes.plain(even))]
+    for seed in range(4):
+        counts.append(len(scenes.plain(scenes.move(even, scenes.random_rotation(seed), 1.0, np.zeros(3)))))
+    assert max(counts) - min(counts) <= 0.005 * max(counts)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
+def test_similarity_with_everything_on(room: PixelScene, factor: float) -> None:
+    moved = scenes.move(room, scenes.random_rotation(2), factor, np.zeros(3))
+    one, other = scenes.compacted(room, k=2), scenes.compacted(moved, k=2)
+    assert len(other.gaussians) == pytest.approx(len(one.gaussians), rel=0.005)
+    assert other.report.choices["merge"] == one.report.choices["merge"]
+    assert other.report.psnr_before == pytest.approx(one.report.psnr_before, abs=0.02)
+    assert other.report.psnr_after == pytest.approx(one.report.psnr_after, abs=0.1)
