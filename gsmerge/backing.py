@@ -23,11 +23,22 @@ class BackingOptions:
         backing: Share of the superpixels asked for that goes to this layer.
         push: Distance behind the surface, as a share of the depth.
         backing_spread: Factor on the standard deviations.
+
+    Raises:
+        ValueError: If a setting is out of range.
     """
 
     backing: float = 0.07
     push: float = 0.1
     backing_spread: float = 1.2
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.backing <= 1:
+            raise ValueError(f"backing: expected 0 to 1, got {self.backing}")
+        if not self.push >= 0:
+            raise ValueError(f"push: expected at least 0, got {self.push}")
+        if not self.backing_spread > 0:
+            raise ValueError(f"backing_spread: expected more than 0, got {self.backing_spread}")
 
 
 def encode_backing(scene: PixelScene, members: Members, groups: Groups, options: BackingOptions) -> FeatureGaussians:

@@ -47,11 +47,16 @@ class Frame:
 
 
 def find_frame(scene: PixelScene) -> Frame:
-    """The canonical frame of a scene: median mean (float64) and median depth of its valid Gaussians."""
+    """The canonical frame of a scene: median mean (float64) and median depth of its valid Gaussians.
+
+    Raises:
+        ValueError: If no Gaussian is valid.
+    """
     h, w = scene.cameras.height, scene.cameras.width
-    step = max(1, len(scene.gaussians) // 65536)
-    rows = torch.arange(0, len(scene.gaussians), step)
-    rows = rows[scene.valid.reshape(-1)[rows]]
+    rows = torch.nonzero(scene.valid.reshape(-1))[:, 0]
+    if len(rows) == 0:
+        raise ValueError("expected at least one valid Gaussian, got none")
+    rows = rows[:: max(1, len(rows) // 65536)]
     means = scene.gaussians.means[rows].double()
     origin = means.median(0).values
     viewmats = scene.cameras.viewmats.double()[rows // (h * w)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsmerge.kernels.bisect import bisect
+from gsmerge.kernels.bisect import bisect, gather_groups
 from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
@@ -23,13 +23,24 @@ class DecodeOptions:
     Args:
         k: Children of each group, 1 to 8.
         min_opacity: Gaussians below this opacity are left out (paper section 4.3).
+
+    Raises:
+        ValueError: If K is not within 1 to 8 or the opacity not within 0 to 1.
     """
 
     k: int = 1
     min_opacity: float = 1 / 255
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.k <= MAX_CHILDREN:
+            raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, got {self.k}")
+        if not 0 <= self.min_opacity <= 1:
+            raise ValueError(f"min_opacity: expected 0 to 1, got {self.min_opacity}")
 
-def decode(features: FeatureGaussians, members: Members, options: DecodeOptions) -> Gaussians:
+
+def decode(
+    features: FeatureGaussians, members: Members, options: DecodeOptions, counts: np.ndarray | None = None
+) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 
     Children are found by halving the members again and again across their widest direction in colour and
@@ -39,46 +50,46 @@ def decode(features: FeatureGaussians, members: Members, options: DecodeOptions)
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
+        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer are not looked at.
 
     Returns:
         The Gaussians, those of one group next to each other.
 
     Raises:
-        ValueError: If K is not within 1 to 8.
+        ValueError: If ``counts`` has the wrong shape or a count below 1.
     """
-    if not 1 <= options.k <= MAX_CHILDREN:
-        raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, got {options.k}")
-    if options.k == 1:
-        gaussians = feature_to_gaussians(features)
-    else:
-        backing = features.backing
-        parts = [_children(features, members, options.k)]
-        if bool(backing.any()):
-            parts.append(feature_to_gaussians(features)[backing])
-        gaussians = Gaussians.concat(parts)
+    if counts is None:
+        counts = np.full(len(features), options.k)
+    if counts.shape != (len(features),) or counts.min(initial=1) < 1:
+        raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
+    divided = (counts > 1) & ~features.backing.numpy()
+    gaussians = feature_to_gaussians(features)
+    if divided.any():
+        children, parents = _children(features, members, np.flatnonzero(divided), counts)
+        whole = np.flatnonzero(~divided)
+        order = np.argsort(np.concatenate([whole, parents]), kind="stable")
+        gaussians = Gaussians.concat([gaussians[torch.from_numpy(whole)], children])[torch.from_numpy(order)]
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
-def _children(features: FeatureGaussians, members: Members, count: int) -> Gaussians:
-    """Gaussians of the children of all groups in front."""
-    front = torch.nonzero(~features.backing)[:, 0].numpy()
+def _children(
+    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
+) -> tuple[Gaussians, np.ndarray]:
+    """Gaussians of the children of some groups, and the group of each."""
     starts, ids = features.starts.numpy(), features.members.numpy()
     centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
 
     def run(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        # groups in front are contiguous in the rows of one task unless the backing layer lies between
-        sizes = starts[rows + 1] - starts[rows]
-        local = np.concatenate([[0], np.cumsum(sizes)])
-        own = ids[np.repeat(starts[rows] - local[:-1], sizes) + np.arange(local[-1])]
+        local, own = gather_groups(starts, ids, rows)
+        m = members
         child_starts, child_ids, parents = bisect(
-            local, own, members.means, members.sh, members.opacities, centres[rows], footprints[rows], count
+            local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], counts[rows]
         )
         return np.diff(child_starts), child_ids, rows[parents]
 
-    tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
-    found = parallel_map(run, tasks)
+    found = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
     sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
     moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), child_ids)
     gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
     means, sh = torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
-    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh)
+    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh), parents

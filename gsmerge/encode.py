@@ -24,9 +24,16 @@ class EncodeOptions:
         rule: ``"depth"``: opacity weights, total covariance of winsorised members, opacity from the conserved
             optical depth. ``"paper"``: the paper's moment matching (eq. teacher_mean, teacher_cov; mean opacity),
             a baseline.
+
+    Raises:
+        ValueError: If the rule is unknown.
     """
 
     rule: Rule = "depth"
+
+    def __post_init__(self) -> None:
+        if self.rule not in ("depth", "paper"):
+            raise ValueError(f'rule: expected "depth" or "paper", got {self.rule!r}')
 
 
 def encode(scene: PixelScene, members: Members, groups: Groups, options: EncodeOptions) -> FeatureGaussians:

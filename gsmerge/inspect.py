@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io import Alignment, PlyScene, SceneFiles, align_scene, find_scene_files, read_cameras, read_ply
+from gsmerge.io import (
+    Alignment,
+    PlyScene,
+    SceneFiles,
+    align_scene,
+    find_scene_files,
+    ply_notes,
+    read_cameras,
+    read_ply,
+)
+from gsmerge.io.ply import OpacityChoice
 from gsmerge.types import Gaussians
 
 _MAX_EXTENT_SAMPLES = 200_000
@@ -88,6 +98,7 @@ def inspect(
     *,
     cameras: str | os.PathLike[str] | None = None,
     images: str | os.PathLike[str] | None = None,
+    opacity: OpacityChoice = "auto",
 ) -> Inspection:
     """Say what a scene is made of, and whether it has one Gaussian per pixel of its views.
 
@@ -97,12 +108,13 @@ def inspect(
         path: A ``.ply`` or a folder that has one.
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
+        opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist.
     """
     files = find_scene_files(path, cameras=cameras, images=images)
-    ply = read_ply(files.ply)
+    ply = read_ply(files.ply, opacity=opacity)
     return Inspection(**_of_ply(ply), **_of_views(ply, files))
 
 
@@ -155,7 +167,7 @@ def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
         "images": None if files.images is None else str(files.images),
         "alignment": None,
         "alignment_problem": None,
-        "notes": _notes(ply),
+        "notes": ply_notes(ply.info),
     }
     camera_file = None
     try:
@@ -166,18 +178,4 @@ def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
     except SceneError as error:
         return found | {"alignment_problem": str(error)}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
-    return found | size | {"alignment": load.alignment, "notes": (*found["notes"], *load.notes)}
-
-
-def _notes(ply: PlyScene) -> tuple[str, ...]:
-    info = ply.info
-    notes = []
-    if info.opacity_encoding == "raw":
-        notes.append("all opacities lie in [0, 1] and are taken as activated, not as logits")
-    if info.num_nonfinite:
-        notes.append(f"{info.num_nonfinite} rows hold NaN or inf and are set aside")
-    if info.num_clipped_scales:
-        notes.append(f"{info.num_clipped_scales} Gaussians have extreme scales, which are clipped")
-    if info.num_zero_quats:
-        notes.append(f"{info.num_zero_quats} Gaussians have a zero quaternion, taken as the identity")
-    return tuple(notes)
+    return found | size | {"alignment": load.alignment, "notes": load.notes}

@@ -27,6 +27,9 @@ class MatchOptions:
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
         neighbors: Nearest neighbours in 3D that are looked at, the own view's included.
         cluster_size: Most Feature Gaussians in a star cluster.
+
+    Raises:
+        ValueError: If a setting is unknown or out of range.
     """
 
     match: Method = "overlap"
@@ -35,18 +38,22 @@ class MatchOptions:
     neighbors: int = 16
     cluster_size: int = 4
 
+    def __post_init__(self) -> None:
+        if self.match not in ("overlap", "aabb", "none"):
+            raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
+        if not 0 <= self.overlap <= 1:
+            raise ValueError(f"overlap: expected 0 to 1, got {self.overlap}")
+        for name in ("neighbors", "cluster_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+
 
 def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Clusters of Feature Gaussians of different views.
 
     The backing layer is left alone. The result does not depend on the order of the Feature Gaussians: leaders are
     taken by weight, ties by position.
-
-    Raises:
-        ValueError: If the method is unknown.
     """
-    if options.match not in ("overlap", "aabb", "none"):
-        raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{options.match}"')
     count = len(features)
     front = torch.nonzero(~features.backing)[:, 0].numpy()
     if options.match == "none" or len(front) < 2 or len(torch.unique(features.views)) < 2:

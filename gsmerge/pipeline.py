@@ -108,7 +108,7 @@ def compact(
     """
     options = (options or CompactOptions()).with_settings(settings)
     run = _Run(progress)
-    with use_threads(options.threads), torch.inference_mode():
+    with use_threads(options.threads), torch.no_grad():
         with run.stage("prepare"):
             canonical, frame = canonicalise(scene)
             members = scene_members(canonical)
@@ -141,6 +141,8 @@ def _merged_features(scene: PixelScene, members: Members, options: CompactOption
     with run.stage("segment"):
         height, width = scene.cameras.height, scene.cameras.width
         count = count_for(options.segment, height, width)
+        if count > height * width:
+            raise ValueError(f"superpixels: expected at most {height * width}, one per pixel, got {count}")
         coarse = min(max(1, round(options.backing.backing * count)), count - 1) if robust else 0
         pictures = scene.images if scene.images is not None else _own_colors(scene)
         groups = segment(pictures, options.segment, count - coarse)

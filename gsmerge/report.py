@@ -41,6 +41,11 @@ def _digest(file: Any) -> str:
     return state.hexdigest()
 
 
+def document_head() -> dict[str, Any]:
+    """What every JSON document starts with."""
+    return {"schema_version": SCHEMA_VERSION, "tool": {"name": "gsmerge", "version": __version__}}
+
+
 def report_document(
     report: Any,
     *,
@@ -71,8 +76,7 @@ def report_document(
     numbers = asdict(report) if is_dataclass(report) and not isinstance(report, type) else dict(report)
     stages = {**seconds_before, **numbers["seconds"], **seconds_after}
     return {
-        "schema_version": SCHEMA_VERSION,
-        "tool": {"name": "gsmerge", "version": __version__},
+        **document_head(),
         "input": {
             "path": os.fspath(input_path),
             "sha256": file_sha256(input_path) if hashed else None,
@@ -147,6 +151,7 @@ def plan_document(
     per_view: int,
     photos: bool,
     threads: int,
+    notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory.
 
@@ -158,6 +163,7 @@ def plan_document(
         per_view: Superpixels per view.
         photos: Whether the scene has photos; robust merging and the colour fit need them.
         threads: Threads that would run.
+        notes: What the reader had to say.
 
     Returns:
         ``schema_version`` 1: the plan; ``estimate`` holds within a factor of about two on a common processor once
@@ -171,8 +177,7 @@ def plan_document(
     work += COST_ROBUST * robust + COST_FIT * (fit != "none")
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
-        "schema_version": SCHEMA_VERSION,
-        "tool": {"name": "gsmerge", "version": __version__},
+        **document_head(),
         "dry_run": True,
         "input": {**files, "num_gaussians": pixels, "num_views": views, "height": height, "width": width},
         "output": {
@@ -187,6 +192,7 @@ def plan_document(
             "memory_bytes": memory,
         },
         "options": dict(options),
+        "notes": list(notes),
     }
 
 
@@ -201,6 +207,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         f" across views: {plan['options']['match']}",
         f"fit          {plan['fit']}",
         f"estimate     about {guess['seconds']:.0f} s, {human_bytes(guess['memory_bytes'])} of memory",
+        *(f"note         {note}" for note in plan["notes"]),
     ]
 
 

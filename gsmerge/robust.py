@@ -34,6 +34,9 @@ class RobustOptions:
         boost: Factor on the optical depth before the other views' photos weigh it down.
         tolerance: Colour error at which a Gaussian keeps half of its boosted optical depth.
         rounds: Times that the weighing looks again.
+
+    Raises:
+        ValueError: If a setting is out of range.
     """
 
     robust: bool = True
@@ -41,6 +44,13 @@ class RobustOptions:
     boost: float = 3.0
     tolerance: float = 0.1
     rounds: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("widen", "boost", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
+        if self.rounds < 1:
+            raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
 
 
 @dataclass(frozen=True)

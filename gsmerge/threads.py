@@ -30,7 +30,15 @@ class _Local(threading.local):
     inside = False  # True on the pool's own threads: they must not wait for a pool
 
 
-_local = _Local()
+class _Libraries:
+    """Threads of torch and OpenCV; their settings are the process's, so all callers share what is remembered."""
+
+    lock = threading.Lock()
+    pools = 0
+    before = (1, 1)  # torch's and OpenCV's threads before the first pool
+
+
+_local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
@@ -57,9 +65,7 @@ def use_threads(count: int | None = None) -> Iterator[int]:
     if _local.pool is not None or _local.inside:
         yield _local.count
         return
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    _hold_libraries()
     _local.pool = ThreadPoolExecutor(count, thread_name_prefix="gsmerge", initializer=_enter_pool)
     _local.count = count
     try:
@@ -67,8 +73,26 @@ def use_threads(count: int | None = None) -> Iterator[int]:
     finally:
         _local.pool.shutdown()
         _local.pool, _local.count = None, 1
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
+        _release_libraries()
+
+
+def _hold_libraries() -> None:
+    """One thread each for torch and OpenCV."""
+    with _libraries.lock:
+        if _libraries.pools == 0:
+            _libraries.before = torch.get_num_threads(), cv2.getNumThreads()
+        _libraries.pools += 1
+        torch.set_num_threads(1)
+        cv2.setNumThreads(1)
+
+
+def _release_libraries() -> None:
+    """Give torch its threads back on this thread, and OpenCV when no caller is left."""
+    with _libraries.lock:
+        _libraries.pools -= 1
+        torch.set_num_threads(_libraries.before[0])
+        if _libraries.pools == 0:
+            cv2.setNumThreads(_libraries.before[1])
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:

@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, say, stage_progress
+from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, default_output
 from gsmerge.cli.settings import superpixels_per_view, told_as_usage
 
@@ -130,8 +130,7 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
     from gsmerge.io import atomic_output
     from gsmerge.report import summary_line, to_json
 
-    for note in document["notes"]:
-        say(note, quiet=quiet or as_json)
+    say_notes(document["notes"], quiet=quiet or as_json)
     if report is not None:
         with atomic_output(report, overwrite=overwrite) as temporary:
             temporary.write_text(to_json(document))
@@ -148,8 +147,8 @@ def _print_plan(
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
-    scene = align_scene(read_ply(files.ply, opacity=opacity), files).scene
-    cameras = scene.cameras
+    loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
+    scene, cameras = loaded.scene, loaded.scene.cameras
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(scene), cameras.height, cameras.width),
@@ -158,6 +157,7 @@ def _print_plan(
         per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height),
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
+        notes=loaded.notes,
     )
     if as_json:
         sys.stdout.write(to_json(document))

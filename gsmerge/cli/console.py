@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
@@ -15,6 +15,12 @@ def say(message: str, *, quiet: bool = False) -> None:
     """Print one status line on stderr unless ``quiet``."""
     if not quiet:
         print(message, file=sys.stderr, flush=True)
+
+
+def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
+    """Print what the reader or the work had to say, a line each, unless ``quiet``."""
+    for note in notes:
+        say(f"note: {note}", quiet=quiet)
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

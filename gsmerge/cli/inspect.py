@@ -11,15 +11,17 @@ def inspect(
     scene: opt.SceneArgument,
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
+    opacity: opt.OpacityOption = opt.Opacity.auto,
     json: opt.JsonOption = False,
+    quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
     """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
     from gsmerge.inspect import inspect as inspect_scene
-    from gsmerge.report import inspection_lines, to_json
+    from gsmerge.report import document_head, inspection_lines, to_json
 
-    found = inspect_scene(scene, cameras=cameras, images=images).to_dict()
+    found = inspect_scene(scene, cameras=cameras, images=images, opacity=opacity.value).to_dict()
     if json:
-        sys.stdout.write(to_json(found))
-    else:
+        sys.stdout.write(to_json({**document_head(), **found}))
+    elif not quiet:
         print("\n".join(inspection_lines(found)))

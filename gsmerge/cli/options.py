@@ -142,7 +142,7 @@ SeedOption = Annotated[
 ]
 ReportOption = Annotated[Path | None, typer.Option(help="Write the JSON report to this file.", rich_help_panel=OUTPUT)]
 DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Print plan, time and memory; write nothing.", rich_help_panel=OUTPUT)
+    bool, typer.Option("--dry-run", help="Print what would be done; write nothing.", rich_help_panel=OUTPUT)
 ]
 ThreadsOption = Annotated[
     int | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,19 +35,24 @@ def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
 
 
 def check_folder(folder: Path, *, overwrite: bool) -> None:
-    """Make an output folder; refuse one that holds files unless ``overwrite``.
+    """Refuse an output folder that holds files, unless ``overwrite``, or that cannot be made or written.
+
+    It is made with the first file that goes into it, so that a run that fails before leaves none.
 
     Raises:
         UsageError: If the folder holds files and ``overwrite`` is False.
-        SceneError: If it cannot be made or is a file.
+        SceneError: If it cannot be made or written, or is a file.
     """
-    if folder.exists() and not folder.is_dir():
-        raise SceneError(folder, "expected a folder to write pictures to, found a file", "name another with --output")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        occupied = next(folder.iterdir(), None) is not None
+        there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+        if not there.is_dir():
+            problem = f"expected a folder to write pictures to, found the file {there}"
+            raise SceneError(folder, problem, "name another with --output")
+        occupied = there == folder and next(folder.iterdir(), None) is not None
     except OSError as error:
-        raise SceneError(folder, f"cannot be written ({error.strerror})", "name another with --output") from error
+        raise SceneError(folder, f"cannot be read ({error.strerror})", "name another with --output") from error
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise SceneError(folder, f"cannot be written: no permission for {there}", "name another with --output")
     if occupied and not overwrite:
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")
 

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, say
+from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import cameras_of, check_output
-from gsmerge.cli.pictures import write_picture
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gsmerge.io import CameraFile, SceneFiles
+from gsmerge.cli.pictures import tell_pictures, write_picture
 
 
 def preview(
@@ -27,30 +22,35 @@ def preview(
     opacity: opt.OpacityOption = opt.Opacity.auto,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
+    json: opt.JsonOption = False,
+    dry_run: opt.DryRunOption = False,
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
     check_output(output, tuple(scenes), overwrite=overwrite)
-    from gsmerge.io import find_scene_files, read_ply, to_cameras
-    from gsmerge.preview import contact_sheet
+    from gsmerge.io import find_scene_files, ply_notes, read_photos, read_ply, to_cameras
+    from gsmerge.preview import contact_sheet, pick_views
     from gsmerge.threads import use_threads
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     camera_file = cameras_of(files)
-    photos = _photos(files, camera_file)
+    photos = read_photos(files, camera_file)
     size = None if photos is None else (photos.shape[2], photos.shape[1])
-    parts = [(path.name, read_ply(path, opacity=opacity.value).gaussians) for path in scenes]
-    with use_threads(threads), announce_compilation(quiet=quiet):
-        sheet = contact_sheet(parts, to_cameras(camera_file, size), photos, most_views=views)
-    write_picture(output, sheet, overwrite=overwrite)
-    say(f"{output}: {sheet.shape[1]} x {sheet.shape[0]} pixels", quiet=quiet)
-
-
-def _photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
-    """``[c,h,w,3]`` from the folder or the cameras' own file; None where there are none."""
-    from gsmerge.io.images import as_tensor, read_images
-
-    if files.images is not None and files.images.is_dir():
-        return read_images(files.images, camera_file.names)
-    return None if camera_file.images is None else as_tensor(camera_file.images)
+    plys = [read_ply(path, opacity=opacity.value) for path in scenes]
+    notes = [f"{path}: {note}" for path, ply in zip(scenes, plys, strict=True) for note in ply_notes(ply.info)]
+    say_notes(notes, quiet=quiet or json)
+    if not dry_run:
+        parts = [(path.name, ply.gaussians) for path, ply in zip(scenes, plys, strict=True)]
+        with use_threads(threads), announce_compilation(quiet=quiet or json):
+            sheet = contact_sheet(parts, to_cameras(camera_file, size), photos, most_views=views)
+        write_picture(output, sheet, overwrite=overwrite)
+    ids = pick_views(len(camera_file), views)
+    facts = {
+        "scenes": {str(path): ply.info.count for path, ply in zip(scenes, plys, strict=True)},
+        "views": ids,
+        "photos": photos is not None,
+        "notes": notes,
+    }
+    line = f"{len(scenes)} scene(s) from {len(ids)} views"
+    tell_pictures(output, [output], facts, line, dry_run=dry_run, as_json=json, quiet=quiet)

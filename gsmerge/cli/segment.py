@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, say
+from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import check_folder
-from gsmerge.cli.pictures import write_picture
+from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 from gsmerge.cli.settings import superpixels_per_view, told_as_usage
+
+if TYPE_CHECKING:
+    from gsmerge.segment import SegmentOptions
+    from gsmerge.types import PixelScene
+
+KINDS = ("borders", "means", "saliency")
 
 
 def segment(
@@ -25,36 +32,51 @@ def segment(
     preset: opt.PresetOption = None,
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
+    opacity: opt.OpacityOption = opt.Opacity.auto,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
+    json: opt.JsonOption = False,
+    dry_run: opt.DryRunOption = False,
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
     check_folder(output, overwrite=overwrite)
-    from gsmerge import preview
-    from gsmerge.io import read_scene
-    from gsmerge.segment import SegmentOptions, saliency
-    from gsmerge.segment import segment as segment_images
+    from gsmerge.io import load_scene
+    from gsmerge.segment import SegmentOptions
     from gsmerge.threads import use_threads
 
     chosen: dict[str, Any] = {"superpixels": superpixels, "density": density}
     chosen |= {"method": method and method.value, "preset": preset and preset.value}
     with told_as_usage():
         options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
-    pixel_scene = read_scene(scene, cameras=cameras, images=images)
-    superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
-    pictures = preview.view_pictures(pixel_scene)
-    with use_threads(threads), announce_compilation(quiet=quiet):
-        groups = segment_images(pictures, options)
-    for view, name in enumerate(pixel_scene.names):
-        image, labels = pictures[view], groups.labels[view]
-        drawn = {
-            "borders": preview.draw_borders(image, labels),
-            "means": preview.draw_means(image, labels),
-            "saliency": preview.draw_heat(saliency(image)),
-        }
-        for kind, picture in drawn.items():
-            write_picture(output / f"{Path(name).stem}.{kind}.png", picture, overwrite=overwrite)
-    counts = groups.counts
-    say(f"{output}: {3 * len(counts)} pictures, {min(counts)} to {max(counts)} superpixels per view", quiet=quiet)
+    loaded = load_scene(scene, cameras=cameras, images=images, opacity=opacity.value)
+    pixel_scene = loaded.scene
+    per_view = superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
+    say_notes(loaded.notes, quiet=quiet or json)
+    stems = picture_stems(pixel_scene.names)
+    pictures = [output / f"{stem}.{kind}.png" for stem in stems for kind in KINDS]
+    counts: Sequence[int] = [per_view] * len(stems)
+    if not dry_run:
+        with use_threads(threads), announce_compilation(quiet=quiet or json):
+            counts = _write_overlays(pixel_scene, options, pictures, overwrite=overwrite)
+    facts = {"superpixels": counts, "options": vars(options), "notes": loaded.notes}
+    line = f"{len(pictures)} pictures, {min(counts)} to {max(counts)} superpixels per view"
+    tell_pictures(output, pictures, facts, line, dry_run=dry_run, as_json=json, quiet=quiet)
+
+
+def _write_overlays(
+    scene: PixelScene, options: SegmentOptions, pictures: Sequence[Path], *, overwrite: bool
+) -> Sequence[int]:
+    """Segment and draw; returns the number of superpixels of every view."""
+    from gsmerge.preview import draw_borders, draw_heat, draw_means, view_pictures
+    from gsmerge.segment import saliency
+    from gsmerge.segment import segment as segment_images
+
+    images = view_pictures(scene)
+    groups = segment_images(images, options)
+    paths = iter(pictures)
+    for image, labels in zip(images, groups.labels, strict=True):
+        for drawn in (draw_borders(image, labels), draw_means(image, labels), draw_heat(saliency(image))):
+            write_picture(next(paths), drawn, overwrite=overwrite)
+    return groups.counts

@@ -4,7 +4,7 @@ from gsmerge.io.alignment import Alignment, check_alignment
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
 from gsmerge.io.images import read_images
-from gsmerge.io.ply import PlyInfo, PlyScene, read_ply
+from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.ply_writer import write_ply
 from gsmerge.io.scene import SceneLoad, align_scene, load_scene, read_photos, read_scene
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
@@ -21,6 +21,7 @@ __all__ = [
     "check_alignment",
     "find_scene_files",
     "load_scene",
+    "ply_notes",
     "read_cameras",
     "read_images",
     "read_photos",

@@ -69,7 +69,9 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
     missing = [name for name, f in zip(names, found, strict=True) if f is None]
     if missing:
         raise SceneError(
-            root, f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing[0]}"
+            root,
+            f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing[0]}",
+            "add what is missing, or name the right folder with --images",
         )
     matched = [f for f in found if f is not None]
     if len(set(matched)) < len(matched):
@@ -139,5 +141,5 @@ def _decode(path: Path) -> np.ndarray:
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(data, flags) if len(data) else None
     if image is None:
-        raise SceneError(path, "expected an image, found a file that cannot be decoded")
+        raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)

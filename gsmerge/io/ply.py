@@ -49,6 +49,7 @@ class PlyInfo:
         extra_elements: Elements beside ``vertex``.
         sh_degree: 0 to 4.
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
+        opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
         num_nonfinite: Rows with NaN or inf, set aside.
         num_clipped_scales: Gaussians with a log scale beyond +-30, clipped.
         num_zero_quats: Gaussians without a rotation, taken as the identity.
@@ -65,6 +66,7 @@ class PlyInfo:
     extra_elements: tuple[str, ...]
     sh_degree: int
     opacity_encoding: str
+    opacity_guessed: bool
     num_nonfinite: int
     num_clipped_scales: int
     num_zero_quats: int
@@ -84,6 +86,18 @@ class PlyScene:
     gaussians: Gaussians
     valid: torch.Tensor
     info: PlyInfo
+
+
+def ply_notes(info: PlyInfo) -> tuple[str, ...]:
+    """What was adapted or looks odd in a PLY file, one sentence each, without a full stop."""
+    counted = {
+        "row(s) with NaN or inf, set aside": info.num_nonfinite,
+        "Gaussian(s) with extreme scales, clipped": info.num_clipped_scales,
+        "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
+    }
+    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
+    notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
+    return (*notes, *(f"{count:,} {what}" for what, count in counted.items() if count))
 
 
 def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
@@ -111,7 +125,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
     done = parallel_map(lambda block: _convert(rows[block], {k: v[block] for k, v in out.items()}), blocks)
 
-    encoding = _encoding(opacity, data, done)
+    named = _named_encoding(opacity, data)
+    encoding = named or _likely_encoding(done)
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _set_aside(path, out)
     used = {*REQUIRED, *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
@@ -128,6 +143,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
+        opacity_guessed=named is None,
         num_nonfinite=num_bad,
         num_clipped_scales=sum(d.num_clipped for d in done),
         num_zero_quats=sum(d.num_zero_quats for d in done),
@@ -143,7 +159,9 @@ def _open(path: Path) -> PlyData:
         with path.open("rb") as file:
             start = file.read(4)
         if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
-            raise SceneError(path, "expected a PLY file, found one that does not start with the line 'ply'")
+            raise SceneError(
+                path, "expected a PLY file, found one that does not start with the line 'ply'", "name the .ply"
+            )
         return PlyData.read(str(path), mmap="r")
     except FileNotFoundError as error:
         raise SceneError(path, "no such file") from error
@@ -153,7 +171,9 @@ def _open(path: Path) -> PlyData:
         element, row = error.element, error.row
         promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
         raise SceneError(
-            path, f"truncated or damaged: expected {promise}, found {row or 0} whole ones ({error.message})"
+            path,
+            f"truncated or damaged: expected {promise}, found {row or 0} whole ones ({error.message})",
+            "copy or export it again",
         ) from error
     except (PlyParseError, ValueError, MemoryError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
@@ -279,12 +299,15 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
-def _encoding(opacity: str, data: PlyData, done: list[_Converted]) -> str:
+def _named_encoding(opacity: str, data: PlyData) -> str | None:
+    """The encoding that the caller or the file's own comment names."""
     if opacity != "auto":
         return opacity
     comments = [*data.comments, *(c for e in data.elements for c in e.comments)]
-    if LOGIT_COMMENT in comments:
-        return "logit"
+    return "logit" if LOGIT_COMMENT in comments else None
+
+
+def _likely_encoding(done: list[_Converted]) -> str:
     finite = any(d.any_finite_opacity for d in done)
     return "raw" if finite and all(d.unit_opacities for d in done) else "logit"
 

@@ -15,7 +15,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
 from gsmerge.io.cameras.da3 import read_da3
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
 from gsmerge.io.images import as_tensor, find_image, natural_key, read_images
-from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, read_ply
+from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.types import Cameras, PixelScene
 
@@ -112,7 +112,7 @@ def align_scene(ply: PlyScene, files: SceneFiles, camera_file: CameraFile | None
     valid = ply.valid.reshape(len(cameras), cameras.height, cameras.width)
     scene = PixelScene(ply.gaussians, cameras, images, valid, camera_file.names)
     notes += _colour_notes(scene)
-    return SceneLoad(scene, ply.info, files, camera_file, alignment, tuple(notes))
+    return SceneLoad(scene, ply.info, files, camera_file, alignment, (*ply_notes(ply.info), *notes))
 
 
 def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
@@ -214,8 +214,8 @@ def _misaligned(ply: PlyScene, camera_file: CameraFile, cameras: Cameras, alignm
         f"found a median of up to {worst:.1f} px and {100 * alignment.share_in_front:.0f} % in front of their camera"
     )
     reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
-    remedy = reason or "no other convention fits either: give the cameras that belong to the .ply"
-    return SceneError(camera_file.path, measured, remedy)
+    unknown = "no other convention fits either: give the cameras that belong to the .ply"
+    return SceneError(camera_file.path, measured, f"{reason}: convert one to the other" if reason else unknown)
 
 
 def _colour_notes(scene: PixelScene) -> list[str]:

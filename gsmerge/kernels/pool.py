@@ -50,7 +50,7 @@ def _member_caps(ids, scales, footprints, caps, scratch):
         scratch[j] = extent
         caps[j] = extent
     scratch[:n].sort()
-    limit = CAP * scratch[n // 2]
+    limit = CAP * scratch[(n - 1) // 2]  # of two, the smaller one
     for j in range(n):
         caps[j] = limit / caps[j] if caps[j] > limit else 1.0
 

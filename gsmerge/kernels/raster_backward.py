@@ -13,23 +13,30 @@ and are then added up in the order of the lists: nothing is shared between threa
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
+from gsmerge.kernels.lanes import FLOAT, LANES, VECTOR, Lanes, load, stopped, store, total, totals, vector
 from gsmerge.kernels.prefetch import prefetch_row
-from gsmerge.kernels.project import TILE
+from gsmerge.kernels.project import LN_CUT, TILE
 from gsmerge.kernels.raster import (
     BATCH,
+    E0,
+    E1,
+    E2,
+    E3,
+    E4,
+    E5,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     P1,
-    P2,
-    P3,
-    P4,
-    P5,
     PLANE,
-    _alpha,
     _gather,
     _live_rows,
     _open_tile,
@@ -38,48 +45,78 @@ from gsmerge.kernels.raster import (
 # Numbers per Gaussian: the sums of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy, where x, y
 # is the pixel less the Gaussian's mean.
 SUMS = 9
-P6 = np.uint64(6 * PLANE)
+STATE = 5 * PLANE  # transmittance, rest, gradient of the colour (3)
 
 
-@kernel
-def _walk_back(state, batch, j, y0, y1, slots, row):
-    """Take one Gaussian off the pixels of rows y0 to y1 and sum up what they want of it."""
-    mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-    red, green, blue = batch[j, 8], batch[j, 9], batch[j, 10]
-    s0, s1, s2, s3, s4 = f4(0.0), f4(0.0), f4(0.0), f4(0.0), f4(0.0)
-    s5, s6, s7, s8 = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
-    first = np.uint64(y0 * TILE)
-    for lane in range((y1 - y0 + 1) * TILE):
-        i = first + np.uint64(lane)
-        dx, dy = state[i + P5] - mx, state[i + P6] - my
-        d = rate * (dx - slope * dy)
-        a = _alpha(lnop - decay * dy * dy - d * d)
-        t = state[i]
-        w = a * t
-        left = t - w
-        stop = left <= MIN_TRANSMITTANCE
-        w = f4(0.0) if stop else w
-        state[i] = -abs(t) if stop else left
-        g0, g1, g2 = state[i + P2], state[i + P3], state[i + P4]
-        own = w * (red * g0 + green * g1 + blue * g2)
-        rest = state[i + P1] - own
-        state[i + P1] = rest
-        v = own - a * rest / (f4(1.0) - a)
-        v = v if a < MAX_ALPHA else f4(0.0)
-        v = f4(0.0) if stop else v
-        s0 += w * g0
-        s1 += w * g1
-        s2 += w * g2
-        vx, vy = v * dx, v * dy
-        s3 += v
-        s4 += vx
-        s5 += vy
-        s6 += vx * dx
-        s7 += vx * dy
-        s8 += vy * dy
-    slots[row, 0], slots[row, 1], slots[row, 2] = s0, s1, s2
-    slots[row, 3], slots[row, 4], slots[row, 5] = s3, s4, s5
-    slots[row, 6], slots[row, 7], slots[row, 8] = s6, s7, s8
+def _alpha_lanes(p: Lanes) -> Lanes:
+    """As :func:`gsmerge.kernels.raster._alpha`, but neither clamped nor cut."""
+    e = E0 + p * (E1 + p * (E2 + p * (E3 + p * (E4 + p * E5))))
+    e = e * e
+    e = e * e
+    return e * e
+
+
+@intrinsic
+def _walk_back(typing_context: Any, state: Any, batch: Any, j: Any, y0: Any, y1: Any, slots: Any, row: Any) -> Any:
+    """Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it to a row of slots."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def address(position: int, *indices: Any) -> Any:
+            kind = signature.args[position]
+            array = context.make_array(kind)(context, builder, arguments[position])
+            return cgutils.get_item_pointer(context, builder, kind, array, indices, wraparound=False)
+
+        def index(number: int) -> Any:
+            return context.get_constant(types.intp, number)
+
+        first, last, member, slot = (
+            context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (3, 4, 2, 6)
+        )
+        mx, my, rate, slope, decay, lnop, _, _, red, green, blue = (
+            Lanes(builder, builder.load(address(1, member, index(q)))) for q in range(11)
+        )
+        columns = vector(builder, range(LANES))
+        stretched = rate * columns
+        names = ("red", "green", "blue", "v", "vy", "vyy")
+        sums = {name: cgutils.alloca_once(builder, VECTOR) for name in names}
+        for pointer in sums.values():
+            builder.store(ir.Constant(VECTOR, [0.0] * LANES), pointer)
+
+        with cgutils.for_range_slice(
+            builder, first, builder.add(last, index(1)), index(1), first.type, inc=True
+        ) as (y, _):
+            dy = Lanes(builder, builder.sitofp(y, FLOAT)) - my
+            start = builder.mul(y, index(TILE))
+            planes = [address(0, builder.add(start, index(PLANE * plane))) for plane in range(5)]
+            t, rest, *g = (load(builder, plane) for plane in planes)
+            d = stretched - rate * (mx + slope * dy)
+            p = (lnop - decay * dy * dy) - d * d
+            a = _alpha_lanes(p)
+            free = a.compare("<", MAX_ALPHA)
+            a = a.where(free, MAX_ALPHA)
+            a = a.where(p.compare(">=", LN_CUT), 0.0)
+            w = a * t
+            left = t - w
+            goes = left.compare(">", MIN_TRANSMITTANCE)
+            w = w.where(goes, 0.0)
+            store(left.where(goes, stopped(t)), planes[0])
+            own = w * (red * g[0] + green * g[1] + blue * g[2])
+            rest = rest - own
+            store(rest, planes[1])
+            v = own - a * rest / (1.0 - a)
+            v = v.where(builder.and_(free, goes), 0.0)
+            vy = v * dy
+            for name, lanes in zip(names, (w * g[0], w * g[1], w * g[2], v, vy, vy * dy), strict=True):
+                builder.store((Lanes(builder, builder.load(sums[name])) + lanes).value, sums[name])
+
+        red, green, blue, v, vy, vyy = (Lanes(builder, builder.load(sums[name])) for name in names)
+        dx = columns - mx
+        vx = v * dx
+        store(totals([red, green, blue, v, vx, vy, vx * dx, vy * dx]), address(5, slot, index(0)))
+        builder.store(total(vyy).value, address(5, slot, index(8)))
+        return context.get_dummy_value()
+
+    return types.void(state, batch, j, y0, y1, slots, row), generate
 
 
 @kernel
@@ -103,16 +140,12 @@ def blend_backward(
         slots: ``[intersections,SUMS]`` float32, written in the tiles' part.
     """
     height, width = transmittance.shape
-    state = np.empty(7 * PLANE, np.float32)
+    state = np.empty(STATE, np.float32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(first, last):
         left, top = tile % columns * TILE, tile // columns * TILE
         num_x, num_y = min(TILE, width - left), min(TILE, height - top)
         _open_tile(state, num_x, num_y)
-        for y in range(TILE):
-            for x in range(TILE):
-                i = np.uint64(y * TILE + x)
-                state[i + P5], state[i + P6] = f4(x), f4(y)
         for y in range(num_y):
             for x in range(num_x):
                 i = np.uint64(y * TILE + x)

@@ -14,14 +14,17 @@ used. Results do not depend on the number of threads.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsmerge.kernels import project_backward, raster_backward
-from gsmerge.render.blend import _tile_ranges, view_colors
+from gsmerge.kernels import harmonics_backward, project_backward, raster_backward
+from gsmerge.render.blend import view_colors
 from gsmerge.render.plan import Array, Splats, ViewPlan, _camera, pieces, plan_view
 from gsmerge.threads import parallel_map, use_threads
+
+WORTH = 1 << 12  # intersections that are worth handing to another thread: walking back takes longer than blending
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,23 @@ class Gradients:
     viewmat: Array | None
 
 
+@dataclass(frozen=True, eq=False)
+class ColorGradients:
+    """Gradients of a loss through the colours that the Gaussians of a plan show its view.
+
+    Args:
+        ids: ``[m]`` int32, ascending: the Gaussians that the rows belong to; all others have none.
+        sh0: ``[m,1,3]`` float32.
+        shN: ``[m,k-1,3]`` float32.
+        means: ``[m,3]`` float32, through the viewing direction alone.
+    """
+
+    ids: Array
+    sh0: Array
+    shN: Array
+    means: Array
+
+
 def plan_differentiable(
     splats: Splats,
     viewmat: ArrayLike,
@@ -81,7 +101,7 @@ def plan_differentiable(
         splats, viewmat, K, width, height,
         eps2d=eps2d, antialiased=antialiased, near=near, far=far, opacities=opacities, keep=keep,
     )  # fmt: skip
-    world = np.array(viewmat, np.float64)
+    world = np.asarray(viewmat, np.float64)
     local = world.copy()
     local[:3, 3] += local[:3, :3] @ splats.origin
     drawn = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
@@ -93,6 +113,15 @@ def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
     return np.ascontiguousarray(array, np.float32)
+
+
+def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
+    """Ranges of tiles with about equally many intersections, some per thread."""
+    count = len(plan.members)
+    num = 1 if threads == 1 else max(1, min(4 * threads, count // WORTH))
+    cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
+    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
+    return list(pairwise(edges.tolist()))
 
 
 def _sums(
@@ -115,6 +144,42 @@ def _sums(
             pieces(len(plan.ids), threads),
         )
     return sums
+
+
+def gradients_of(
+    plan: DifferentiablePlan,
+    colors: Array,
+    image: Array,
+    transmittance: Array,
+    grad_image: Array,
+    grad_left: Array,
+    with_viewmat: bool,
+) -> Gradients:
+    """:func:`plan_gradients` of contiguous float32 arrays, unchecked; colours ``[m,3]`` of the plan's Gaussians."""
+    m = len(plan.ids)
+    sums = _sums(plan, colors, image, transmittance, grad_image, grad_left)
+    means, quats, scales = np.empty((m, 3), np.float32), np.empty((m, 4), np.float32), np.empty((m, 3), np.float32)
+    opacities, block = np.empty(m, np.float32), project_backward.BLOCK
+    poses = np.empty((-(-m // block) if with_viewmat else 0, project_backward.POSE), np.float32)
+    splats = plan.splats
+
+    def project(span: tuple[int, int]) -> None:
+        project_backward.project_backward(
+            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera,
+            span[0] * block, min(m, span[1] * block), means, quats, scales, opacities, poses,
+        )  # fmt: skip
+
+    with use_threads() as threads:
+        num_blocks = -(-m // block)
+        num = len(pieces(m, threads))
+        parallel_map(project, [(num_blocks * i // num, num_blocks * (i + 1) // num) for i in range(num)])
+    viewmat = None
+    if with_viewmat:
+        pose = poses.sum(0, dtype=np.float64)
+        viewmat = np.zeros((4, 4))
+        viewmat[:3, 3] = pose[9:]
+        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
+    return Gradients(plan.ids, means, quats, scales, opacities, sums[:, :3], viewmat)
 
 
 def plan_gradients(
@@ -145,36 +210,41 @@ def plan_gradients(
     Raises:
         ValueError: If an array has another shape.
     """
-    size, m = (plan.height, plan.width), len(plan.ids)
+    size = plan.height, plan.width
     grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
     transmittance = _expect("transmittance", transmittance, size)
     left = np.empty((0, 0), np.float32)
     if grad_transmittance is not None:
         left = _expect("grad_transmittance", grad_transmittance, size)
-    if colors is None:
-        drawn = view_colors(plan)
-    else:
-        drawn = _expect("colors", colors, (len(plan.splats), 3))[plan.ids]
-    sums = _sums(plan, drawn, image, transmittance, grad_image, left)
-    means, quats, scales = np.empty((m, 3), np.float32), np.empty((m, 4), np.float32), np.empty((m, 3), np.float32)
-    opacities, block = np.empty(m, np.float32), project_backward.BLOCK
-    poses = np.empty((-(-m // block) if with_viewmat else 0, project_backward.POSE), np.float32)
-    splats = plan.splats
+    drawn = view_colors(plan) if colors is None else _expect("colors", colors, (len(plan.splats), 3))[plan.ids]
+    return gradients_of(plan, drawn, image, transmittance, grad_image, left, with_viewmat)
 
-    def project(span: tuple[int, int]) -> None:
-        project_backward.project_backward(
-            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera,
-            span[0] * block, min(m, span[1] * block), means, quats, scales, opacities, poses,
-        )  # fmt: skip
 
+def color_gradients(plan: ViewPlan, grad_colors: Array, colors: Array | None = None) -> ColorGradients:
+    """Gradients of a loss on the colours that the spherical harmonics of a plan's Gaussians give in its view.
+
+    Args:
+        plan: The view.
+        grad_colors: ``[m,3]``, such as :attr:`Gradients.colors`.
+        colors: ``[m,3]`` float32, the colours themselves, where they are at hand. Where they are cut at 0 no gradient
+            passes.
+
+    Returns:
+        The gradients; the one of the eye is minus the sum of those of the means.
+
+    Raises:
+        ValueError: If an array has another shape.
+    """
+    m, splats = len(plan.ids), plan.splats
+    grad_colors = _expect("grad_colors", grad_colors, (m, 3))
+    colors = view_colors(plan) if colors is None else _expect("colors", colors, (m, 3))
+    sh0, shN = np.empty((m, 1, 3), np.float32), np.empty((m, *splats.shN.shape[1:]), np.float32)
+    means = np.empty((m, 3), np.float32)
     with use_threads() as threads:
-        num_blocks = -(-m // block)
-        num = len(pieces(m, threads))
-        parallel_map(project, [(num_blocks * i // num, num_blocks * (i + 1) // num) for i in range(num)])
-    viewmat = None
-    if with_viewmat:
-        pose = poses.sum(0, dtype=np.float64)
-        viewmat = np.zeros((4, 4))
-        viewmat[:3, 3] = pose[9:]
-        viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
-    return Gradients(plan.ids, means, quats, scales, opacities, sums[:, :3], viewmat)
+        parallel_map(
+            lambda span: harmonics_backward.view_colors_backward(
+                splats.means, splats.shN, plan.ids, plan.eye, *span, colors, grad_colors, sh0, shN, means
+            ),
+            pieces(m, threads),
+        )
+    return ColorGradients(plan.ids, sh0, shN, means)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.render.blend import background_color, blend, view_colors
-from gsmerge.render.plan import plan_view, prepare
+from gsmerge.render.plan import Array, Splats, ViewPlan, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
@@ -30,6 +30,48 @@ class Rendering:
     depths: Tensor | None
 
 
+def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
+    """Gaussians around the cameras' own centre, and view matrices and intrinsics in float64.
+
+    The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
+    """
+    origin = cameras.centres.detach().double().mean(0).cpu().numpy() if len(cameras) else np.zeros(3)
+    viewmats, Ks = (matrices.detach().double().cpu().numpy() for matrices in (cameras.viewmats, cameras.Ks))
+    return prepare(gaussians, origin), viewmats, Ks
+
+
+def draw_views(
+    plan_one: Callable[[int], ViewPlan], shape: tuple[int, int, int], background: Array, with_depths: bool
+) -> Rendering:
+    """Draw the plans of ``c`` views.
+
+    Args:
+        plan_one: Plans the view of a number.
+        shape: Views, height and width.
+        background: ``[3]`` float32.
+        with_depths: Also draw depths.
+    """
+    images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
+    depths = np.zeros((*shape, 1), np.float32) if with_depths else None
+
+    def one(view: int) -> None:
+        plan = plan_one(view)
+        images[view], transmittance = blend(plan, view_colors(plan), background)
+        alphas[view, ..., 0] = 1 - transmittance
+        if depths is not None:
+            colors = np.repeat(plan.depths[:, None], 3, 1)
+            weighted = blend(plan, colors, np.zeros(3, np.float32))[0][..., :1]
+            np.divide(weighted, alphas[view], out=depths[view], where=alphas[view] > 0)
+
+    if shape[0] == 1:
+        one(0)  # not through the pool, so that the pieces of the one view can share it
+    else:
+        parallel_map(one, range(shape[0]))
+    return Rendering(
+        torch.from_numpy(images), torch.from_numpy(alphas), None if depths is None else torch.from_numpy(depths)
+    )
+
+
 def render(
     gaussians: Gaussians,
     cameras: Cameras,
@@ -41,6 +83,10 @@ def render(
     with_depths: bool = False,
 ) -> Rendering:
     """Render Gaussians into every camera.
+
+    Images and alphas are differentiable with respect to every tensor of the Gaussians and the view matrices, where
+    autograd is on and one of them asks for it; depths and intrinsics are not. No gradient passes where alpha is
+    clamped at 0.99 or a colour at 0.
 
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.
@@ -57,31 +103,20 @@ def render(
     Raises:
         ValueError: If the background or the depth range makes no sense.
     """
-    # Around the cameras' own centre, in float64, so that scenes in geographic coordinates keep their detail.
-    origin = cameras.centres.double().mean(0).cpu().numpy() if len(cameras) else np.zeros(3)
-    splats = prepare(gaussians, origin)
-    viewmats, Ks = cameras.viewmats.double().cpu().numpy(), cameras.Ks.double().cpu().numpy()
-    shape = (len(cameras), cameras.height, cameras.width)
-    images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
-    depths = np.zeros((*shape, 1), np.float32) if with_depths else None
     under = background_color(background)
+    inputs = (*vars(gaussians).values(), cameras.viewmats)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        from gsmerge.render.autograd import render_differentiable  # compiled only for those who train
 
-    def one(view: int) -> None:
-        plan = plan_view(
+        return render_differentiable(
+            gaussians, cameras, under, antialiased=antialiased, near=near, far=far, with_depths=with_depths
+        )
+    splats, viewmats, Ks = prepare_views(gaussians, cameras)
+
+    def plan_one(view: int) -> ViewPlan:
+        return plan_view(
             splats, viewmats[view], Ks[view], cameras.width, cameras.height,
             antialiased=antialiased, near=near, far=far,
         )  # fmt: skip
-        images[view], transmittance = blend(plan, view_colors(plan), under)
-        alphas[view, ..., 0] = 1 - transmittance
-        if depths is not None:
-            colors = np.repeat(plan.depths[:, None], 3, 1)
-            weighted = blend(plan, colors, np.zeros(3, np.float32))[0][..., :1]
-            np.divide(weighted, alphas[view], out=depths[view], where=alphas[view] > 0)
 
-    if len(cameras) == 1:
-        one(0)  # not through the pool, so that the pieces of the one view can share it
-    else:
-        parallel_map(one, range(len(cameras)))
-    return Rendering(
-        torch.from_numpy(images), torch.from_numpy(alphas), None if depths is None else torch.from_numpy(depths)
-    )
+    return draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)

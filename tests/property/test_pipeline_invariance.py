@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -58,6 +59,13 @@ def test_threads_change_no_bit(settings: dict) -> None:
 @pytest.mark.parametrize("settings", CASES, ids=str)
 def test_runs_repeat(settings: dict) -> None:
     assert identical(scenes.compacted(ROOM, **settings).gaussians, scenes.compacted(ROOM, **settings).gaussians)
+
+
+def test_two_runs_at_once_do_not_disturb_each_other() -> None:
+    wanted = [scenes.compacted(ROOM, k=k).gaussians for k in (1, 2)]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda k: scenes.compacted(ROOM, k=k).gaussians, (1, 2)))
+    assert all(identical(a, b) for a, b in zip(wanted, found, strict=True))
 
 
 def test_large_groups_of_tasks_change_no_bit() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from renderer import footprints as project_footprints
@@ -28,7 +30,7 @@ def test_draw_in_matches(pixel: float) -> None:
     depths = np.exp(rng.normal(size=60))
     ids = rng.permutation(50)  # ten members belong to no group
     starts = np.array([0, 1, 3, 3, 20, 50])
-    groups = [ids[a:b] for a, b in zip(starts, starts[1:], strict=False) if b > a]
+    groups = [ids[a:b] for a, b in pairwise(starts) if b > a]
     factors = np.ones(60)
     draw_in(starts, ids, 1 / depths, pixel, factors)
     np.testing.assert_allclose(factors, draw_in_reference(groups, depths, pixel), rtol=1e-12)
@@ -66,7 +68,7 @@ def test_image_extinctions_match() -> None:
     for g in range(3):
         rows = ids[starts[g] : starts[g + 1]]
         extents = scales[rows].max(1).astype(float) / pixels[rows]
-        caps = np.minimum(1, 3 * np.sort(extents)[len(rows) // 2] / extents)
+        caps = np.minimum(1, 3 * np.sort(extents)[(len(rows) - 1) // 2] / extents)
         columns = [means[rows], quats[rows], scales[rows] * caps[:, None]]
         _, covars, _ = project_footprints(
             *(from_numpy(np.asarray(c, float)) for c in columns), from_numpy(viewmat), from_numpy(K), 4000, 4000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix, csgraph
 
 from gsmerge.kernels.cluster import bhattacharyya, box_overlap, connected_components, edge_scores, leader_clusters
 
@@ -160,9 +161,6 @@ def test_leaders_do_not_chain() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_connected_components_match(seed: int) -> None:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse import csgraph
-
     rng = np.random.default_rng(seed)
     n, k = 80, 3
     neighbors, scores = rng.integers(-1, n, (n, k)), rng.uniform(0, 1, (n, k))

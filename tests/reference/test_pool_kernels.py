@@ -22,7 +22,7 @@ def pool_reference(members: dict[str, np.ndarray], rows: list[int], own: bool) -
     weights = opacities if opacities.sum() > 0 else np.ones(len(rows))
     if own:
         extents = scales.max(1) / footprints
-        limit = 3 * np.sort(extents)[len(rows) // 2]
+        limit = 3 * np.sort(extents)[(len(rows) - 1) // 2]
         scales = scales * np.minimum(1, limit / np.maximum(extents, 1e-300))[:, None]
     mean = np.average(means, axis=0, weights=weights)
     covar = np.zeros((3, 3))

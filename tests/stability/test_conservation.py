@@ -14,9 +14,20 @@ from gsmerge import Gaussians, PixelScene
 SCENES = {"wall": scenes.wall, "planes": scenes.two_planes, "room": scenes.room}
 
 
+def build(name: str, noise: float) -> PixelScene:
+    return scenes.make_scene(SCENES[name](), scenes.arc(3, 96, 72), noise=noise)
+
+
 @pytest.fixture(scope="module", params=list(SCENES))
 def scene(request: pytest.FixtureRequest) -> PixelScene:
-    return scenes.make_scene(SCENES[request.param](), scenes.arc(3, 64, 48), noise=0.005)
+    """With the depth noise of a network."""
+    return build(request.param, 0.02)
+
+
+@pytest.fixture(scope="module", params=list(SCENES))
+def clean(request: pytest.FixtureRequest) -> PixelScene:
+    """With hardly any, so that groups are thin."""
+    return build(request.param, 0.005)
 
 
 def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
@@ -46,26 +57,31 @@ def test_more_superpixels_show_more(scene: PixelScene) -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"k": 4}, {"fit": "none"}], ids=str)
 def test_photos_keep_coverage_and_brightness(scene: PixelScene, settings: dict) -> None:
-    """With the choice among merges, within a hundredth; more coverage than the input's holes is no fault."""
+    """With the choice among merges, within a hundredth."""
     before = coverage(scene.gaussians, scene)
     after = coverage(scenes.compacted(scene, density=0.044, **settings).gaussians, scene)
-    assert after[0] > before[0] - 0.01
-    assert after[1] == pytest.approx(before[1], abs=0.02)
+    assert after[0] == pytest.approx(before[0], abs=0.01)
+    assert after[1] == pytest.approx(before[1], abs=0.01)
 
 
-@pytest.mark.parametrize("views", [1, 3])
-def test_plain_merging_keeps_coverage_and_brightness(scene: PixelScene, views: int) -> None:
-    own = scenes.take_views(scene, list(range(views)))
+# One layer of merged Gaussians is not closed: a tile's corners lie 2.4 of its standard deviations away. What is
+# lost of the coverage falls with the number of layers (views) and of children.
+LOSSES = {(1, 1): 0.34, (1, 4): 0.16, (3, 1): 0.23, (3, 4): 0.08}
+
+
+@pytest.mark.parametrize(("views", "k"), list(LOSSES))
+def test_plain_merging_loses_a_known_part_of_coverage(clean: PixelScene, views: int, k: int) -> None:
+    own = scenes.take_views(clean, list(range(views)))
     before = coverage(own.gaussians, own)
-    after = coverage(scenes.plain(own, density=0.044), own)
-    assert after[0] == pytest.approx(before[0], rel=0.01)
-    assert after[1] == pytest.approx(before[1], rel=0.01)
+    after = coverage(scenes.plain(own, density=0.044, k=k), own)
+    for old, new in zip(before, after, strict=True):
+        assert (1 - LOSSES[views, k]) * old < new < 1.01 * old
 
 
-def test_merging_across_views_keeps_coverage(scene: PixelScene) -> None:
+def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
     """A cluster stands for all its members: not thinner than one view alone."""
-    alone = coverage(scenes.plain(scenes.take_views(scene, [0])), scenes.take_views(scene, [0]))
-    together = coverage(scenes.plain(scene), scenes.take_views(scene, [0]))
+    alone = coverage(scenes.plain(scenes.take_views(clean, [0])), scenes.take_views(clean, [0]))
+    together = coverage(scenes.plain(clean), scenes.take_views(clean, [0]))
     assert together[0] >= alone[0] - 0.01
 
 
@@ -82,10 +98,14 @@ def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
 
 
 @pytest.mark.parametrize("match", ["overlap", "none"])
-def test_faint_scenes_keep_their_coverage(scene: PixelScene, match: str) -> None:
-    """Where hardly anything is hidden, integrated optical depth is what is seen."""
-    opacities = 0.01 * torch.ones_like(scene.gaussians.opacities)
-    faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
-    before = coverage(faint.gaussians, faint)[0]
-    after = coverage(scenes.plain(faint, match=match), faint)[0]
+def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None:
+    """Where little is hidden, integrated optical depth is what is seen; in pictures so fine that the low-pass of the
+    renderer, which thickens small Gaussians, does not count."""
+    opacities = 0.05 * torch.ones_like(clean.gaussians.opacities)
+    faint = replace(clean, gaussians=replace(clean.gaussians, opacities=opacities))
+    found = scenes.plain(faint, match=match)
+    Ks = clean.cameras.Ks.clone()
+    Ks[:, :2] *= 4
+    fine = replace(clean.cameras[:1], Ks=Ks[:1], width=4 * clean.cameras.width, height=4 * clean.cameras.height)
+    before, after = (scenes.images_of(g, fine)[1].mean() for g in (faint.gaussians, found))
     assert after == pytest.approx(before, rel=0.1)

@@ -145,3 +145,16 @@ def test_fit_never_hurts_under_wrong_poses(room: PixelScene, degrees: float) -> 
     fit = fitted.report.choices["fit"]
     assert fit["accepted"] == (fit["holdout_after"] > fit["holdout_before"])
     assert fitted.report.psnr_after > unfitted.report.psnr_after - 0.1  # type: ignore[operator]
+
+
+# more views of the same surfaces
+
+
+def test_more_views_do_not_hurt() -> None:
+    """From a place between the views; matching makes one layer of the views' many, and it must still be closed."""
+    between = scenes.make_scene(scenes.room(), scenes.arc(1, 96, 72, start=-0.23))
+    found = []
+    for views in (3, 6):
+        scene = scenes.make_scene(scenes.room(), scenes.arc(views, 96, 72), noise=0.01)
+        found.append(scenes.psnr_of(scenes.compacted(scene, density=0.044).gaussians, between))
+    assert found[1] > found[0] - 0.5

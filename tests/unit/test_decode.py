@@ -98,7 +98,9 @@ def test_merged_features_are_split_again(features: FeatureGaussians, members: Me
 
 @pytest.mark.parametrize("k", [1, 2])
 def test_backing_stays_at_one(features: FeatureGaussians, members: Members, k: int) -> None:
-    behind = replace(features, backing=torch.ones(len(features), dtype=torch.bool), extinctions=2 * features.extinctions)
+    behind = replace(
+        features, backing=torch.ones(len(features), dtype=torch.bool), extinctions=2 * features.extinctions
+    )
     both = FeatureGaussians.concat([features, behind])
     found = decode(both, members, DecodeOptions(k=k, min_opacity=0))
     assert len(found) == 2 * COUNT * (k + 1)
@@ -129,16 +131,6 @@ def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
     found = decode(features, own, DecodeOptions(k=k))
     assert len(found) == COUNT * k
     assert (found.opacities >= 1 / 255).all()
-
-
-@pytest.mark.parametrize("k", [2, 4])
-def test_children_follow_the_paper_rule(scene: PixelScene, members: Members, k: int) -> None:
-    """With the baseline's rule, children too have the spread of their means only and their mean opacity."""
-    assert scene.images is not None
-    features = encode(scene, members, segment(scene.images, SegmentOptions(), COUNT), EncodeOptions("paper"))
-    one, many = (decode(features, members, DecodeOptions(k=count)) for count in (1, k))
-    assert float(one.opacities.mean()) == pytest.approx(float(scene.gaussians.opacities.mean()), abs=0.02)
-    assert float(many.opacities.mean()) == pytest.approx(float(scene.gaussians.opacities.mean()), abs=0.02)
 
 
 @pytest.mark.parametrize("k", [0, -1, 9])

@@ -82,11 +82,16 @@ def test_every_segmentation(scene: PixelScene, method: str) -> None:
     assert len(scenes.compacted(scene, method=method, superpixels=40).gaussians) <= 120
 
 
-def test_paper_rule(scene: PixelScene) -> None:
-    scenes.compacted(scene, rule="paper", match="aabb", robust=False, fit="none")
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_paper_rule(scene: PixelScene, k: int) -> None:
+    """The baseline's Gaussians, children too, have their members' mean opacity."""
+    found = scenes.plain(scene, rule="paper", match="none", k=k).opacities
+    assert float(found.max()) <= float(scene.gaussians.opacities.max()) + 1e-4
+    assert float(found.min()) >= float(scene.gaussians.opacities.min()) - 1e-4
+    scenes.plain(scene, rule="paper", match="aabb", k=k)
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_harmonics_keep_their_degree(degree: int) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     assert scenes.compacted(scene, k=2).gaussians.sh_degree == degree
@@ -110,6 +115,13 @@ def test_result_can_be_used_like_any_tensor(scene: PixelScene) -> None:
         (tensor * torch.ones(1, requires_grad=True)).sum().backward()
 
 
+def test_double_precision_input(scene: PixelScene) -> None:
+    columns = {name: getattr(scene.gaussians, name).double() for name in scenes.FIELDS}
+    assert scene.images is not None
+    doubled = replace(scene, gaussians=replace(scene.gaussians, **columns), images=scene.images.double())
+    scenes.assert_same_set(scenes.compacted(doubled).gaussians, scenes.compacted(scene).gaussians, atol=1e-4)
+
+
 def test_input_is_left_alone(scene: PixelScene) -> None:
     before = [getattr(scene.gaussians, name).clone() for name in scenes.FIELDS]
     assert scene.images is not None
@@ -123,7 +135,7 @@ def test_input_is_left_alone(scene: PixelScene) -> None:
     ("settings", "message"),
     [
         ({"k": 0}, "k: expected 1 to 8, got 0"),
-        ({"superpixels": 32 * 24 + 1}, "expected at most 768 superpixels"),
+        ({"superpixels": 32 * 24 + 1}, "superpixels: expected at most 768"),
         ({"match": "iou"}, "match: expected"),
         ({"kk": 1}, "unknown setting 'kk'"),
         ({"threads": 0}, "expected at least 1 thread"),

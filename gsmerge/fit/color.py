@@ -7,48 +7,19 @@ linear system whose matrix is one splat and one transposed splat; a few precondi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
 
+from gsmerge.fit.options import FitOptions
 from gsmerge.photos import Photos
 from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import SH_C0, Gaussians
 from gsmerge.weights import ViewWeights, apply, apply_transposed, peak_weights, view_weights
 
-Fit = Literal["none", "color"]
 BLOCK = 32  # pixels of the full-size image
 MAX_RETRIES = 2
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """What is fitted to the photos.
-
-    Args:
-        fit: ``"color"``: the base colours; ``"none"``: nothing.
-        fit_level: Photos are reduced by this factor on each side for the fit.
-        iterations: Conjugate-gradient steps.
-        pull: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
-        huber: Colour error beyond which a pixel counts less (moving things, reflections).
-        min_gain: Exposure of a view against the mean, as a factor, from which on it is compensated; smaller
-            differences come from holes and highlights as often as from the camera.
-        max_gain: Largest exposure factor that is believed.
-        holdout: Share of the photos' blocks that decides whether the fit is accepted.
-        prune: Leave out Gaussians that contribute less than this to every pixel of every photo that they lie in.
-    """
-
-    fit: Fit = "color"
-    fit_level: int = 2
-    iterations: int = 6
-    pull: float = 0.03
-    huber: float = 0.2
-    min_gain: float = 1.15
-    max_gain: float = 2.0
-    holdout: float = 0.1
-    prune: float = 1 / 255
 
 
 @dataclass(frozen=True)
@@ -139,10 +110,14 @@ def fit_colors(
 
 
 def _blocks(photos: Photos, view: int, options: FitOptions, seed: int) -> np.ndarray:
-    """``[h,w]`` float32, 0 on the held-out blocks of a view and 1 elsewhere."""
-    size = max(2, round(BLOCK * (photos.eps2d / 0.3) ** 0.5))
+    """``[h,w]`` float32, 0 on the held-out blocks of a view, of which there is at least one, and 1 elsewhere."""
+    size = min(round(BLOCK * (photos.eps2d / 0.3) ** 0.5), min(photos.height, photos.width) // 4)
+    size = max(2, size)
     rows, columns = -(-photos.height // size), -(-photos.width // size)
-    keep = np.random.default_rng([seed, view]).random((rows, columns)) >= options.holdout
+    rng = np.random.default_rng([seed, view])
+    keep = rng.random((rows, columns)) >= options.holdout
+    if keep.all():
+        keep.flat[rng.integers(keep.size)] = False
     full = np.repeat(np.repeat(keep, size, 0), size, 1)[: photos.height, : photos.width]
     return full.astype(np.float32)
 
@@ -253,6 +228,7 @@ def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: 
 
 
 def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> torch.Tensor:
-    """New sh0 within a little more than the range of colours."""
-    color = 0.5 + SH_C0 * gaussians.sh0[:, 0].double().numpy() + offsets
-    return torch.from_numpy((np.clip(color, -0.05, 1.05) - 0.5) / SH_C0).float()[:, None]
+    """New sh0 within a little more than the range of colours, or where they were outside it, no farther out."""
+    before = 0.5 + SH_C0 * gaussians.sh0[:, 0].double().numpy()
+    color = np.clip(before + offsets, np.minimum(before, -0.05), np.maximum(before, 1.05))
+    return torch.from_numpy((color - 0.5) / SH_C0).float()[:, None]

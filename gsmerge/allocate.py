@@ -1,0 +1,365 @@
+"""How many Gaussians to spend, and where: superpixels merged where little is lost, split where much is gained.
+
+Distortion lives in image space: squared colour error plus the squared error of the depth relative to a plane, so
+that a flat wall costs nothing from any angle and far things count no less than near ones. All views of a scene
+share one threshold, so every Gaussian buys about the same.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.io.ply_layout import LOGIT_COMMENT, MEANS, NORMALS, QUATS, SCALES, SH0
+from gsmerge.kernels.allocate import ROW, cut_labels, merge_order, region_sums
+from gsmerge.kernels.bisect import gather_groups, split_errors
+from gsmerge.kernels.regions import pad_labels
+from gsmerge.kernels.ward import adjacent_pairs
+from gsmerge.moments import Members
+from gsmerge.threads import parallel_map
+from gsmerge.types import FeatureGaussians, Groups, PixelScene
+
+PRESETS = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
+SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+DEPTH_RANGE = 1e3  # depths are held within this factor of the view's median
+GROUPS_PER_TASK = 8192
+KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
+
+
+@dataclass(frozen=True)
+class AllocateOptions:
+    """What a good place for a Gaussian is, and when more are not worth it.
+
+    Args:
+        depth_weight: Of squared relative depth errors against squared colour errors (sRGB in [0, 1]).
+        region_compactness: Of squared pixels against squared colours while regions merge; without it they become
+            snakes that no Gaussian fits.
+        max_extent: Largest side of a region, as a share of the image's width: the rasterizer's affine
+            approximation bends larger Gaussians. Exceeded only when the budget leaves no other choice.
+        knee_slope: The automatic count stops where the predicted quality grows by less than this, dB per
+            relative increase of the count (2 means 0.02 dB per 1 % more).
+        knee_floor: Squared error per pixel and channel that no count removes (noise, views that disagree).
+    """
+
+    depth_weight: float = 16.0
+    region_compactness: float = 1e-5
+    max_extent: float = 1 / 8
+    knee_slope: float = 1.0
+    knee_floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("depth_weight", "region_compactness", "knee_slope"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected a number of at least 0, got {getattr(self, name)}")
+        if not self.max_extent > 0:
+            raise ValueError(f"max_extent: expected a positive number, got {self.max_extent}")
+        if not self.knee_floor > 0:
+            raise ValueError(f"knee_floor: expected a positive number, got {self.knee_floor}")
+
+
+@dataclass(frozen=True, eq=False)
+class RegionTree:
+    """The merges of the superpixels of all views, from the finest to one per view, and in which order to make them.
+
+    Args:
+        groups: The superpixels that it starts from.
+        parents: Per view ``[2·leaves-1]`` int32: the region that a region is merged into, -1 for the whole view.
+        order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
+        first: ``[v+1]`` int64, merges in the views before.
+        distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
+    """
+
+    groups: Groups
+    parents: tuple[np.ndarray, ...]
+    order: np.ndarray
+    first: np.ndarray
+    distortions: np.ndarray
+
+    def __len__(self) -> int:
+        """Superpixels at the start."""
+        return len(self.groups)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """``[m+1]`` regions left after the first i merges."""
+        return len(self) - np.arange(len(self.distortions))
+
+
+def pixel_depths(scene: PixelScene) -> Tensor:
+    """``[v,h,w]`` float32 depth of every pixel's Gaussian in its own view, world units."""
+    cameras, means = scene.cameras, scene.gaussians.means
+    height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
+
+    def one_view(view: int) -> Tensor:
+        third = cameras.viewmats[view, 2].to(means.dtype)
+        return (means[view * pixels : (view + 1) * pixels] @ third[:3] + third[3]).float().reshape(height, width)
+
+    return torch.stack(parallel_map(one_view, range(len(scene))))
+
+
+def region_tree(
+    images: Tensor, depths: Tensor, groups: Groups, valid: Tensor, options: AllocateOptions | None = None
+) -> RegionTree:
+    """Merge neighbouring superpixels in order of the distortion that it adds, each view down to a single region.
+
+    Args:
+        images: ``[v,h,w,3]`` float, sRGB in [0, 1].
+        depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 are taken as very near.
+        groups: The superpixels to start from, 4-connected, none empty.
+        valid: ``[v,h,w]`` bool; pixels that do not count. Superpixels without a valid pixel merge first.
+        options: Weights.
+
+    Raises:
+        ValueError: If the shapes do not fit together or a superpixel has no pixel.
+    """
+    options = options or AllocateOptions()
+    _check_pictures(images, depths, groups, valid)
+    extent = max(1.0, options.max_extent * images.shape[2])
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
+        usable = _usable_depths(depths[view].numpy(), valid[view].numpy())
+        labels, count = pad_labels(groups.labels[view].numpy()), groups.counts[view]
+        pixels = np.ascontiguousarray(images[view].numpy(), np.float32)
+        rows = np.empty((2 * count, ROW))
+        weight = options.depth_weight
+        start = region_sums(labels, pixels, usable, count, rows) + weight * float(rows[:count, 15].sum())
+        pairs = adjacent_pairs(labels)
+        return *merge_order(pairs, rows, weight, options.region_compactness, extent), start, int((usable > 0).sum())
+
+    parents, heights, growths, starts, num_pixels = zip(*parallel_map(one_view, range(len(images))), strict=True)
+    first = np.concatenate([[0], np.cumsum([len(h) for h in heights])])
+    # Heights never fall from child to parent and children come first, so a stable sort keeps them in front.
+    order = np.argsort(np.concatenate(heights), kind="stable")
+    added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
+    return RegionTree(groups, parents, order, first, np.cumsum(added) / (3 * max(sum(num_pixels), 1)))
+
+
+def _check_pictures(images: Tensor, depths: Tensor, groups: Groups, valid: Tensor) -> None:
+    shape = list(groups.labels.shape)
+    for name, tensor, want in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
+        if list(tensor.shape) != want:
+            raise ValueError(f"{name}: expected shape {want}, got {list(tensor.shape)}")
+    for view, count in enumerate(groups.counts):
+        sizes = torch.bincount(groups.labels[view].reshape(-1), minlength=count)
+        if len(sizes) > count or int(sizes.min()) < 1:
+            raise ValueError(f"groups: expected {count} superpixels with pixels in view {view}")
+
+
+def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Depths in units of their median, float32; 0 for pixels that do not count."""
+    usable = valid & np.isfinite(depths)
+    middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
+    held = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    return np.where(usable, held, 0).astype(np.float32)
+
+
+def cut_tree(tree: RegionTree, budget: int) -> Groups:
+    """Exactly ``budget`` regions over all views, at least one in each; the superpixels themselves if there are fewer.
+
+    The regions of a smaller budget are unions of those of a larger one.
+
+    Raises:
+        ValueError: If ``budget`` is below the number of views.
+    """
+    num_views = len(tree.parents)
+    if budget < num_views:
+        raise ValueError(f"budget: expected at least {num_views}, one per view, got {budget}")
+    keep = np.zeros(len(tree.order), bool)
+    keep[tree.order[: max(0, len(tree) - budget)]] = True
+
+    def one_view(view: int) -> tuple[Tensor, int]:
+        own = keep[tree.first[view] : tree.first[view + 1]]
+        leaves = tree.groups.counts[view]
+        of_leaf = torch.from_numpy(cut_labels(tree.parents[view], own, leaves))
+        return of_leaf[tree.groups.labels[view].long()], leaves - int(own.sum())
+
+    labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
+    return Groups(torch.stack(labels), counts)
+
+
+def knee(counts: np.ndarray, distortions: np.ndarray, options: AllocateOptions | None = None) -> int:
+    """The count beyond which more Gaussians are not worth it.
+
+    Predicted quality is q(N) = -10 log10(floor + D(N)) dB. The knee is the largest count from whose surroundings
+    (a factor of 1.25) q still grows by ``knee_slope`` dB per relative increase; the least count if there is none.
+
+    Args:
+        counts: ``[m]`` in any order, all different.
+        distortions: ``[m]`` mean squared error per pixel and channel at each count.
+        options: Slope and floor.
+
+    Raises:
+        ValueError: If there is no count.
+    """
+    options = options or AllocateOptions()
+    counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
+    if len(counts) == 0 or counts.shape != distortions.shape:
+        raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
+    order = np.argsort(counts)
+    scale, error = np.log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
+    quality = -10 * np.log10(options.knee_floor + np.maximum(error, 0))
+    before = np.interp(scale - np.log(KNEE_STEP), scale, quality)
+    steep = (quality - before) / np.log(KNEE_STEP) >= max(options.knee_slope, 1e-12)
+    return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])
+
+
+def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
+    """Children of every Feature Gaussian when ``extra`` more Gaussians are spent where they lower distortion most.
+
+    A step that only pays together with the next one is judged by the two together (the convex hull of the
+    group's distortion), so a larger ``extra`` never takes a child away. The backing layer stays at one.
+
+    Args:
+        features: g Feature Gaussians.
+        members: The scene's Gaussians that ``features.members`` points into.
+        extra: Gaussians to add, at least 0.
+        max_children: Most children of one group.
+
+    Returns:
+        ``[g]`` int64, 1 to ``max_children``; their sum is ``g + extra``, or the most that the members give.
+
+    Raises:
+        ValueError: If ``extra`` is negative or ``max_children`` below 1.
+    """
+    if extra < 0:
+        raise ValueError(f"extra: expected at least 0, got {extra}")
+    if max_children < 1:
+        raise ValueError(f"max_children: expected at least 1, got {max_children}")
+    counts = np.ones(len(features), np.int64)
+    front = np.flatnonzero(~features.backing.numpy())
+    if extra == 0 or max_children == 1 or len(front) == 0:
+        return counts
+    gains = _hull_gains(_child_errors(features, members, front, max_children))
+    # Stable, group by group: of equal gains of one group the first step comes first.
+    order = np.argsort(-gains.reshape(-1), kind="stable")
+    chosen = order[: min(extra, int(np.isfinite(gains).sum()))]
+    counts[front] += np.bincount(chosen // gains.shape[1], minlength=len(front))
+    return counts
+
+
+def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarray, max_children: int) -> np.ndarray:
+    """``[f,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
+    starts, ids = features.starts.numpy(), features.members.numpy()
+    centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
+
+    def run(rows: np.ndarray) -> np.ndarray:
+        local, own = gather_groups(starts, ids, rows)
+        m = members
+        return split_errors(local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], max_children)
+
+    tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
+    return np.concatenate(parallel_map(run, tasks))
+
+
+def _hull_gains(errors: np.ndarray) -> np.ndarray:
+    """``[f,c-1]`` gain of each further child along the lower convex hull of the errors; -inf where there is none.
+
+    Falls from child to child: the mean gain up to the farthest point of steepest descent, again and again.
+    """
+    num_groups, num_children = errors.shape
+    gains = np.full((num_groups, num_children - 1), -np.inf)
+    at, rows = np.zeros(num_groups, int), np.arange(num_groups)
+    for _ in range(num_children - 1):
+        steps = np.arange(num_children)[None] - at[:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slopes = np.where(steps > 0, (errors[rows, at][:, None] - errors) / steps, -np.inf)
+        slopes = np.where(np.isnan(slopes), -np.inf, slopes)
+        best = num_children - 1 - np.argmax(slopes[:, ::-1], axis=1)
+        slope = slopes[rows, best]
+        for child in range(1, num_children):
+            fill = np.isfinite(slope) & (child > at) & (child <= best)
+            gains[fill, child - 1] = slope[fill]
+        at = np.where(np.isfinite(slope), best, at)
+    return gains
+
+
+def trim(importance: Tensor | np.ndarray, count: int) -> Tensor:
+    """Indices, rising, of the ``count`` most important Gaussians; of equal ones the first are kept.
+
+    Args:
+        importance: ``[n]``, for instance the summed blending weight over all photos.
+        count: How many to keep; all if there are fewer.
+
+    Raises:
+        ValueError: If ``count`` is negative.
+    """
+    if count < 0:
+        raise ValueError(f"count: expected at least 0, got {count}")
+    values = torch.as_tensor(importance).double().nan_to_num(nan=-torch.inf, neginf=-torch.inf)
+    return torch.sort(torch.argsort(values, descending=True, stable=True)[:count]).values
+
+
+def parse_budget(budget: str | int, num_input: int) -> int:
+    """The number of Gaussians that ``--budget`` asks for: a number, or a share of the input as "2%" (rounded down).
+
+    Never above ``num_input``.
+
+    Raises:
+        ValueError: If it is neither, or not at least one Gaussian.
+
+    Example:
+        >>> parse_budget("40000", 1_000_000), parse_budget("2.5%", 1_000_000)
+        (40000, 25000)
+    """
+    text = str(budget).strip()
+    found = re.fullmatch(r"(\d[\d_]*|\d*\.?\d+\s*%)", text, re.ASCII)
+    if not found:
+        raise ValueError(f'budget: expected a number of Gaussians as "40000" or a share as "2%", got {text!r}')
+    if text.endswith("%"):
+        share = Fraction(text[:-1].strip())
+        if share > 100:
+            raise ValueError(f"budget: expected at most 100%, got {text!r}")
+        count = int(share * num_input / 100)
+    else:
+        count = min(int(text), num_input)
+    if count < 1:
+        raise ValueError(f"budget: expected at least one Gaussian, got {text!r} of {num_input}")
+    return count
+
+
+def parse_bytes(size: str | int) -> int:
+    """The number of bytes of a size as "5MB", "800 KiB" or "5000000".
+
+    Raises:
+        ValueError: If it is none.
+
+    Example:
+        >>> parse_bytes("1.5MB")
+        1500000
+    """
+    text = str(size).strip()
+    found = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]*)", text, re.ASCII)
+    unit = SIZES.get((found[2] or "B").upper()) if found else None
+    if found is None or unit is None:
+        raise ValueError(f'max bytes: expected a size as "5MB" or "800KiB", got {text!r}')
+    return int(Fraction(found[1]) * unit)
+
+
+def file_bytes(count: int, sh_degree: int) -> int:
+    """Size of the ``.ply`` of that many Gaussians, as :func:`gsmerge.io.write_ply` writes it."""
+    num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}", f"element vertex {count}"]
+    header += [*(f"property float {name}" for name in names), "end_header", ""]
+    return len("\n".join(header)) + 4 * len(names) * count
+
+
+def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
+    """Most Gaussians whose ``.ply`` has at most ``max_bytes``.
+
+    Raises:
+        ValueError: If not even one fits, or the degree is not 0 to 4.
+    """
+    if not 0 <= sh_degree <= 4:
+        raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
+    if max_bytes < file_bytes(1, sh_degree):
+        raise ValueError(f"max bytes: expected at least {file_bytes(1, sh_degree)} for one Gaussian, got {max_bytes}")
+    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - file_bytes(1, sh_degree))
+    while file_bytes(count, sh_degree) > max_bytes:  # the count itself stands in the header
+        count -= 1
+    return count

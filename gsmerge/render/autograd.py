@@ -1,0 +1,94 @@
+"""Rendering that autograd can differentiate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gsmerge.render.blend import view_colors
+from gsmerge.render.gradient import DifferentiablePlan, color_gradients, gradients_of, plan_differentiable
+from gsmerge.render.images import Rendering, draw_views, prepare_views
+from gsmerge.render.plan import Array, ViewPlan
+from gsmerge.types import Cameras, Gaussians
+
+
+def _view_gradients(
+    plan: DifferentiablePlan, image: Array, transmittance: Array, grad_image: Array, grad_alpha: Array, pose: bool
+) -> tuple[list[Array], Array | None]:
+    """Gradients of one view's Gaussians, in the order of the fields, and of its view matrix."""
+    colors = view_colors(plan)
+    shape = gradients_of(plan, colors, image, transmittance, grad_image, -grad_alpha, pose)
+    shade = color_gradients(plan, shape.colors, colors)
+    viewmat = shape.viewmat
+    if viewmat is not None:
+        # the eye is -R^T t, and moves against the means
+        eye = -shade.means.sum(0, dtype=np.float64)
+        viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
+        viewmat[:3, 3] -= plan.viewmat[:3, :3] @ eye
+    rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
+    return rows, viewmat
+
+
+class _Render(torch.autograd.Function):
+    """Images and alphas (and depths, without gradient) of the tensors of Gaussians and view matrices."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, cameras: Cameras, background: Array, options: dict[str, Any], with_depths: bool, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        cameras = replace(cameras, viewmats=tensors[-1])
+        splats, viewmats, Ks = prepare_views(Gaussians(*tensors[:-1]), cameras)
+        plans: dict[int, DifferentiablePlan] = {}
+
+        def plan_one(view: int) -> ViewPlan:
+            plans[view] = plan_differentiable(
+                splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options
+            )
+            return plans[view]
+
+        drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
+        ctx.plans = plans
+        # kept through autograd, so that it notices when one of them was overwritten in the meantime
+        ctx.save_for_backward(*tensors, drawn.images, drawn.alphas)
+        if drawn.depths is None:
+            return drawn.images, drawn.alphas
+        ctx.mark_non_differentiable(drawn.depths)
+        return drawn.images, drawn.alphas, drawn.depths
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, *_: Tensor) -> tuple[Any, ...]:
+        *tensors, images, alphas = ctx.saved_tensors
+        lefts = 1 - alphas[..., 0]
+        totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]
+        poses = np.zeros(tensors[-1].shape)
+        for view, plan in sorted(ctx.plans.items()):
+            image, left, grad_image, grad_alpha = (
+                np.ascontiguousarray(tensor.numpy())
+                for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
+            )
+            rows, pose = _view_gradients(plan, image, left, grad_image, grad_alpha, ctx.needs_input_grad[-1])
+            for total, row in zip(totals, rows, strict=True):
+                total[plan.ids] += row
+            if pose is not None:
+                poses[view] = pose
+        gradients = [
+            torch.from_numpy(total).to(tensor.device, tensor.dtype) if wanted else None
+            for total, tensor, wanted in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)
+        ]
+        return None, None, None, None, *gradients
+
+
+def render_differentiable(
+    gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
+) -> Rendering:
+    """:func:`gsmerge.render` with a backward pass; same arguments, but for the checked ``[3]`` background."""
+    tensors = (*vars(gaussians).values(), cameras.viewmats)
+    cameras = replace(cameras, viewmats=cameras.viewmats.detach())
+    drawn = _Render.apply(cameras, background, options, with_depths, *tensors)
+    return Rendering(drawn[0], drawn[1], drawn[2] if with_depths else None)
