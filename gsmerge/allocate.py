@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.io.ply_layout import LOGIT_COMMENT, MEANS, NORMALS, QUATS, SCALES, SH0
-from gsmerge.kernels.allocate import ROW, cut_labels, merge_order, region_sums
+from gsmerge.kernels.allocate import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.bisect import gather_groups, split_errors
 from gsmerge.kernels.regions import pad_labels
 from gsmerge.kernels.ward import adjacent_pairs
@@ -72,6 +72,7 @@ class RegionTree:
         order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
         first: ``[v+1]`` int64, merges in the views before.
         distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
+        least: Fewest regions before any is larger than ``max_extent``.
     """
 
     groups: Groups
@@ -79,6 +80,7 @@ class RegionTree:
     order: np.ndarray
     first: np.ndarray
     distortions: np.ndarray
+    least: int
 
     def __len__(self) -> int:
         """Superpixels at the start."""
@@ -127,16 +129,18 @@ def region_tree(
         pixels = np.ascontiguousarray(images[view].numpy(), np.float32)
         rows = np.empty((2 * count, ROW))
         weight = options.depth_weight
-        start = region_sums(labels, pixels, usable, count, rows) + weight * float(rows[:count, 15].sum())
+        start = region_sums(labels, pixels, usable, count, rows) + weight * float(rows[:count, PLANE_ERROR].sum())
         pairs = adjacent_pairs(labels)
         return *merge_order(pairs, rows, weight, options.region_compactness, extent), start, int((usable > 0).sum())
 
-    parents, heights, growths, starts, num_pixels = zip(*parallel_map(one_view, range(len(images))), strict=True)
-    first = np.concatenate([[0], np.cumsum([len(h) for h in heights])])
+    parents, of_view, growths, starts, num_pixels = zip(*parallel_map(one_view, range(len(images))), strict=True)
+    first, heights = np.concatenate([[0], np.cumsum([len(h) for h in of_view])]), np.concatenate(of_view)
     # Heights never fall from child to parent and children come first, so a stable sort keeps them in front.
-    order = np.argsort(np.concatenate(heights), kind="stable")
+    order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
-    return RegionTree(groups, parents, order, first, np.cumsum(added) / (3 * max(sum(num_pixels), 1)))
+    distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
+    least = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
+    return RegionTree(groups, parents, order, first, distortions, least)
 
 
 def _check_pictures(images: Tensor, depths: Tensor, groups: Groups, valid: Tensor) -> None:
@@ -180,6 +184,12 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 
     labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
     return Groups(torch.stack(labels), counts)
+
+
+def auto_count(tree: RegionTree, options: AllocateOptions | None = None) -> int:
+    """The :func:`knee` of a scene, among the counts that need no region larger than ``max_extent``."""
+    usable = tree.counts >= tree.least
+    return knee(tree.counts[usable], tree.distortions[usable], options)
 
 
 def knee(counts: np.ndarray, distortions: np.ndarray, options: AllocateOptions | None = None) -> int:

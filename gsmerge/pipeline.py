@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from gsmerge.backing import encode_backing
 from gsmerge.canonical import canonicalise
 from gsmerge.decode import decode
 from gsmerge.encode import encode
-from gsmerge.fit import draw, fit_colors, seen
+from gsmerge.fit import fit
 from gsmerge.match import match
 from gsmerge.memory import peak_memory, release_memory
 from gsmerge.merge import merge
@@ -79,6 +79,10 @@ class _Run:
     choices: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    def fit_progress(self, step: int, steps: int, photos: float, held_out: float) -> None:
+        if self.progress:
+            self.progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)
+
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         if self.progress:
@@ -97,7 +101,8 @@ def compact(
     Args:
         scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`.
         options: Settings of all stages; None: the defaults.
-        progress: Called with (stage, stages done, number of stages) as each stage begins.
+        progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
+            the fit with ("fit: ...", step, steps).
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, density=0.01)``.
 
     Returns:
@@ -167,18 +172,15 @@ def _own_colors(scene: PixelScene) -> torch.Tensor:
 
 
 def _fitted(gaussians: Gaussians, scene: PixelScene, options: CompactOptions, run: _Run) -> Gaussians:
-    """Gaussians that no photo shows left out, colours fitted."""
-    photos = scene_photos(scene, options.fit.fit_level)
-    drawn = draw(gaussians, photos)
-    keep = seen(drawn, options.fit.prune)
-    run.choices["pruned"] = int((~keep).sum())
-    if options.fit.fit == "none":
-        return gaussians[keep]
-    gaussians, report = fit_colors(gaussians, drawn, photos, options.fit, options.seed)
-    run.choices["fit"] = report.__dict__
-    if not report.accepted:
-        run.notes.append("the colour fit was not accepted: held-out parts of the photos did not get better")
-    return gaussians[keep]
+    """Gaussians that no photo shows left out, the rest fitted to the photos."""
+    count, photos = len(gaussians), (scene_photos(scene), scene_photos(scene, 2))
+    gaussians, report = fit(gaussians, photos, options.fit, options.seed, run.fit_progress)
+    run.choices["pruned"] = count - len(gaussians)
+    if report:
+        run.choices["fit"] = asdict(report)
+        if not report.accepted:
+            run.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+    return gaussians
 
 
 def input_psnr(gaussians: Gaussians, photos: Photos, near: float) -> float:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
-from gsmerge.cli.paths import check_output, default_output
+from gsmerge.cli.paths import check_output, default_output, input_files
 from gsmerge.cli.settings import superpixels_per_view, told_as_usage
 
 if TYPE_CHECKING:
@@ -49,9 +49,10 @@ def compact(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
-    check_output(out, (files.ply,), overwrite=overwrite)
+    inputs = input_files(files)
+    check_output(out, inputs, overwrite=overwrite)
     if report is not None:
-        check_output(report, (files.ply, out), overwrite=overwrite)
+        check_output(report, (*inputs, out), overwrite=overwrite)
     chosen: dict[str, Any] = {
         "k": k,
         "superpixels": superpixels,

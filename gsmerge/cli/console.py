@@ -61,13 +61,20 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
     if not console.is_terminal:
         yield None
         return
-    columns = TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = (
+        TextColumn("{task.description:>12}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[detail]}"),
+    )
     with Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
 
         def move(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+            name, _, detail = stage.partition(": ")
+            if name not in tasks:
+                tasks[name] = bars.add_task(name, total=total, detail="")
+            bars.update(tasks[name], completed=done, total=total, detail=detail)
 
         yield move

@@ -20,27 +20,49 @@ def default_output(ply: Path) -> Path:
 def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Refuse an output file that is one of the inputs, that exists, or whose folder does not.
 
+    Args:
+        output: The file to write.
+        inputs: Files that are read, and folders of photos: no photo is replaced.
+        overwrite: Whether the file may exist.
+
     Raises:
         UsageError: If the output is an input, or exists and ``overwrite`` is False.
         SceneError: If the output cannot be written.
     """
-    if any(output.resolve() == path.resolve() for path in inputs):
-        raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
+    target = output.resolve()
+    if any(path.resolve() in (target, target.parent if _is_photo(target) else target) for path in inputs):
+        raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if output.exists() and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
     if not output.parent.is_dir():
         raise SceneError(output, f"expected a folder to write to, found no {output.parent}", "make it first")
 
 
-def check_folder(folder: Path, *, overwrite: bool) -> None:
-    """Refuse an output folder that holds files, unless ``overwrite``, or that cannot be made or written.
+def _is_photo(path: Path) -> bool:
+    from gsmerge.io.images import IMAGE_SUFFIXES
+
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.exists()
+
+
+def input_files(files: SceneFiles) -> tuple[Path, ...]:
+    """What is read: Gaussians, cameras, photos."""
+    return tuple(path for path in (files.ply, files.cameras, files.images) if path is not None)
+
+
+def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
+    """Refuse an output folder that holds files, unless ``overwrite``, or the photos, or that cannot be written.
 
     It is made with the first file that goes into it, so that a run that fails before leaves none.
 
+    Args:
+        folder: The folder to write to.
+        inputs: Files and folders that are read.
+        overwrite: Whether there may be files in it.
+
     Raises:
-        UsageError: If the folder holds files and ``overwrite`` is False.
+        UsageError: If the folder is one of the inputs, or holds files and ``overwrite`` is False.
         SceneError: If it cannot be made or written, or is a file.
     """
     try:
@@ -51,6 +73,8 @@ def check_folder(folder: Path, *, overwrite: bool) -> None:
         occupied = there == folder and next(folder.iterdir(), None) is not None
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})", "name another with --output") from error
+    if any(folder.resolve() == path.resolve() for path in inputs):
+        raise UsageError(f"{folder}: expected an output other than the input; name another folder with --output")
     if not os.access(there, os.W_OK | os.X_OK):
         raise SceneError(folder, f"cannot be written: no permission for {there}", "name another with --output")
     if occupied and not overwrite:

@@ -9,7 +9,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import cameras_of, check_output
+from gsmerge.cli.paths import cameras_of, check_output, input_files
 from gsmerge.cli.pictures import tell_pictures, write_picture
 
 
@@ -28,12 +28,12 @@ def preview(
     debug: opt.DebugOption = False,
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
-    check_output(output, tuple(scenes), overwrite=overwrite)
     from gsmerge.io import find_scene_files, ply_notes, read_photos, read_ply, to_cameras
     from gsmerge.preview import contact_sheet, pick_views
     from gsmerge.threads import use_threads
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
+    check_output(output, (*scenes, *input_files(files)), overwrite=overwrite)
     camera_file = cameras_of(files)
     photos = read_photos(files, camera_file)
     size = None if photos is None else (photos.shape[2], photos.shape[1])

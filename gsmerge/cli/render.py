@@ -10,7 +10,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
-from gsmerge.cli.paths import cameras_of, check_folder
+from gsmerge.cli.paths import cameras_of, check_folder, input_files
 from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 
 if TYPE_CHECKING:
@@ -39,10 +39,10 @@ def render(
     debug: opt.DebugOption = False,
 ) -> None:
     """Render a scene from every camera, one PNG each."""
-    check_folder(output, overwrite=overwrite)
     from gsmerge.io import find_scene_files, ply_notes, read_ply, to_cameras
 
     files = find_scene_files(scene, cameras=cameras)
+    check_folder(output, input_files(files), overwrite=overwrite)
     camera_file = cameras_of(files)
     views = to_cameras(camera_file)
     pictures = [output / f"{stem}.png" for stem in picture_stems(camera_file.names)]

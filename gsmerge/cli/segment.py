@@ -10,7 +10,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import check_folder
+from gsmerge.cli.paths import check_folder, input_files
 from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 from gsmerge.cli.settings import superpixels_per_view, told_as_usage
 
@@ -41,8 +41,7 @@ def segment(
     debug: opt.DebugOption = False,
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
-    check_folder(output, overwrite=overwrite)
-    from gsmerge.io import load_scene
+    from gsmerge.io import align_scene, find_scene_files, read_ply
     from gsmerge.segment import SegmentOptions
     from gsmerge.threads import use_threads
 
@@ -50,7 +49,9 @@ def segment(
     chosen |= {"method": method and method.value, "preset": preset and preset.value}
     with told_as_usage():
         options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
-    loaded = load_scene(scene, cameras=cameras, images=images, opacity=opacity.value)
+    files = find_scene_files(scene, cameras=cameras, images=images)
+    check_folder(output, input_files(files), overwrite=overwrite)
+    loaded = align_scene(read_ply(files.ply, opacity=opacity.value), files)
     pixel_scene = loaded.scene
     per_view = superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
     say_notes(loaded.notes, quiet=quiet or json)

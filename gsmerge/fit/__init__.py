@@ -1,6 +1,7 @@
 """gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
 
-from gsmerge.fit.color import Drawn, FitReport, draw, fit_colors, seen
-from gsmerge.fit.options import FitOptions
+from gsmerge.fit.options import Fit, FitOptions, Rates
+from gsmerge.fit.report import FitReport
+from gsmerge.fit.stage import fit
 
-__all__ = ["Drawn", "FitOptions", "FitReport", "draw", "fit_colors", "seen"]
+__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit"]

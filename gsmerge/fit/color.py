@@ -11,25 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from gsmerge.fit.holdout import holdout_psnr, training_weights
 from gsmerge.fit.options import FitOptions
+from gsmerge.fit.report import FitReport
 from gsmerge.photos import Photos
 from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import SH_C0, Gaussians
 from gsmerge.weights import ViewWeights, apply, apply_transposed, peak_weights, view_weights
 
-BLOCK = 32  # pixels of the full-size image
 MAX_RETRIES = 2
-
-
-@dataclass(frozen=True)
-class FitReport:
-    """What the fit did: PSNR (dB) on the held-out blocks with the colours before and after, pull used (0: none)."""
-
-    accepted: bool
-    holdout_before: float
-    holdout_after: float
-    pull: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,44 +86,21 @@ def fit_colors(
     Returns:
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
-    train = [_blocks(photos, view, options, seed) for view in range(len(photos))]
+    train = training_weights(photos, options.holdout, seed)
     plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)))
-    before = _holdout_psnr(plain, train, None)
+    before = holdout_psnr(drawn.images, photos, train)
     pull = options.pull
     for _ in range(1 + MAX_RETRIES):
         system, offsets = _solve(plain, options, pull)
-        after = _holdout_psnr(plain, train, offsets)
+        fitted = parallel_map(lambda view, offsets=offsets: _image(plain, view, offsets), range(len(photos)))
+        after = holdout_psnr(fitted, photos, train)
         if after > before:
             offsets = _finish(system, offsets, options, pull)
-            return replace(gaussians, sh0=_clamped(gaussians, offsets)), FitReport(True, before, after, pull)
+            report = FitReport("color", True, options.iterations, before, after, f"solved with a pull of {pull:g}")
+            return replace(gaussians, sh0=_clamped(gaussians, offsets)), report
         pull *= 8
-    return gaussians, FitReport(False, before, after, 0.0)
-
-
-def _blocks(photos: Photos, view: int, options: FitOptions, seed: int) -> np.ndarray:
-    """``[h,w]`` float32, 0 on the held-out blocks of a view, of which there is at least one, and 1 elsewhere."""
-    size = min(round(BLOCK * (photos.eps2d / 0.3) ** 0.5), min(photos.height, photos.width) // 4)
-    size = max(2, size)
-    rows, columns = -(-photos.height // size), -(-photos.width // size)
-    rng = np.random.default_rng([seed, view])
-    keep = rng.random((rows, columns)) >= options.holdout
-    if keep.all():
-        keep.flat[rng.integers(keep.size)] = False
-    full = np.repeat(np.repeat(keep, size, 0), size, 1)[: photos.height, : photos.width]
-    return full.astype(np.float32)
-
-
-def _holdout_psnr(system: _System, train: list[np.ndarray], offsets: np.ndarray | None) -> float:
-    """PSNR (dB) on the held-out blocks, without any exposure gain: as the result will be looked at."""
-
-    def one_view(view: int) -> tuple[float, float]:
-        image = _image(system, view, offsets)
-        error = ((np.clip(image, 0, 1) - system.photos[view]) ** 2).sum(-1)
-        held = train[view] == 0
-        return float(error[held].sum(dtype=np.float64)), float(held.sum())
-
-    error, count = np.sum(parallel_map(one_view, range(len(system.photos))), axis=0)
-    return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+    report = FitReport("none", False, options.iterations, before, after, "held-out parts of the photos did not improve")
+    return gaussians, report
 
 
 def _solve(plain: _System, options: FitOptions, pull: float) -> tuple[_System, np.ndarray]:

@@ -6,23 +6,31 @@ units of each Gaussian's own size, a box about the start. The number of Gaussian
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 
-from gsmerge.fit.options import FitOptions
+from gsmerge.fit.holdout import holdout_psnr, training_weights
+from gsmerge.fit.loss import image_gradient
+from gsmerge.fit.options import FitOptions, Rates
+from gsmerge.fit.report import FitReport
 from gsmerge.kernels import optimise as kernels
 from gsmerge.photos import Photos
-from gsmerge.render import Splats, composite
+from gsmerge.render import Splats, composite, plan_view
 from gsmerge.render.gradient import plan_differentiable, plan_gradients
 from gsmerge.threads import parallel_map
 from gsmerge.types import SH_C0, Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
-WINDOW = (7, 7)  # of structural similarity
+CHECK = 60  # steps between two looks at the held-out blocks
+FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 100, 0.2
+PROBE = 6  # steps that are timed to spend a time budget
+MAX_STEPS = 2000
+
+Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
 
 
 @dataclass(eq=False)
@@ -46,7 +54,6 @@ class State:
     units: np.ndarray
     splats: Splats
     colors: np.ndarray
-    step: int = 0
 
 
 def start_state(gaussians: Gaussians) -> State:
@@ -60,132 +67,162 @@ def start_state(gaussians: Gaussians) -> State:
     x[:, kernels.QUAT : kernels.LOGIT] = gaussians.quats.numpy()
     x[:, kernels.LOGIT] = np.log(opacities / (1 - opacities))
     x[:, kernels.COLOR :] = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()
-    return state_from(x)
-
-
-def state_from(x: np.ndarray) -> State:
-    """A fresh state at given parameters."""
-    count = len(x)
     sizes = np.sort(x[:, kernels.SIZE : kernels.QUAT], 1)
-    units = np.exp((sizes[:, 1] + sizes[:, 2]) / 2)
     splats = Splats(
         means=np.ascontiguousarray(x[:, :3]),
         quats=np.ascontiguousarray(x[:, kernels.QUAT : kernels.LOGIT]),
         scales=np.exp(x[:, kernels.SIZE : kernels.QUAT]),
         opacities=(1 / (1 + np.exp(-x[:, kernels.LOGIT]))).astype(np.float32),
-        sh0=np.zeros((count, 1, 3), np.float32),
-        shN=np.zeros((count, 0, 3), np.float32),
+        sh0=gaussians.sh0.numpy().copy(),
+        shN=gaussians.shN.numpy(),
         origin=np.zeros(3),
     )
-    colors = np.ascontiguousarray(x[:, kernels.COLOR :])
+    units, colors = np.exp((sizes[:, 1] + sizes[:, 2]) / 2), np.ascontiguousarray(x[:, kernels.COLOR :])
     return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, splats, colors)
 
 
-def end_state(state: State, gaussians: Gaussians) -> Gaussians:
-    """Gaussians of a state; higher SH from those that it started from."""
-    s, tensor = state.splats, torch.from_numpy
-    sh0 = tensor((state.colors - 0.5) / SH_C0).float()[:, None]
-    return Gaussians(tensor(s.means), tensor(s.quats), tensor(s.scales), tensor(s.opacities), sh0, gaussians.shN)
+def view_colors(state: State) -> np.ndarray | None:
+    """Colours as the rasterizer takes them: as they are, or None: from the harmonics, which are brought up to date."""
+    if state.splats.shN.shape[1] == 0:
+        return state.colors
+    np.divide(state.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=state.splats.sh0)
+    return None
 
 
-@dataclass(frozen=True, eq=False)
-class Pyramid:
-    """The photos at full and at half size, with the photo's part of structural similarity."""
-
-    levels: tuple[Photos, Photos]
-
-
-def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray | None, dssim: float) -> np.ndarray:
-    """Gradient of the mean over the pixels of (1 - dssim) L1 + dssim (1 - SSIM), windows of 7 x 7.
-
-    Args:
-        image: ``[h,w,3]`` float32.
-        photo: ``[h,w,3]`` float32.
-        weight: ``[h,w]`` weights of the pixels, None for ones.
-        dssim: Share of structural similarity.
-    """
-
-    def box(a: np.ndarray) -> np.ndarray:
-        return cv2.blur(a, WINDOW, borderType=cv2.BORDER_CONSTANT)
-
-    mean, square, cross = np.empty_like(image), np.empty_like(image), np.empty_like(image)
-    windows = [box(image), box(photo), box(image * image), box(photo * photo), box(image * photo)]
-    kernels.similarity_terms(*(w.reshape(-1) for w in windows), mean.reshape(-1), square.reshape(-1), cross.reshape(-1))
-    if weight is not None:
-        for terms in (mean, square, cross):
-            terms *= weight[..., None]
-    similarity = box(mean) + 2 * image * box(square) + photo * box(cross)
-    gradient = np.sign(image - photo)
-    if weight is not None:
-        gradient *= weight[..., None]
-    gradient *= 1 - dssim
-    gradient -= dssim * similarity
-    gradient /= image.shape[0] * image.shape[1]
-    return gradient
+def end_state(x: np.ndarray, shN: torch.Tensor) -> Gaussians:
+    """Gaussians of parameters ``[n,14]``; the higher harmonics stay as they were."""
+    tensor = torch.from_numpy
+    return Gaussians(
+        means=tensor(x[:, :3].copy()),
+        quats=tensor(x[:, kernels.QUAT : kernels.LOGIT].copy()),
+        scales=tensor(np.exp(x[:, kernels.SIZE : kernels.QUAT])),
+        opacities=tensor(1 / (1 + np.exp(-x[:, kernels.LOGIT]))),
+        sh0=tensor((x[:, kernels.COLOR :] - 0.5) / SH_C0).float()[:, None],
+        shN=shN,
+    )
 
 
-def fit_step(
-    state: State,
-    photos: Photos,
-    view: int,
-    rates: np.ndarray,
-    options: FitOptions,
-    rng: np.random.Generator,
-    weight: np.ndarray | None,
-) -> None:
-    """One Adam step on one view."""
-    background = rng.random(3, dtype=np.float32)
-    opacities = None
-    if options.dropout > 0:
-        kept = rng.random(len(state.x), dtype=np.float32) >= options.dropout
-        opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - options.dropout), np.float32(0.99))
-    plan = plan_differentiable(
+@dataclass(frozen=True)
+class Plan:
+    """How a run goes: photos at full and half size with their training weights, steps, and what a step does."""
+
+    photos: tuple[Photos, Photos]
+    weights: tuple[list[np.ndarray], list[np.ndarray]]
+    options: FitOptions
+    dropout: float
+
+
+def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int) -> Plan:
+    """Held-out blocks, and dropout where there are few views."""
+    full = training_weights(photos[0], options.holdout, seed)
+    height, width = photos[1].height, photos[1].width
+    half = [np.ascontiguousarray(weight[::2, ::2][:height, :width]) for weight in full]
+    few = len(photos[0]) <= FEW_VIEWS and options.fit_steps >= MANY_STEPS
+    dropout = options.dropout if options.dropout is not None else DROPOUT if few else 0.0
+    return Plan(photos, (full, half), options, dropout)
+
+
+def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
+    """One Adam step on one view -> mean squared error of its training pixels."""
+    level = 1 if progress < plan.options.coarse else 0
+    photos, weight = plan.photos[level], plan.weights[level][view]
+    background, opacities = rng.random(3, dtype=np.float32), None
+    if plan.dropout > 0:
+        kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
+        opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
+    drawn = plan_differentiable(
         state.splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height,
         eps2d=photos.eps2d, opacities=opacities,
     )  # fmt: skip
-    image, transmittance = composite(plan, state.colors, background)
-    gradient = image_gradient(image, photos.images[view], weight, options.dssim)
-    g = plan_gradients(plan, gradient, image=image, transmittance=transmittance, colors=state.colors)
-    state.step += 1
-    limits = np.array([options.reach, options.reach_size, options.reach_logit], np.float32)
-    betas = np.array([options.beta1, options.beta2], np.float32)
-    s = state.splats
+    colors = view_colors(state)
+    image, transmittance = composite(drawn, colors, background)
+    gradient = image_gradient(image, photos.images[view], weight, plan.options.dssim)
+    g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
+    rates, s = plan.options.rates, state.splats
+    steps = step_sizes(rates, progress)
+    limits = np.array([rates.reach_mean, rates.reach_size, rates.reach_logit], np.float32)
+    betas = np.array(rates.betas, np.float32)
 
     def update(first: int) -> None:
         last = min(first + ROWS, len(state.x))
         kernels.adam(
             state.x, state.x0, state.m, state.v, state.units, g.ids,
-            g.means, g.quats, g.scales, g.opacities, g.colors, rates, limits, betas, state.step,
+            g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, step,
             first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
         )  # fmt: skip
 
     parallel_map(update, range(0, len(state.x), ROWS))
+    error = weight[..., None] * (image - photos.images[view]) ** 2
+    return float(error.sum(dtype=np.float64) / max(3 * weight.sum(), 1))
 
 
-def step_rates(options: FitOptions, progress: float) -> np.ndarray:
-    """Rates of the fourteen columns at a point of the run, decaying geometrically."""
-    base = (options.rate_mean,) * 3 + (options.rate_size,) * 3 + (options.rate_quat,) * 4
-    base += (options.rate_logit,) + (options.rate_color,) * 3
-    return (np.array(base) * options.decay**progress).astype(np.float32)
+def step_sizes(rates: Rates, progress: float) -> np.ndarray:
+    """Step of each of the fourteen columns at a point of the run, decaying geometrically."""
+    columns = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
+    return (np.array(columns) * rates.decay**progress).astype(np.float32)
 
 
-Progress = Callable[[int, int], None]
+def holdout_score(state: State, plan: Plan) -> float:
+    """PSNR (dB) of the half-size held-out blocks."""
+    photos, colors = plan.photos[1], view_colors(state)
+
+    def one_view(view: int) -> np.ndarray:
+        drawn = plan_view(
+            state.splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
+        )
+        return composite(drawn, colors)[0]
+
+    return holdout_psnr(parallel_map(one_view, range(len(photos))), photos, plan.weights[1])
 
 
-def fit_full(gaussians: Gaussians, photos: tuple[Photos, Photos], options: FitOptions, seed: int = 0) -> Gaussians:
+def fit_full(
+    gaussians: Gaussians,
+    photos: tuple[Photos, Photos],
+    options: FitOptions,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
+    The best state by the held-out blocks is returned, the start included.
+
     Args:
-        gaussians: The start, canonical.
+        gaussians: n canonical Gaussians; the result has as many, in the same order.
         photos: The input views at full and at half size.
         options: Steps, rates, limits.
-        seed: Order of the views, backgrounds, dropout.
+        seed: Order of the views, backgrounds, dropout, held-out blocks.
+        progress: Told after every step.
     """
-    rng, state, queue = np.random.default_rng(seed), start_state(gaussians), []
-    for step in range(options.fit_steps):
-        progress = step / options.fit_steps
+    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
+    before = best = score = holdout_score(state, plan)
+    kept, kept_at = state.x.copy(), 0
+    queue: list[int] = []
+    step, steps, started, error = 0, options.fit_steps, time.perf_counter(), 0.0
+    while step < steps:
         if not queue:
-            queue = list(rng.permutation(len(photos[0])))
-        level = photos[1] if progress < options.coarse else photos[0]
-        fit_step(state, level, queue.pop(), step_rates(options, progress), options, rng, None)
-    return end_state(state, gaussians)
+            queue = rng.permutation(len(photos[0])).tolist()
+        error += 0.1 * (fit_step(state, plan, queue.pop(), step + 1, step / steps, rng) - error)
+        step += 1
+        if options.time_budget is not None and step == PROBE:
+            steps = affordable_steps(time.perf_counter() - started, plan)
+        if step % CHECK == 0 or step == steps:
+            score = holdout_score(state, plan)
+            if score > best:
+                best, kept, kept_at = score, state.x.copy(), step
+        if progress:
+            progress(step, steps, -10 * np.log10(max(error, 1e-12)), score)
+    accepted = kept_at > 0
+    stopped = "all steps done" if kept_at == steps else f"held-out blocks were best after step {kept_at} of {steps}"
+    report = FitReport("full" if accepted else "none", accepted, kept_at, before, best, stopped)
+    return (end_state(kept, gaussians.shN) if accepted else gaussians), report
+
+
+def affordable_steps(seconds: float, plan: Plan) -> int:
+    """Steps that fit into the time budget, from the time of the first PROBE ones at half size.
+
+    A step at full size costs up to three times as much.
+    """
+    budget, coarse = plan.options.time_budget, plan.options.coarse
+    assert budget is not None
+    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse))
+    return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

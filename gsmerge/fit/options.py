@@ -2,10 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
-Fit = Literal["none", "color"]
+Fit = Literal["none", "color", "full"]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How far a step of the full fit may go, and how far all of them together.
+
+    Args:
+        mean: Step of a mean, in units of the Gaussian's size.
+        size: Step of a log scale.
+        quat: Step of a quaternion.
+        logit: Step of an opacity's logit.
+        color: Step of a colour, sRGB in [0, 1].
+        decay: Factor on all steps at the end of the run.
+        betas: Decay of Adam's first and second moments.
+        reach_mean: Farthest that a mean may go from its start, in units of the Gaussian's size.
+        reach_size: Largest change of a log scale.
+        reach_logit: Largest change of an opacity's logit.
+    """
+
+    mean: float = 0.1
+    size: float = 0.2
+    quat: float = 0.03
+    logit: float = 0.3
+    color: float = 0.03
+    decay: float = 0.1
+    betas: tuple[float, float] = (0.7, 0.99)
+    reach_mean: float = 2.0
+    reach_size: float = 2.5
+    reach_logit: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -13,54 +42,54 @@ class FitOptions:
     """What is fitted to the photos.
 
     Args:
-        fit: ``"color"``: the base colours; ``"none"``: nothing.
-        fit_level: Photos are reduced by this factor on each side for the fit.
-        iterations: Conjugate-gradient steps.
+        fit: ``"full"``: all parameters; ``"color"``: the base colours; ``"none"``: nothing.
+        fit_steps: Steps of the full fit, one view each.
+        time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
+            measured time of the first ones, and the result is no longer the same on every machine.
+        dropout: Share of the Gaussians that a step leaves out; None: 0.2 for five views or fewer and 100 steps or
+            more, where the photos alone would be learnt by heart, otherwise 0.
+        coarse: Share of the steps that look at half-size photos.
+        dssim: Share of structural similarity in the loss, the rest is L1.
+        rates: Steps and limits of the full fit.
+        iterations: Conjugate-gradient steps of the colour fit.
         pull: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
         huber: Colour error beyond which a pixel counts less (moving things, reflections).
-        min_gain: Exposure of a view against the mean, as a factor, from which on it is compensated; smaller
-            differences come from holes and highlights as often as from the camera.
+        min_gain: Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
+            smaller differences come from holes and highlights as often as from the camera.
         max_gain: Largest exposure factor that is believed.
-        holdout: Share of the photos' blocks that decides whether the fit is accepted.
+        holdout: Share of the photos' blocks that decides whether a fit is accepted.
         prune: Leave out Gaussians that contribute less than this to every pixel of every photo that they lie in.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
     """
 
-    fit: Fit = "color"
-    fit_level: int = 2
+    fit: Fit = "full"
+    fit_steps: int = 120
+    time_budget: float | None = None
+    dropout: float | None = None
+    coarse: float = 0.7
+    dssim: float = 0.2
+    rates: Rates = field(default_factory=Rates)
     iterations: int = 6
     pull: float = 0.03
     huber: float = 0.2
     min_gain: float = 1.15
     max_gain: float = 2.0
-    holdout: float = 0.1
+    holdout: float = 0.05
     prune: float = 1 / 255
 
     def __post_init__(self) -> None:
-        if self.fit not in ("none", "color"):
-            raise ValueError(f'fit: expected "none" or "color", got "{self.fit}"')
-        for name in ("fit_level", "iterations"):
+        if self.fit not in ("none", "color", "full"):
+            raise ValueError(f'fit: expected "none", "color" or "full", got "{self.fit}"')
+        for name in ("fit_steps", "iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if not self.pull >= 0:
             raise ValueError(f"pull: expected at least 0, got {self.pull}")
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
-
-    fit_steps: int = 60
-    coarse: float = 0.7
-    dssim: float = 0.2
-    dropout: float = 0.0
-    rate_mean: float = 0.1
-    rate_size: float = 0.2
-    rate_quat: float = 0.03
-    rate_logit: float = 0.3
-    rate_color: float = 0.03
-    decay: float = 0.1
-    beta1: float = 0.7
-    beta2: float = 0.99
-    reach: float = 2.0
-    reach_size: float = 2.5
-    reach_logit: float = 4.0
+        if self.dropout is not None and not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout: expected a number from 0 to below 1, got {self.dropout}")
+        if self.time_budget is not None and not self.time_budget > 0:
+            raise ValueError(f"time_budget: expected more than 0 seconds, got {self.time_budget}")

@@ -211,8 +211,7 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
     heap, places, costs = np.arange(size), np.arange(size), np.empty(size)
     for e in range(size):
         costs[e] = _merge_cost(rows, ends[2 * e], ends[2 * e + 1], depth_weight, compactness, max_extent)
-    for e in range(size // 2 - 1, -1, -1):
-        _settle(heap, places, costs, size, heap[e])
+        _settle(heap, places, costs, e + 1, e)
     node = num_leaves
     while size > 0:
         edge = heap[0]

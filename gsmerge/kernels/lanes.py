@@ -97,7 +97,8 @@ def totals(vectors: Sequence[Lanes]) -> Lanes:
 
     def halves(first: Lanes, second: Lanes, group: int) -> Lanes:
         """Add the two halves of every group of lanes; the second's follow the first's per block."""
-        low, high = [], []
+        low: list[int] = []
+        high: list[int] = []
         for source in (0, LANES):
             for block in range(0, LANES, 2 * group):
                 low += range(source + block, source + block + group)
@@ -126,8 +127,8 @@ def total(lanes: Lanes) -> Lanes:
     return Lanes(builder, builder.extract_element(value, ir.Constant(ir.IntType(32), 0)))
 
 
-def stopped(lanes: Lanes) -> Lanes:
-    """The lanes with the sign of a number below zero."""
+def negative(lanes: Lanes) -> Lanes:
+    """Minus the lanes' absolute values."""
     builder, bits = lanes.builder, ir.VectorType(ir.IntType(32), LANES)
     sign = ir.Constant(bits, [-(1 << 31)] * LANES)
     return Lanes(builder, builder.bitcast(builder.or_(builder.bitcast(lanes.value, bits), sign), VECTOR))

@@ -40,6 +40,15 @@ def _alpha(p):
     return a if p >= LN_CUT else f4(0.0)
 
 
+@kernel(inline=True)
+def _take(t, p):
+    """A pixel's weight at exponent p, and what is left of its transmittance t; stopped pixels keep a negative one."""
+    w = _alpha(p) * t
+    left = t - w
+    stop = left <= MIN_TRANSMITTANCE
+    return f4(0.0) if stop else w, -abs(t) if stop else left
+
+
 @kernel
 def _gather(footprints, members, first, last, end, tile_x, tile_y, batch):
     """Copy footprints into the batch, relative to the tile's first pixel centre, and call for the next batch's."""
@@ -100,16 +109,10 @@ def _blend(state, batch, count, y_low, y_high):
             for x in range(TILE):
                 i = row + np.uint64(x)
                 d = rate * f4(x) - centre
-                a = _alpha(top - d * d)
-                t = state[i]
-                w = a * t
-                left = t - w
-                stop = left <= MIN_TRANSMITTANCE
-                w = f4(0.0) if stop else w
+                w, state[i] = _take(state[i], top - d * d)
                 state[i + P1] += w * red
                 state[i + P2] += w * green
                 state[i + P3] += w * blue
-                state[i] = -abs(t) if stop else left
 
 
 @kernel
@@ -171,13 +174,7 @@ def _weights(state, batch, j, y0, y1):
         for x in range(TILE):
             i = row + np.uint64(x)
             d = rate * f4(x) - centre
-            a = _alpha(top - d * d)
-            t = state[i]
-            w = a * t
-            left = t - w
-            stop = left <= MIN_TRANSMITTANCE
-            state[i + P1] = f4(0.0) if stop else w
-            state[i] = -abs(t) if stop else left
+            state[i + P1], state[i] = _take(state[i], top - d * d)
 
 
 @kernel

@@ -16,13 +16,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.lanes import FLOAT, LANES, VECTOR, Lanes, load, stopped, store, total, totals, vector
+from gsmerge.kernels.lanes import FLOAT, LANES, VECTOR, Lanes, load, negative, store, total, totals, vector
 from gsmerge.kernels.prefetch import prefetch_row
 from gsmerge.kernels.project import LN_CUT, TILE
 from gsmerge.kernels.raster import (
@@ -48,12 +47,25 @@ SUMS = 9
 STATE = 5 * PLANE  # transmittance, rest, gradient of the colour (3)
 
 
-def _alpha_lanes(p: Lanes) -> Lanes:
-    """As :func:`gsmerge.kernels.raster._alpha`, but neither clamped nor cut."""
+def _take_back(t: Lanes, rest: Lanes, g: list[Lanes], color: list[Lanes], p: Lanes) -> list[Lanes]:
+    """A Gaussian's share of sixteen pixels: transmittance and rest behind it, its weights, and v.
+
+    The weights are those of :func:`gsmerge.kernels.raster._take`.
+    """
     e = E0 + p * (E1 + p * (E2 + p * (E3 + p * (E4 + p * E5))))
     e = e * e
     e = e * e
-    return e * e
+    e = e * e
+    free = e.compare("<", MAX_ALPHA)
+    a = e.where(free, MAX_ALPHA).where(p.compare(">=", LN_CUT), 0.0)
+    w = a * t
+    left = t - w
+    goes = left.compare(">", MIN_TRANSMITTANCE)
+    w = w.where(goes, 0.0)
+    own = w * (color[0] * g[0] + color[1] * g[1] + color[2] * g[2])
+    rest = rest - own
+    v = own - a * rest / (1.0 - a)
+    return [left.where(goes, negative(t)), rest, w, v.where(free, 0.0).where(goes, 0.0)]
 
 
 @intrinsic
@@ -69,47 +81,31 @@ def _walk_back(typing_context: Any, state: Any, batch: Any, j: Any, y0: Any, y1:
         def index(number: int) -> Any:
             return context.get_constant(types.intp, number)
 
-        first, last, member, slot = (
-            context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (3, 4, 2, 6)
+        member, first, last, slot = (
+            context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (2, 3, 4, 6)
         )
-        mx, my, rate, slope, decay, lnop, _, _, red, green, blue = (
+        mx, my, rate, slope, decay, lnop, _, _, *color = (
             Lanes(builder, builder.load(address(1, member, index(q)))) for q in range(11)
         )
         columns = vector(builder, range(LANES))
-        stretched = rate * columns
-        names = ("red", "green", "blue", "v", "vy", "vyy")
-        sums = {name: cgutils.alloca_once(builder, VECTOR) for name in names}
-        for pointer in sums.values():
-            builder.store(ir.Constant(VECTOR, [0.0] * LANES), pointer)
-
-        with cgutils.for_range_slice(
-            builder, first, builder.add(last, index(1)), index(1), first.type, inc=True
-        ) as (y, _):
-            dy = Lanes(builder, builder.sitofp(y, FLOAT)) - my
+        sums = [cgutils.alloca_once(builder, VECTOR) for _ in range(6)]
+        for pointer in sums:
+            builder.store(vector(builder, [0.0] * LANES).value, pointer)
+        end = builder.add(last, index(1))
+        with cgutils.for_range_slice(builder, first, end, index(1), first.type, inc=True) as (y, _):
             start = builder.mul(y, index(TILE))
             planes = [address(0, builder.add(start, index(PLANE * plane))) for plane in range(5)]
             t, rest, *g = (load(builder, plane) for plane in planes)
-            d = stretched - rate * (mx + slope * dy)
-            p = (lnop - decay * dy * dy) - d * d
-            a = _alpha_lanes(p)
-            free = a.compare("<", MAX_ALPHA)
-            a = a.where(free, MAX_ALPHA)
-            a = a.where(p.compare(">=", LN_CUT), 0.0)
-            w = a * t
-            left = t - w
-            goes = left.compare(">", MIN_TRANSMITTANCE)
-            w = w.where(goes, 0.0)
-            store(left.where(goes, stopped(t)), planes[0])
-            own = w * (red * g[0] + green * g[1] + blue * g[2])
-            rest = rest - own
+            dy = Lanes(builder, builder.sitofp(y, FLOAT)) - my
+            d = rate * columns - rate * (mx + slope * dy)
+            left, rest, w, v = _take_back(t, rest, g, color, (lnop - decay * dy * dy) - d * d)
+            store(left, planes[0])
             store(rest, planes[1])
-            v = own - a * rest / (1.0 - a)
-            v = v.where(builder.and_(free, goes), 0.0)
             vy = v * dy
-            for name, lanes in zip(names, (w * g[0], w * g[1], w * g[2], v, vy, vy * dy), strict=True):
-                builder.store((Lanes(builder, builder.load(sums[name])) + lanes).value, sums[name])
-
-        red, green, blue, v, vy, vyy = (Lanes(builder, builder.load(sums[name])) for name in names)
+            for pointer, more in zip(sums, (w * g[0], w * g[1], w * g[2], v, vy, vy * dy), strict=True):
+                builder.store((Lanes(builder, builder.load(pointer)) + more).value, pointer)
+        # x is the same in all rows of a lane, so its moments wait until here
+        red, green, blue, v, vy, vyy = (Lanes(builder, builder.load(pointer)) for pointer in sums)
         dx = columns - mx
         vx = v * dx
         store(totals([red, green, blue, v, vx, vy, vx * dx, vy * dx]), address(5, slot, index(0)))
@@ -117,6 +113,23 @@ def _walk_back(typing_context: Any, state: Any, batch: Any, j: Any, y0: Any, y1:
         return context.get_dummy_value()
 
     return types.void(state, batch, j, y0, y1, slots, row), generate
+
+
+@kernel
+def _open_back(state, left, top, columns, lines, image, transmittance, grad_image, grad_left):
+    """The planes of a tile before its first Gaussian."""
+    _open_tile(state, columns, lines)
+    for y in range(lines):
+        for x in range(columns):
+            i = np.uint64(y * TILE + x)
+            rest = f4(0.0)
+            if grad_left.shape[0] > 0:
+                rest = grad_left[top + y, left + x] * transmittance[top + y, left + x]
+            for c in range(3):
+                g = grad_image[top + y, left + x, c]
+                state[i + np.uint64((2 + c) * PLANE)] = g
+                rest += g * image[top + y, left + x, c]
+            state[i + P1] = rest
 
 
 @kernel
@@ -145,18 +158,7 @@ def blend_backward(
     for tile in range(first, last):
         left, top = tile % columns * TILE, tile // columns * TILE
         num_x, num_y = min(TILE, width - left), min(TILE, height - top)
-        _open_tile(state, num_x, num_y)
-        for y in range(num_y):
-            for x in range(num_x):
-                i = np.uint64(y * TILE + x)
-                rest = f4(0.0)
-                if grad_left.shape[0] > 0:
-                    rest = grad_left[top + y, left + x] * transmittance[top + y, left + x]
-                for c in range(3):
-                    g = grad_image[top + y, left + x, c]
-                    state[i + np.uint64((2 + c) * PLANE)] = g
-                    rest += g * image[top + y, left + x, c]
-                state[i + P1] = rest
+        _open_back(state, left, top, num_x, num_y, image, transmittance, grad_image, grad_left)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:

@@ -7,30 +7,9 @@ from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
 from gsmerge.kernels.project import LN_CUT, TILE
-from gsmerge.kernels.raster import BATCH, MIN_TRANSMITTANCE, P1, PLANE, _alpha, _gather, _live_rows, _open_tile
+from gsmerge.kernels.raster import BATCH, P1, PLANE, _gather, _live_rows, _open_tile, _weights
 
 LANES = 4  # channels of an image row: one vector register
-
-
-@kernel
-def _batch_weights(state, batch, j, y0, y1):
-    """Blend one Gaussian over rows of a tile; plane 1 holds its weights."""
-    mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-    for y in range(y0, y1 + 1):
-        dy = f4(y) - my
-        top = lnop - decay * dy * dy
-        centre = rate * (mx + slope * dy)
-        row = np.uint64(y * TILE)
-        for x in range(TILE):
-            i = row + np.uint64(x)
-            d = rate * f4(x) - centre
-            a = _alpha(top - d * d)
-            t = state[i]
-            w = a * t
-            left = t - w
-            stop = left <= MIN_TRANSMITTANCE
-            state[i + P1] = f4(0.0) if stop else w
-            state[i] = -abs(t) if stop else left
 
 
 @kernel
@@ -82,7 +61,7 @@ def list_weights(footprints, members, offsets, columns, height, width):
                 lanes, weights = _grown(lanes, weights, count)
             for j in range(stop - start):
                 y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-                _batch_weights(state, batch, j, y0, y1)
+                _weights(state, batch, j, y0, y1)
                 x0, x1 = _columns(batch, j, num_x)
                 for y in range(y0, y1 + 1):
                     for x in range(x0, x1 + 1):

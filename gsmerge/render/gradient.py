@@ -24,7 +24,7 @@ from gsmerge.render.blend import view_colors
 from gsmerge.render.plan import Array, Splats, ViewPlan, _camera, pieces, plan_view
 from gsmerge.threads import parallel_map, use_threads
 
-WORTH = 1 << 12  # intersections that are worth handing to another thread: walking back takes longer than blending
+WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,26 +124,13 @@ def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
     return list(pairwise(edges.tolist()))
 
 
-def _sums(
-    plan: ViewPlan, colors: Array, image: Array, transmittance: Array, grad_image: Array, grad_left: Array
-) -> Array:
-    """``[m,SUMS]`` sums over the image of what the footprints and colours should become."""
-    slots = np.empty((len(plan.members), raster_backward.SUMS), np.float32)
-    sums = np.zeros((len(plan.ids), raster_backward.SUMS), np.float32)
-
-    def tiles(span: tuple[int, int]) -> None:
-        raster_backward.blend_backward(
-            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span,
-            image, transmittance, grad_image, grad_left, slots,
-        )  # fmt: skip
-
-    with use_threads() as threads:
-        parallel_map(tiles, _tile_ranges(plan, threads))
-        parallel_map(
-            lambda span: raster_backward.gather_slots(plan.members, slots, *span, sums),
-            pieces(len(plan.ids), threads),
-        )
-    return sums
+def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
+    """Ranges of Gaussians, whole blocks of the kernels each."""
+    block = project_backward.BLOCK
+    num_blocks = -(-count // block)
+    num = max(1, min(threads, count // WORTH))
+    edges = [block * (num_blocks * i // num) for i in range(num)] + [count]
+    return list(pairwise(edges))
 
 
 def gradients_of(
@@ -156,30 +143,38 @@ def gradients_of(
     with_viewmat: bool,
 ) -> Gradients:
     """:func:`plan_gradients` of contiguous float32 arrays, unchecked; colours ``[m,3]`` of the plan's Gaussians."""
-    m = len(plan.ids)
-    sums = _sums(plan, colors, image, transmittance, grad_image, grad_left)
-    means, quats, scales = np.empty((m, 3), np.float32), np.empty((m, 4), np.float32), np.empty((m, 3), np.float32)
-    opacities, block = np.empty(m, np.float32), project_backward.BLOCK
-    poses = np.empty((-(-m // block) if with_viewmat else 0, project_backward.POSE), np.float32)
-    splats = plan.splats
+    m, splats = len(plan.ids), plan.splats
+    slots = np.empty((len(plan.members), raster_backward.SUMS), np.float32)
+    sums = np.zeros((m, raster_backward.SUMS), np.float32)
+    means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
+    opacities = np.empty(m, np.float32)
+    num_blocks = -(-m // project_backward.BLOCK)
+    poses = np.empty((num_blocks if with_viewmat else 0, project_backward.POSE), np.float32)
 
-    def project(span: tuple[int, int]) -> None:
-        project_backward.project_backward(
-            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera,
-            span[0] * block, min(m, span[1] * block), means, quats, scales, opacities, poses,
+    def tiles(span: tuple[int, int]) -> None:
+        raster_backward.blend_backward(
+            plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span,
+            image, transmittance, grad_image, grad_left, slots,
         )  # fmt: skip
 
+    def project(span: tuple[int, int]) -> None:
+        raster_backward.gather_slots(plan.members, slots, *span, sums)
+        project_backward.project_backward(
+            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera, *span,
+            means, quats, scales, opacities, poses,
+        )  # fmt: skip
+        tints[slice(*span)] = sums[slice(*span), :3]
+
     with use_threads() as threads:
-        num_blocks = -(-m // block)
-        num = len(pieces(m, threads))
-        parallel_map(project, [(num_blocks * i // num, num_blocks * (i + 1) // num) for i in range(num)])
+        parallel_map(tiles, _tile_ranges(plan, threads))
+        parallel_map(project, _blocks(m, threads))
     viewmat = None
     if with_viewmat:
         pose = poses.sum(0, dtype=np.float64)
         viewmat = np.zeros((4, 4))
         viewmat[:3, 3] = pose[9:]
         viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
-    return Gradients(plan.ids, means, quats, scales, opacities, sums[:, :3], viewmat)
+    return Gradients(plan.ids, means, quats, scales, opacities, tints, viewmat)
 
 
 def plan_gradients(

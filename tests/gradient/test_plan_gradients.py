@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -105,10 +106,11 @@ def test_opacities_in_place_of_the_gaussians_own() -> None:
 
 
 def test_finite_differences() -> None:
-    """Along random directions, on soft Gaussians, where no threshold is near."""
+    """Along the gradient, with Gaussians so wide that no weight crosses a threshold."""
     n, grad_image, grad_left = 12, normal(HEIGHT, WIDTH, 3).astype(float), normal(HEIGHT, WIDTH, seed=1).astype(float)
     start = random_gaussians(n, 0, 9)
-    start = replace(start, scales=0.3 + 0.2 * start.scales.clamp(max=1), opacities=0.2 + 0.4 * start.opacities)
+    means = torch.tensor([0.0, 0.0, 3.0]) + 0.3 * (random_gaussians(n, 0, 9).means - torch.tensor([0.0, 0.0, 3.0]))
+    start = replace(start, means=means, scales=1.5 + 2 * start.scales, opacities=0.1 + 0.3 * start.opacities)
     colors = normal(n, 3, seed=4)
 
     def loss(name: str, step: np.ndarray) -> float:
@@ -129,15 +131,15 @@ def test_finite_differences() -> None:
     for name in FIELDS:
         gradient = full(found, name, n)
         step = gradient / np.abs(gradient).max()
-        size = 2e-3
+        size = 5e-3
         change = (loss(name, size * step) - loss(name, -size * step)) / (2 * size)
-        assert change == pytest.approx((gradient * step).sum(), rel=0.02), name
+        assert change == pytest.approx((gradient * step).sum(), rel=5e-3), name
 
 
 @pytest.mark.parametrize("threads", [2, 8])
 def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.render.plan.PIECE", 200)
-    monkeypatch.setattr("gsmerge.render.gradient.WORTH", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.render.plan"], "PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.render.gradient"], "WORTH", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10), turned_cameras(1)
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
     K, size = cameras.Ks[0] * torch.tensor([[4.0], [4.0], [1.0]]), (4 * HEIGHT, 4 * WIDTH)

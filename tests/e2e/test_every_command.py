@@ -1,0 +1,168 @@
+"""What all commands have in common: --json, --quiet, --dry-run, notes, and that inputs are never replaced."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsmerge
+from gsmerge.cli.pictures import picture_stems
+from gsmerge.io import load_scene
+
+from .conftest import Run, listing
+
+VIEWS = 5
+WRITERS: dict[str, tuple[str, ...]] = {
+    "compact": ("small.ply", "--superpixels", "100", "--no-robust", "--fit", "none"),
+    "segment": ("overlays", "--superpixels", "100"),
+    "render": ("renders",),
+    "preview": ("sheet.png", "--views", "1"),
+}
+COMMANDS = ("inspect", *WRITERS)
+
+
+def call(command: str, scene: Path) -> list[object]:
+    """The command with its scene, its output, and what makes it fast."""
+    given: Path = scene / "scene.ply" if command == "preview" else scene
+    if command == "inspect":
+        return [command, given]
+    output, *rest = WRITERS[command]
+    return [command, given, "-o", scene / output, *rest]
+
+
+def spoil_rows(ply: Path) -> None:
+    """NaN in one row, a log scale of 40 in another, and every opacity between 0 and 1."""
+    head, data = ply.read_bytes().split(b"end_header\n", 1)
+    rows = np.frombuffer(data, "<f4").reshape(-1, 17).copy()
+    rows[3, 0], rows[7, 10] = np.nan, 40
+    rows[:, 9] = 1 / (1 + np.exp(-rows[:, 9]))
+    ply.write_bytes(head + b"end_header\n" + rows.tobytes())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_json_is_all_there_is_on_stdout(command: str, scene_copy: Path, run: Run) -> None:
+    outcome = run(*call(command, scene_copy), "--json")
+    assert (outcome.code, outcome.err) == (0, "")
+    document = json.loads(outcome.out)
+    assert document["schema_version"] == 1
+    assert document["tool"]["version"] == gsmerge.__version__
+    assert document["notes"] == []
+
+
+@pytest.mark.parametrize("command", ["segment", "render", "preview"])
+def test_json_names_the_pictures(command: str, scene_copy: Path, run: Run) -> None:
+    before = listing(scene_copy)
+    document = json.loads(run(*call(command, scene_copy), "--json").out)
+    written = sorted(str(scene_copy / name) for name in set(listing(scene_copy)) - set(before))
+    assert sorted(document["pictures"]) == written
+    assert len(written) == {"segment": 3 * VIEWS, "render": VIEWS, "preview": 1}[command]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_quiet_says_nothing(command: str, scene_copy: Path, run: Run) -> None:
+    spoil_rows(scene_copy / "scene.ply")
+    outcome = run(*call(command, scene_copy), "--quiet")
+    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+@pytest.mark.parametrize("command", sorted(WRITERS))
+def test_a_dry_run_writes_nothing(command: str, scene_copy: Path, run: Run) -> None:
+    before = listing(scene_copy)
+    outcome = run(*call(command, scene_copy), "--dry-run")
+    assert outcome.code == 0, outcome.err
+    assert WRITERS[command][0] in outcome.out
+    assert "would write" in outcome.out
+    assert json.loads(run(*call(command, scene_copy), "--dry-run", "--json").out)["dry_run"] is True
+    assert listing(scene_copy) == before
+    assert not (scene_copy / WRITERS[command][0]).exists()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_odd_rows_are_told_by_every_command(command: str, scene_copy: Path, run: Run) -> None:
+    spoil_rows(scene_copy / "scene.ply")
+    outcome = run(*call(command, scene_copy))
+    assert outcome.code == 0, outcome.err
+    told = outcome.out if command == "inspect" else outcome.err
+    notes = [line for line in told.splitlines() if line.startswith("note")]
+    assert len(notes) == 3
+    parts = ("taken as activated", "1 row(s) with NaN or inf", "1 Gaussian(s) with extreme scales")
+    assert [part for part in parts if part not in told] == []
+
+
+def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: Run) -> None:
+    spoil_rows(scene_copy / "scene.ply")
+    notes = load_scene(scene_copy).notes
+    assert len(notes) == 3
+    assert json.loads(run(*call("compact", scene_copy), "--json").out)["notes"] == list(notes)
+    named = load_scene(scene_copy, opacity="raw").notes
+    assert len(named) == 2  # who names the encoding need not be told
+
+
+@pytest.mark.parametrize("command", ["segment", "render"])
+def test_no_folder_is_left_where_the_input_is_bad(command: str, scene_copy: Path, run: Run) -> None:
+    (scene_copy / "scene.ply").write_text("These are notes, not Gaussians.\n")
+    assert run(*call(command, scene_copy)).code == 3
+    assert not (scene_copy / WRITERS[command][0]).exists()
+
+
+@pytest.mark.parametrize("command", ["segment", "render"])
+def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Path, run: Run) -> None:
+    outcome = run(command, scene_copy, "-o", scene_copy / "scene.ply" / "pictures")
+    assert outcome.code == 3
+    assert "found the file" in outcome.err
+    assert outcome.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [
+        ("compact", "transforms.json"),
+        ("preview", "transforms.json"),
+        ("preview", "images/view_00.png"),
+        ("render", "images"),
+        ("segment", "images"),
+    ],
+)
+def test_inputs_are_not_replaced(command: str, output: str, scene_copy: Path, run: Run) -> None:
+    before = listing(scene_copy)
+    scene = scene_copy / "scene.ply"
+    outcome = run(command, scene, "-o", scene_copy / output, "--overwrite")
+    assert outcome.code == 2
+    assert "other than the input" in outcome.err
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.parametrize("command", ["segment", "render"])
+def test_images_of_one_name_in_several_folders(command: str, scene_copy: Path, run: Run) -> None:
+    path = scene_copy / "transforms.json"
+    data = json.loads(path.read_text())
+    for i, frame in enumerate(data["frames"]):
+        name = f"images/side{i % 2}/{i // 2:03d}.png"
+        (scene_copy / name).parent.mkdir(exist_ok=True)
+        (scene_copy / frame["file_path"]).rename(scene_copy / name)
+        frame["file_path"] = name
+    path.write_text(json.dumps(data))
+    outcome = run(*call(command, scene_copy), "--json")
+    assert outcome.code == 0, outcome.err
+    document = json.loads(outcome.out)
+    assert len(set(document["pictures"])) == len(document["pictures"])
+    assert all(Path(picture).is_file() for picture in document["pictures"])
+
+
+@pytest.mark.parametrize(
+    ("names", "stems"),
+    [
+        (["images/a.png", "b.JPG", "c"], ["a", "b", "c"]),
+        (["left/0.png", "right/0.png"], ["left_0", "right_0"]),
+        (["left\\0.png", "right\\0.png"], ["left_0", "right_0"]),
+        (["a.png", "a.jpg"], ["view_000", "view_001"]),
+        (["A.png", "a.png"], ["view_000", "view_001"]),
+        (["../x/run.v1.png", "run.v2"], ["run.v1", "run.v2"]),
+        ([], []),
+    ],
+)
+def test_picture_names(names: list[str], stems: list[str]) -> None:
+    assert picture_stems(names) == stems

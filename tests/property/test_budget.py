@@ -1,0 +1,109 @@
+"""Whatever the picture and the budget: the exact count, every view kept, and smaller budgets nest in larger ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import make_features
+from skimage.measure import label as connected_parts
+
+from gsmerge.allocate import RegionTree, cut_tree, region_tree, split_counts
+from gsmerge.moments import Members
+from gsmerge.segment import SegmentOptions, segment
+from gsmerge.threads import use_threads
+from gsmerge.types import FeatureGaussians, Groups
+
+FEW = settings(max_examples=25, deadline=None, derandomize=True)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_tree(seed: int, num_views: int, colours: int) -> RegionTree:
+    """Small views; few colours and depths make ties, some pixels do not count."""
+    rng = np.random.default_rng(seed)
+    height, width = rng.integers(3, 16, 2)
+    shape = (num_views, height, width)
+    images = torch.from_numpy(rng.integers(0, colours, (*shape, 3)) / max(colours - 1, 1)).float()
+    depths = torch.from_numpy(1.0 + rng.integers(0, colours, shape)).float()
+    valid = torch.from_numpy(rng.random(shape) > 0.2)
+    groups = segment(images, SegmentOptions(), int(rng.integers(1, height * width + 1)))
+    return region_tree(images, depths, groups, valid)
+
+
+def is_union_of(coarse: Groups, fine: Groups) -> bool:
+    for view, count in enumerate(fine.counts):
+        pairs = np.stack([fine.labels[view].numpy().ravel(), coarse.labels[view].numpy().ravel()])
+        if np.unique(pairs, axis=1).shape[1] != count:
+            return False
+    return True
+
+
+@FEW
+@given(seeds, st.integers(1, 4), st.integers(1, 5), st.floats(0, 1), st.floats(0, 1))
+def test_counts_are_exact_and_nest(seed: int, num_views: int, colours: int, low: float, high: float) -> None:
+    tree = random_tree(seed, num_views, colours)
+    few, many = sorted(num_views + int(share * (len(tree) - num_views)) for share in (low, high))
+    coarse, fine = cut_tree(tree, few), cut_tree(tree, many)
+    for groups, count in ((coarse, few), (fine, many)):
+        assert sum(groups.counts) == count
+        assert min(groups.counts) >= 1
+        for view, own in enumerate(groups.counts):
+            labels = groups.labels[view].numpy()
+            assert np.array_equal(np.unique(labels), np.arange(own))
+            assert connected_parts(labels, connectivity=1, background=-1).max() == own
+    assert is_union_of(coarse, fine)
+    assert is_union_of(fine, tree.groups)
+    assert (np.diff(tree.distortions) >= 0).all()
+
+
+@FEW
+@given(seeds, st.integers(1, 5))
+def test_more_than_there_is_leaves_the_superpixels(seed: int, colours: int) -> None:
+    tree = random_tree(seed, 2, colours)
+    groups = cut_tree(tree, len(tree) + 10)
+    assert groups.counts == tree.groups.counts
+    assert is_union_of(tree.groups, groups)
+
+
+@settings(max_examples=5, deadline=None, derandomize=True)
+@given(seeds)
+def test_threads_change_nothing(seed: int) -> None:
+    found = []
+    for threads in (1, 3):
+        with use_threads(threads):
+            tree = random_tree(seed, 4, 3)
+            found.append((tree.distortions, cut_tree(tree, (len(tree) + 4) // 2).labels))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert torch.equal(found[0][1], found[1][1])
+
+
+def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
+    """Up to 12 groups of up to 20 members, some of them alike."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(1, 20, rng.integers(1, 12))
+    n, g = int(sizes.sum()), len(sizes)
+    colours = rng.integers(0, 3, (n, 1, 3)) if seed % 2 else rng.normal(size=(n, 1, 3))
+    columns = (rng.normal(size=(n, 3)) * 0.01, np.eye(4)[np.zeros(n, int)], np.full((n, 3), 0.01), rng.random(n))
+    members = Members(*(np.ascontiguousarray(c, np.float32) for c in (*columns, colours, np.full(n, 0.01))))
+    features = make_features(rng.normal(size=(g, 3)) * 0.01)
+    starts = torch.from_numpy(np.concatenate([[0], np.cumsum(sizes)]))
+    return replace(
+        features, starts=starts, members=torch.arange(n), backing=torch.from_numpy(rng.random(g) < 0.2)
+    ), members
+
+
+@FEW
+@given(seeds, st.integers(0, 60), st.integers(0, 60), st.integers(1, 8))
+def test_splits_are_exact_and_monotone(seed: int, one: int, other: int, max_children: int) -> None:
+    features, members = random_groups(seed)
+    most = split_counts(features, members, 10**6, max_children)
+    few, many = (split_counts(features, members, extra, max_children) for extra in sorted((one, other)))
+    assert few.sum() == min(len(features) + min(one, other), most.sum())
+    assert many.sum() == min(len(features) + max(one, other), most.sum())
+    assert (few <= many).all()
+    assert (many <= most).all()
+    assert (few[features.backing.numpy()] == 1).all()
+    assert (few >= 1).all()
