@@ -4,6 +4,9 @@
 
 S1: 100 k Gaussians of 1.4 px, 476 x 476. S2: 1 M of 1.2 px, 640 x 480. S3: 20 k of 7 px, 476 x 476.
 
+The raster's backward pass ends with 9 sums per Gaussian; ``projection`` takes them to means, quaternions, scales and
+opacities, ``colours`` those of the colours to the spherical harmonics and the means.
+
 Milliseconds are process CPU time on one thread, best of the repeats, kernels warm; ours and the sketch's runs take
 turns. ``dB`` is the PSNR against float64 renders. Scenes, renders and sketch are looked for in ``GSMERGE_SHARED``
 and in ``../shared`` beside the repository; without them there is nothing to measure.
@@ -29,8 +32,11 @@ import torch
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from gsmerge.kernels.raster_backward import SUMS, blend_backward, gather_slots  # noqa: E402
 from gsmerge.metrics import psnr  # noqa: E402
 from gsmerge.render import composite, contributions, plan_view, prepare, splat_adjoint  # noqa: E402
+from gsmerge.render.blend import view_colors  # noqa: E402
+from gsmerge.render.gradient import color_gradients, gradients_of, plan_differentiable  # noqa: E402
 from gsmerge.threads import available_threads, use_threads  # noqa: E402
 from gsmerge.types import Gaussians  # noqa: E402
 
@@ -71,6 +77,16 @@ class Clock:
         return result
 
 
+def walk_back(plan: Any, image: Any, transmittance: Any, gradient: Any, colors: Any, slots: Any) -> None:
+    """The raster's part of :func:`gradients_of`."""
+    tiles, none = len(plan.offsets) - 1, np.empty((0, 0), np.float32)
+    blend_backward(
+        plan.footprints, colors, plan.members, plan.offsets, plan.columns, 0, tiles,
+        image, transmittance, gradient, none, slots,
+    )  # fmt: skip
+    gather_slots(plan.members, slots, 0, len(plan.ids), np.zeros((len(plan.ids), SUMS), np.float32))
+
+
 def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int) -> tuple[dict[str, float], Any]:
     """Best times of both, and our image."""
     tensors = {key: torch.from_numpy(scene[key]) for key in ("means", "quats", "scales", "opacities", "sh")}
@@ -88,6 +104,14 @@ def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int
         image, _ = clock("composite", lambda plan=plan: composite(plan))
         clock("adjoint", lambda plan=plan: splat_adjoint(plan, gradient))
         clock("contributions", lambda plan=plan: contributions(plan))
+    plan = plan_differentiable(splats, *view)
+    (image, left), colors = composite(plan), view_colors(plan)
+    slots, none = np.empty((len(plan.members), SUMS), np.float32), np.empty((0, 0), np.float32)
+    for _ in range(repeats + 1):
+        clock("sketch backward", lambda: raster.sums(gradient))
+        clock("raster backward", lambda: walk_back(plan, image, left, gradient, colors, slots))
+        wanted = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, none, False))
+        clock("color gradients", lambda wanted=wanted: color_gradients(plan, wanted.colors, colors))
     return clock.best, image
 
 
@@ -117,7 +141,7 @@ def main() -> None:
     print("| scene | SH | plan | composite | forward | sketch | ratio | adjoint | sketch backward | ratio "
           "| contributions | dB |")  # fmt: skip
     print("|-|-|-|-|-|-|-|-|-|-|-|-|")
-    speedups = []
+    speedups, backward = [], []
     for name in args.scenes:
         scene = generator.make(*generator.SPEC[name])
         for degree in (0, 3):
@@ -130,7 +154,13 @@ def main() -> None:
                   f"| {t['sketch forward']:.1f} | {forward / t['sketch forward']:.2f} | {t['adjoint']:.1f} "
                   f"| {t['sketch backward']:.1f} | {t['adjoint'] / t['sketch backward']:.2f} "
                   f"| {t['contributions']:.1f} | {quality} |", flush=True)  # fmt: skip
+            rest = t["gradients"] - t["raster backward"], t["color gradients"]
+            backward.append(f"| {name} | {degree} | {t['raster backward']:.1f} | {t['sketch backward']:.1f} "
+                            f"| {t['raster backward'] / t['sketch backward']:.2f} | {rest[0]:.1f} | {rest[1]:.1f} "
+                            f"| {sum(rest) / t['raster backward']:.2f} |")  # fmt: skip
         speedups.append((name, wall(scene, 1, args.repeats), wall(scene, available_threads(), args.repeats)))
+    print("\n| scene | SH | raster backward | sketch | ratio | projection backward | colours backward "
+          "| both / raster |\n|-|-|-|-|-|-|-|-|", *backward, sep="\n")  # fmt: skip
     print(f"\n| scene | forward wall, 1 thread | {available_threads()} threads |\n|-|-|-|")
     for name, one, all_threads in speedups:
         print(f"| {name} | {one:.1f} ms | {all_threads:.1f} ms |")

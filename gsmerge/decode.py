@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from gsmerge.kernels.bisect import bisect, gather_groups
-from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
+from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
 
@@ -39,7 +39,11 @@ class DecodeOptions:
 
 
 def decode(
-    features: FeatureGaussians, members: Members, options: DecodeOptions, counts: np.ndarray | None = None
+    features: FeatureGaussians,
+    members: Members,
+    options: DecodeOptions,
+    counts: np.ndarray | None = None,
+    rule: Rule = "depth",
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 
@@ -51,6 +55,7 @@ def decode(
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
         counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer are not looked at.
+        rule: How children are pooled, the encoder's.
 
     Returns:
         The Gaussians, those of one group next to each other.
@@ -65,7 +70,7 @@ def decode(
     divided = (counts > 1) & ~features.backing.numpy()
     gaussians = feature_to_gaussians(features)
     if divided.any():
-        children, parents = _children(features, members, np.flatnonzero(divided), counts)
+        children, parents = _children(features, members, np.flatnonzero(divided), counts, rule)
         whole = np.flatnonzero(~divided)
         order = np.argsort(np.concatenate([whole, parents]), kind="stable")
         gaussians = Gaussians.concat([gaussians[torch.from_numpy(whole)], children])[torch.from_numpy(order)]
@@ -73,7 +78,7 @@ def decode(
 
 
 def _children(
-    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
+    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray, rule: Rule
 ) -> tuple[Gaussians, np.ndarray]:
     """Gaussians of the children of some groups, and the group of each."""
     starts, ids = features.starts.numpy(), features.members.numpy()
@@ -89,7 +94,7 @@ def _children(
 
     found = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
     sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
-    moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), child_ids)
+    moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), child_ids, rule)
     gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
     means, sh = torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
     return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh), parents

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 
 from gsmerge.kernels.pool import group_members
-from gsmerge.moments import Members, Moments, pool_members, principal_axes
+from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Groups, PixelScene
-
-Rule = Literal["depth", "paper"]
 
 
 @dataclass(frozen=True)
@@ -49,10 +46,7 @@ def encode(scene: PixelScene, members: Members, groups: Groups, options: EncodeO
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
     """
     starts, ids, views = group_rows(scene, groups)
-    moments = pool_members(members, starts, ids, own_covariance=options.rule == "depth")
-    if options.rule == "paper":
-        moments = _mean_opacity(moments, members, starts, ids)
-    return from_moments(moments, starts, ids, views)
+    return from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
 
 
 def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -91,11 +85,3 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
         starts=tensor(starts),
         members=tensor(ids),
     )
-
-
-def _mean_opacity(moments: Moments, members: Members, starts: np.ndarray, ids: np.ndarray) -> Moments:
-    """The paper states no opacity rule: the members' mean opacity, written as the optical depth that gives it."""
-    scales, _ = principal_axes(moments.covars)
-    mean = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
-    extinctions = -np.log1p(-np.clip(mean, 1e-4, 0.999)) * scales[:, 1] * scales[:, 2]
-    return Moments(**{**moments.__dict__, "extinctions": extinctions})

@@ -26,7 +26,8 @@ class MatchOptions:
         overlap: Least overlap, 0 to 1.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
         neighbors: Nearest neighbours in 3D that are looked at, the own view's included.
-        cluster_size: Most Feature Gaussians in a star cluster.
+        cluster_size: Most Feature Gaussians in a star cluster; None: as many as there are views (a cluster holds
+            one of each view at most).
 
     Raises:
         ValueError: If a setting is unknown or out of range.
@@ -36,46 +37,54 @@ class MatchOptions:
     overlap: float = 0.7
     max_color: float = 0.12
     neighbors: int = 16
-    cluster_size: int = 4
+    cluster_size: int | None = None
 
     def __post_init__(self) -> None:
         if self.match not in ("overlap", "aabb", "none"):
             raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
         if not 0 <= self.overlap <= 1:
             raise ValueError(f"overlap: expected 0 to 1, got {self.overlap}")
-        for name in ("neighbors", "cluster_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.neighbors < 1:
+            raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
+        if self.cluster_size is not None and self.cluster_size < 1:
+            raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
 
 
 def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Clusters of Feature Gaussians of different views.
 
-    The backing layer is left alone. The result does not depend on the order of the Feature Gaussians: leaders are
-    taken by weight, ties by position.
+    The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
+    are taken by weight, ties by position. What is fully transparent is left alone.
     """
     count = len(features)
-    front = torch.nonzero(~features.backing)[:, 0].numpy()
-    if options.match == "none" or len(front) < 2 or len(torch.unique(features.views)) < 2:
-        return Matches(torch.arange(count), count)
-    means = features.means.double().numpy()[front]
-    views = features.views.numpy()[front]
-    neighbors = _nearest(means, options.neighbors)
-    covars = features.covars.double().numpy()[front].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-    colors = SH_C0 * features.sh0[:, 0].double().numpy()[front]
+    clusters = np.full(count, -1, np.int64)
+    num_found = 0
+    if options.match != "none" and len(torch.unique(features.views)) > 1:
+        solid = features.extinctions > 0
+        for layer in (solid & ~features.backing, solid & features.backing):
+            rows = torch.nonzero(layer)[:, 0].numpy()
+            if len(rows) > 1:
+                found, num_layer = _clusters(features, rows, options)
+                clusters[rows] = num_found + found
+                num_found += num_layer
+    alone = np.flatnonzero(clusters < 0)
+    clusters[alone] = num_found + np.arange(len(alone))
+    return Matches(torch.from_numpy(clusters), num_found + len(alone))
+
+
+def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
+    """Cluster of each of some rows, and the number of clusters."""
+    means, views = features.means.double().numpy()[rows], features.views.numpy()[rows]
+    covars = features.covars.double().numpy()[rows].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    colors = SH_C0 * features.sh0[:, 0].double().numpy()[rows]
+    neighbors, boxes = _nearest(means, options.neighbors), options.match == "aabb"
     scores = np.empty(neighbors.shape)
-    boxes = options.match == "aabb"
     edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, views, options.max_color, boxes, scores)
     if boxes:
-        found, num_found = connected_components(neighbors, scores, options.overlap)
-    else:
-        order = np.lexsort((*means.T, -features.weights.numpy()[front]))
-        found, num_found = leader_clusters(order, neighbors, scores, views, options.overlap, options.cluster_size)
-    clusters = np.empty(count, np.int64)
-    clusters[front] = found
-    backing = np.nonzero(features.backing.numpy())[0]
-    clusters[backing] = num_found + np.arange(len(backing))
-    return Matches(torch.from_numpy(clusters), num_found + len(backing))
+        return connected_components(neighbors, scores, options.overlap)
+    order = np.lexsort((*means.T, -features.weights.numpy()[rows]))
+    size = options.cluster_size or len(np.unique(views))
+    return leader_clusters(order, neighbors, scores, views, options.overlap, size)
 
 
 def _nearest(means: np.ndarray, count: int) -> np.ndarray:

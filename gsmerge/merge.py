@@ -86,7 +86,7 @@ def _pool(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> Featur
         shN=single(total(share[:, None, None] * rows(features.shN))),
         footprints=single(total(share * rows(features.footprints))),
         views=torch.full((len(cuts),), -1),
-        backing=torch.zeros(len(cuts), dtype=torch.bool),
+        backing=features.backing[order][torch.from_numpy(cuts)],
         starts=torch.cat([starts[torch.from_numpy(cuts)], starts[-1:]]),
         members=members,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor
 from gsmerge.kernels.pool import decompose, pool
 from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+
+Rule = Literal["depth", "paper"]
 
 MIN_SCALE = 1e-12
 MAX_OPACITY = 0.999  # of a merged Gaussian: finite as a logit, and still differentiable for a later fit
@@ -76,15 +79,16 @@ class Moments:
     sh: np.ndarray
 
 
-def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, *, own_covariance: bool = True) -> Moments:
-    """Moments of every group of members (docs/method: opacity weights, total covariance, winsorised members).
+def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Rule = "depth") -> Moments:
+    """Moments of every group of members: opacity weights, total covariance, winsorised members.
 
     Args:
         members: The scene's Gaussians.
         starts: ``[g+1]`` int64 into ``ids``.
         ids: ``[m]`` int64 rows of ``members``.
-        own_covariance: Add the members' own covariances to the spread of their means. Without it this is the
-            paper's moment matching (eq. teacher_mean, teacher_cov).
+        rule: ``"depth"``: the members' own covariances are added to the spread of their means, and the optical
+            depth is what they have together. ``"paper"``: the paper's moment matching (eq. teacher_mean,
+            teacher_cov), which states no opacity: the members' mean.
     """
     num_groups = len(starts) - 1
     geometry = np.zeros((num_groups, 13))
@@ -95,12 +99,16 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, *, own_c
         m = members
         pool(
             starts[first : last + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh, m.footprints,
-            own_covariance, geometry[first:last], sh[first:last],
+            rule == "depth", geometry[first:last], sh[first:last],
         )  # fmt: skip
 
     parallel_map(run, range(0, num_groups, ROWS_PER_TASK))
-    covars = geometry[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
-    return Moments(geometry[:, :3], covars, geometry[:, 9], geometry[:, 10], geometry[:, 11], geometry[:, 12], sh)
+    covars, extinctions = geometry[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3), geometry[:, 11]
+    if rule == "paper" and num_groups:
+        scales, _ = principal_axes(covars)
+        mean = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
+        extinctions = -np.log1p(-np.clip(mean, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
+    return Moments(geometry[:, :3], covars, geometry[:, 9], geometry[:, 10], extinctions, geometry[:, 12], sh)
 
 
 def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

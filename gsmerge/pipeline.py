@@ -24,7 +24,7 @@ from gsmerge.moments import Members, scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
-from gsmerge.robust import MIN_VIEWS, choose_merge
+from gsmerge.robust import MIN_VIEWS, choose_merge, close_holes
 from gsmerge.segment import count_for, segment
 from gsmerge.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, PixelScene
@@ -119,7 +119,7 @@ def compact(
             members = scene_members(canonical)
         features = _merged_features(canonical, members, options, run)
         with run.stage("decode"):
-            gaussians = decode(features, members, options.decode)
+            gaussians = decode(features, members, options.decode, rule=options.encode.rule)
         del features, members
         if canonical.images is not None:
             with run.stage("fit"):
@@ -142,27 +142,38 @@ def compact(
 
 def _merged_features(scene: PixelScene, members: Members, options: CompactOptions, run: _Run) -> FeatureGaussians:
     """Superpixels, one Feature Gaussian each, the merge that the photos prefer, and merging across views."""
-    robust = options.robust.robust and scene.images is not None and len(scene) >= MIN_VIEWS
+    robust = options.robust.robust and scene.images is not None
     with run.stage("segment"):
         height, width = scene.cameras.height, scene.cameras.width
         count = count_for(options.segment, height, width)
         if count > height * width:
             raise ValueError(f"superpixels: expected at most {height * width}, one per pixel, got {count}")
-        coarse = min(max(1, round(options.backing.backing * count)), count - 1) if robust else 0
+        behind = robust and len(scene) >= MIN_VIEWS
+        coarse = min(round(options.backing.backing * count), count - 1) if behind else 0
         pictures = scene.images if scene.images is not None else _own_colors(scene)
         groups = segment(pictures, options.segment, count - coarse)
         coarse_groups = segment(pictures, options.segment, coarse) if coarse else None
     with run.stage("encode"):
         features = encode(scene, members, groups, options.encode)
-    if coarse_groups is not None:
-        with run.stage("robust"):
-            backing = encode_backing(scene, members, coarse_groups, options.backing)
-            features, choice = choose_merge(features, backing, scene_photos(scene, 2), options.robust)
-            run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
+    if not robust:
+        with run.stage("match"):
+            return _matched(features, options, run)
+    with run.stage("robust"):
+        backing = encode_backing(scene, members, coarse_groups, options.backing) if coarse_groups else None
+        photos = scene_photos(scene, 2)
+        features, choice = choose_merge(features, backing, photos, options.robust)
+        run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
     with run.stage("match"):
-        matches = match(features, options.match)
-        run.choices["groups"], run.choices["clusters"] = len(features), matches.count
-        return merge(features, matches)
+        features, choice = close_holes(_matched(features, options, run), backing, photos, options.robust)
+        run.choices["closed"] = choice.name
+        return features
+
+
+def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> FeatureGaussians:
+    """Merged across views."""
+    matches = match(features, options.match)
+    run.choices["groups"], run.choices["clusters"] = len(features), matches.count
+    return merge(features, matches)
 
 
 def _own_colors(scene: PixelScene) -> torch.Tensor:

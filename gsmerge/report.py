@@ -22,7 +22,8 @@ COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5}
 COST_MERGE = 0.5
 COST_SCORE = 1.3  # rendering the photos from input and output
 COST_ROBUST = 1.6
-COST_FIT = 0.9
+COST_COLOR_FIT = 0.9
+COST_FULL_FIT = 0.36  # per step and million pixels of one view
 BYTES_FIXED = 350_000_000  # interpreter, torch and numba
 BYTES_PER_GAUSSIAN = 240
 BYTES_PER_PIXEL = 100  # the photo as floats and what segmentation and rendering keep of it
@@ -161,7 +162,7 @@ def plan_document(
         options: All settings by flat name, as of ``CompactOptions.to_dict()``.
         output_path: The ``.ply`` that would be written.
         per_view: Superpixels per view.
-        photos: Whether the scene has photos; robust merging and the colour fit need them.
+        photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
         notes: What the reader had to say.
 
@@ -174,7 +175,9 @@ def plan_document(
     robust = bool(options["robust"]) and photos and views >= 3
     fit = options["fit"] if photos else "none"
     work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
-    work += COST_ROBUST * robust + COST_FIT * (fit != "none")
+    work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
+    steps = options["fit_steps"] if fit == "full" else 0
+    seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
         **document_head(),
@@ -188,7 +191,7 @@ def plan_document(
         "robust": robust,
         "fit": fit,
         "estimate": {
-            "seconds": round(COST_FIXED + pixels / 1e6 * work / min(threads, views), 1),
+            "seconds": round(COST_FIXED + seconds / min(threads, views), 1),
             "memory_bytes": memory,
         },
         "options": dict(options),

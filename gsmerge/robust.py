@@ -7,7 +7,7 @@ from the Gaussians of the *other* views only, on half-size photos, and the best 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +28,7 @@ class RobustOptions:
     """The family of merges and how it is judged.
 
     Args:
-        robust: Choose among the family (needs three views and photos); otherwise the plain merge is taken.
+        robust: Choose among the family by the photos; otherwise the plain merge is taken.
         widen: Standard deviations of the "wide" members times this; a single layer of merged Gaussians is not
             closed at 1.
         boost: Factor on the optical depth before the other views' photos weigh it down.
@@ -55,54 +55,102 @@ class RobustOptions:
 
 @dataclass(frozen=True)
 class RobustChoice:
-    """The merge that won and the leave-one-view-out PSNR (dB) of every candidate."""
+    """The merge that won and the PSNR (dB) of every candidate: of views left out, with one or two views of all."""
 
     name: str
     scores: dict[str, float]
 
 
 def choose_merge(
-    features: FeatureGaussians, backing: FeatureGaussians, photos: Photos, options: RobustOptions
+    features: FeatureGaussians, backing: FeatureGaussians | None, photos: Photos, options: RobustOptions
 ) -> tuple[FeatureGaussians, RobustChoice]:
-    """The candidate with the best leave-one-view-out PSNR.
+    """The candidate that shows the photos best.
+
+    From three views up every photo is rendered from the other views' Gaussians only. One or two views leave nothing
+    to leave out: there the candidates differ in their spread alone, and the photos are rendered from everything.
 
     Args:
         features: Plain Feature Gaussians, unmerged across views.
-        backing: The coarse layer, see :mod:`gsmerge.backing`.
+        backing: The coarse layer, see :mod:`gsmerge.backing`; None: no candidate has one.
         photos: The input views, usually at half size.
         options: The family.
     """
-    best, found, scores = -np.inf, None, {}
-    for name, candidate in _family(features, backing, photos, options):
-        scores[name] = leave_one_out(candidate, photos)
-        if scores[name] > best:
-            best, found, winner = scores[name], candidate, name
-    assert found is not None
-    return found, RobustChoice(winner, scores)
+    many = len(photos) >= MIN_VIEWS
+    family = _family(features, backing, photos, options) if many else _spreads(features, options)
+    return _best(family, photos, left_out=many)
+
+
+def close_holes(
+    merged: FeatureGaussians, backing: FeatureGaussians | None, photos: Photos, options: RobustOptions
+) -> tuple[FeatureGaussians, RobustChoice]:
+    """Wider Gaussians or a backing layer where merging across views has opened holes.
+
+    Several views' layers on one surface close each other's gaps; merged into one they may not. The photos, rendered
+    from everything, decide.
+
+    Args:
+        merged: Feature Gaussians after merging across views.
+        backing: The coarse layer, for candidates without one; None: no candidate gets one.
+        photos: The input views, usually at half size.
+        options: The family.
+    """
+    family = [("as it is", merged)]
+    wide = replace(merged, spreads=merged.spreads * options.widen)
+    narrow = not bool(merged.backing.all()) and float(merged.spreads[~merged.backing].max()) <= 1
+    if narrow:
+        family.append(("wide", wide))
+    if backing is not None and not bool(merged.backing.any()):
+        family.append(("back", FeatureGaussians.concat([merged, backing])))
+        if narrow:
+            family.append(("wide+back", FeatureGaussians.concat([wide, backing])))
+    return _best(family, photos, left_out=False)
+
+
+def _best(
+    family: Iterable[tuple[str, FeatureGaussians]], photos: Photos, *, left_out: bool
+) -> tuple[FeatureGaussians, RobustChoice]:
+    """The member of the family with the best score; the first of equals."""
+    scores: dict[str, float] = {}
+    best: tuple[str, FeatureGaussians] | None = None
+    for name, candidate in family:
+        scores[name] = photo_psnr(candidate, photos, left_out=left_out)
+        if best is None or scores[name] > scores[best[0]]:
+            best = name, candidate
+    assert best is not None
+    return best[1], RobustChoice(best[0], scores)
 
 
 def _family(
-    features: FeatureGaussians, backing: FeatureGaussians, photos: Photos, options: RobustOptions
+    features: FeatureGaussians, backing: FeatureGaussians | None, photos: Photos, options: RobustOptions
 ) -> Iterator[tuple[str, FeatureGaussians]]:
     """Plain, wide, weighed, and with the backing layer behind."""
     wide = replace(features, spreads=features.spreads * options.widen)
     yield "plain", features
     yield "wide", wide
-    yield "wide+back", FeatureGaussians.concat([wide, backing])
+    if backing is not None:
+        yield "wide+back", FeatureGaussians.concat([wide, backing])
     for name, base in (("plain", features), ("wide", wide)):
         weighed = replace(base, gains=weigh(base, photos, options))
         yield f"{name}+weigh", weighed
-        yield f"{name}+weigh+back", FeatureGaussians.concat([weighed, backing])
+        if backing is not None:
+            yield f"{name}+weigh+back", FeatureGaussians.concat([weighed, backing])
 
 
-def leave_one_out(features: FeatureGaussians, photos: Photos) -> float:
-    """Mean PSNR (dB) of every photo rendered from the other views' Gaussians only."""
+def _spreads(features: FeatureGaussians, options: RobustOptions) -> Iterator[tuple[str, FeatureGaussians]]:
+    """Plain, wide, and wider still."""
+    yield "plain", features
+    for name, power in (("wide", 1), ("wider", 2)):
+        yield name, replace(features, spreads=features.spreads * options.widen**power)
+
+
+def photo_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) -> float:
+    """Mean PSNR (dB) of every photo rendered from all Gaussians, or from those of the other views only."""
     splats, views = prepare(feature_to_gaussians(features)), features.views.numpy()
 
     def score(view: int) -> float:
         plan = plan_view(
             splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height,
-            eps2d=photos.eps2d, keep=views != view,
+            eps2d=photos.eps2d, keep=views != view if left_out else None,
         )  # fmt: skip
         image, _ = composite(plan)
         return psnr(np.clip(image, 0, 1), photos.images[view])

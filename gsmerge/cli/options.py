@@ -43,6 +43,7 @@ class Match(str, Enum):
 class Fit(str, Enum):
     """What is fitted to the input images."""
 
+    full = "full"
     color = "color"
     none = "none"
 
@@ -131,7 +132,7 @@ MatchOption = Annotated[
     Match | None, typer.Option(help="Merging across views.", show_default="overlap", rich_help_panel=MERGING)
 ]
 FitOption = Annotated[
-    Fit | None, typer.Option(help="What to fit to the photos.", show_default="color", rich_help_panel=MERGING)
+    Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
 ]
 OutputOption = Annotated[
     Path | None,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsmerge.fit.holdout import holdout_psnr, training_weights
+from gsmerge.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.options import FitOptions, Rates
 from gsmerge.fit.report import FitReport
@@ -115,17 +115,16 @@ class Plan:
 def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int) -> Plan:
     """Held-out blocks, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
-    height, width = photos[1].height, photos[1].width
-    half = [np.ascontiguousarray(weight[::2, ::2][:height, :width]) for weight in full]
     few = len(photos[0]) <= FEW_VIEWS and options.fit_steps >= MANY_STEPS
     dropout = options.dropout if options.dropout is not None else DROPOUT if few else 0.0
-    return Plan(photos, (full, half), options, dropout)
+    return Plan(photos, (full, reduced(full, photos[1])), options, dropout)
 
 
 def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """One Adam step on one view -> mean squared error of its training pixels."""
     level = 1 if progress < plan.options.coarse else 0
-    photos, weight = plan.photos[level], plan.weights[level][view]
+    photos = plan.photos[level]
+    weight = plan.weights[level][view] if level == 1 else np.ones_like(plan.weights[level][view])
     background, opacities = rng.random(3, dtype=np.float32), None
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout

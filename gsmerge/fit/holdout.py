@@ -7,14 +7,12 @@ import numpy as np
 from gsmerge.photos import Photos
 from gsmerge.threads import parallel_map
 
-BLOCK = 32  # pixels of the full-size image
-EPS2D = 0.3  # of the full-size image, see gsmerge.photos
+BLOCK = 32  # pixels, at most
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Per view ``[h,w]`` float32: 0 on the held-out blocks, 1 elsewhere; the same blocks at every size."""
-    scale = (photos.eps2d / EPS2D) ** 0.5
-    size = max(2, round(BLOCK * scale))
+    """Per view ``[h,w]`` float32: 0 on the held-out blocks, 1 elsewhere; every view holds out at least one block."""
+    size = max(1, min(BLOCK, min(photos.height, photos.width) // 4))
 
     def one_view(view: int) -> np.ndarray:
         rows, columns = -(-photos.height // size), -(-photos.width // size)
@@ -26,6 +24,11 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
         return full.astype(np.float32)
 
     return [one_view(view) for view in range(len(photos))]
+
+
+def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
+    """The weights of full-size photos for the same photos at half size."""
+    return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
 def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndarray]) -> float:

@@ -1,17 +1,22 @@
 """The one place that configures numba.
 
-Compiled kernels are cached where the user may write, even if the package folder may not be: numba's own choice
-(``__pycache__`` beside the source, then the user's cache folder) unless neither is writable, then a folder below
-the system's temporary one.
+Compiled kernels are cached where the user may write: ``GSMERGE_CACHE_DIR`` if it is set, beside the sources, in the
+user's cache folder, or below the system's temporary one, whichever is the first that can be written. The folder's
+name carries a hash of all kernel sources: numba looks at a kernel's own file alone and would go on with an old copy of
+what it inlined from another.
 """
 
 from __future__ import annotations
 
+import getpass
+import hashlib
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numba
 
 # Reassociation lets sums vectorise; NaN and inf keep their meaning, so that bad input is not optimised away.
 FAST = frozenset({"contract", "nsz", "arcp", "reassoc"})
@@ -26,17 +31,26 @@ def _writable(folder: Path) -> bool:
         return False
 
 
-def _choose_cache() -> None:
-    """Point numba at a temporary folder when neither the package nor the user's cache can be written."""
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
-    if "NUMBA_CACHE_DIR" in os.environ or _writable(Path(__file__).parent / "__pycache__") or _writable(user):
-        return
-    os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"gsmerge-kernels-{os.getuid()}")
+def _sources_hash() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
-_choose_cache()
+def cache_folder() -> Path:
+    """Where this version's compiled kernels are kept."""
+    given = os.environ.get("GSMERGE_CACHE_DIR") or os.environ.get("NUMBA_CACHE_DIR")
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gsmerge"
+    places = [Path(given)] if given else [Path(__file__).parent / "__pycache__", user]
+    name = f"kernels-{_sources_hash()}"
+    for place in places:
+        if _writable(place):
+            return place / name
+    return Path(tempfile.gettempdir()) / f"gsmerge-{getpass.getuser()}" / name
 
-from numba import njit  # noqa: E402 - the cache folder is read at import
+
+_CACHE = str(cache_folder())
 
 
 def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, exact: bool = False) -> Any:
@@ -49,12 +63,16 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, 
     """
 
     def wrap(f: Callable[..., Any]) -> Any:
-        return njit(
-            cache=True,
-            nogil=True,
-            error_model="numpy",
-            fastmath=False if exact else set(FAST),
-            inline="always" if inline else "never",
-        )(f)
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, _CACHE
+        try:
+            return numba.njit(
+                cache=True,
+                nogil=True,
+                error_model="numpy",
+                fastmath=False if exact else set(FAST),
+                inline="always" if inline else "never",
+            )(f)
+        finally:
+            numba.config.CACHE_DIR = before
 
     return wrap(function) if function is not None else wrap

@@ -181,7 +181,7 @@ def decompose(covars, out_scales, out_quats):
                 order[0] = k
             if a[k, k] >= a[order[2], order[2]]:
                 order[2] = k
-        order[1] = 3 - order[0] - order[2]
+        order[1] = min(3 - order[0] - order[2], 2)  # NaN compares to nothing
         for k in range(3):
             out_scales[g, k] = np.sqrt(max(a[order[k], order[k]], 0.0))
         for k in range(3):

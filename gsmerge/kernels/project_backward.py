@@ -31,6 +31,48 @@ PLANES = 20 + POSE
 P = tuple(np.uint64(BLOCK * plane) for plane in range(PLANES))
 
 
+@kernel(inline=True)
+def _rotation(w, x, y, z, h):
+    """Rotation matrix of a unit quaternion, row by row; h is 2, or 0 for no rotation."""
+    one = f4(1.0)
+    return (
+        one - h * (y * y + z * z), h * (x * y - w * z), h * (x * z + w * y),
+        h * (x * y + w * z), one - h * (x * x + z * z), h * (y * z - w * x),
+        h * (x * z - w * y), h * (y * z + w * x), one - h * (x * x + y * y),
+    )  # fmt: skip
+
+
+@kernel(inline=True)
+def _rotation_backward(w, x, y, z, h, g00, g01, g02, g10, g11, g12, g20, g21, g22):
+    """Gradient of the unit quaternion from that of its rotation matrix: only what is across it."""
+    two = f4(2.0)
+    gw = x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01)
+    gx = w * (g21 - g12) + y * (g01 + g10) + z * (g02 + g20) - two * x * (g11 + g22)
+    gy = w * (g02 - g20) + x * (g01 + g10) + z * (g12 + g21) - two * y * (g00 + g22)
+    gz = w * (g10 - g01) + x * (g02 + g20) + y * (g12 + g21) - two * z * (g00 + g11)
+    along = gw * w + gx * x + gy * y + gz * z
+    return h * (gw - along * w), h * (gx - along * x), h * (gy - along * y), h * (gz - along * z)
+
+
+@kernel(inline=True)
+def _conic_backward(uu, uv, vv, det0, eps2d, sxx, sxy, syy, thinning):
+    """Conic A, B, C (the exponent is -1/2 (A xx + 2 B xy + C yy)), and the gradient xx, xy, yy of the covariance.
+
+    With the conic Q and half the second moments M it is Q M Q. What the dilation takes of the density, with an
+    antialiased s = ``thinning``, adds s (inv(S) - Q), S the covariance before the dilation.
+    """
+    det = det0 + eps2d * (uu + vv + eps2d)
+    det = det if det > f4(1e-20) else f4(1e-20)
+    scale, scale0 = f4(1.0) / det, f4(1.0) / (det0 if det0 > f4(1e-30) else f4(1.0))
+    a, b, c = (vv + eps2d) * scale, -uv * scale, (uu + eps2d) * scale
+    thinning = thinning if det0 > f4(0.005 * 0.005) * det else f4(0.0)
+    e00, e01, e10, e11 = a * sxx + b * sxy, a * sxy + b * syy, b * sxx + c * sxy, b * sxy + c * syy
+    gxx = e00 * a + e01 * b + thinning * (vv * scale0 - a)
+    gxy = e00 * b + e01 * c - thinning * (uv * scale0 + b)
+    gyy = e10 * b + e11 * c + thinning * (uu * scale0 - c)
+    return a, b, c, gxx, gxy, gyy
+
+
 @kernel
 def _block_backward(block, camera):
     """Replace the Gaussians of a block by their gradients."""
@@ -58,13 +100,9 @@ def _block_backward(block, camera):
         b0, b1, b2 = jy * r10 + jyz * r20, jy * r11 + jyz * r21, jy * r12 + jyz * r22
         qw, qx, qy, qz = block[i + P[3]], block[i + P[4]], block[i + P[5]], block[i + P[6]]
         qq = qw * qw + qx * qx + qy * qy + qz * qz
-        turned = qq > f4(1e-30)
-        qn = one / np.sqrt(qq if turned else one)
+        h, qn = two if qq > f4(1e-30) else zero, one / np.sqrt(qq if qq > f4(1e-30) else one)
         qw, qx, qy, qz = qw * qn, qx * qn, qy * qn, qz * qn
-        h = two if turned else zero
-        m00, m01, m02 = one - h * (qy * qy + qz * qz), h * (qx * qy - qw * qz), h * (qx * qz + qw * qy)
-        m10, m11, m12 = h * (qx * qy + qw * qz), one - h * (qx * qx + qz * qz), h * (qy * qz - qw * qx)
-        m20, m21, m22 = h * (qx * qz - qw * qy), h * (qy * qz + qw * qx), one - h * (qx * qx + qy * qy)
+        m00, m01, m02, m10, m11, m12, m20, m21, m22 = _rotation(qw, qx, qy, qz, h)
         s0, s1, s2 = block[i + P[7]], block[i + P[8]], block[i + P[9]]
         wide = widest * z
         free0, free1, free2 = one if s0 < wide else zero, one if s1 < wide else zero, one if s2 < wide else zero
@@ -76,25 +114,12 @@ def _block_backward(block, camera):
         uu, vv, uv = u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2, u0 * v0 + u1 * v1 + u2 * v2
         n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
         det0 = n0 * n0 + n1 * n1 + n2 * n2
-        det = det0 + eps2d * (uu + vv + eps2d)
-        det = det if det > f4(1e-20) else f4(1e-20)
-        idet = one / det
-        # the conic: the exponent is -1/2 (A xx + 2 B xy + C yy)
-        ca, cb, cc = (vv + eps2d) * idet, -uv * idet, (uu + eps2d) * idet
-        # covariance: d/dS = 1/2 Q M Q, Q the conic, M the second moments; the dilation's loss of density adds
-        # 1/2 s (inv(S0) - Q), S0 the covariance before it
         sv, sx, sy = block[i + P[13]], block[i + P[14]], block[i + P[15]]
         sxx, sxy, syy = half * block[i + P[16]], half * block[i + P[17]], half * block[i + P[18]]
-        e00, e01 = ca * sxx + cb * sxy, ca * sxy + cb * syy
-        e10, e11 = cb * sxx + cc * sxy, cb * sxy + cc * syy
-        thinned = filtered * sv if det0 > f4(0.005 * 0.005) * det else zero
-        idet0 = one / (det0 if det0 > f4(1e-30) else one)
-        g00 = e00 * ca + e01 * cb + thinned * (vv * idet0 - ca)
-        g01 = e00 * cb + e01 * cc + thinned * (-uv * idet0 - cb)
-        g11 = e10 * cb + e11 * cc + thinned * (uu * idet0 - cc)
+        ca, cb, cc, gxx, gxy, gyy = _conic_backward(uu, uv, vv, det0, eps2d, sxx, sxy, syy, filtered * sv)
         # half axes, scales, then c and d in place of u and v
-        gu0, gu1, gu2 = two * (g00 * u0 + g01 * v0), two * (g00 * u1 + g01 * v1), two * (g00 * u2 + g01 * v2)
-        gv0, gv1, gv2 = two * (g11 * v0 + g01 * u0), two * (g11 * v1 + g01 * u1), two * (g11 * v2 + g01 * u2)
+        gu0, gu1, gu2 = two * (gxx * u0 + gxy * v0), two * (gxx * u1 + gxy * v1), two * (gxx * u2 + gxy * v2)
+        gv0, gv1, gv2 = two * (gyy * v0 + gxy * u0), two * (gyy * v1 + gxy * u1), two * (gyy * v2 + gxy * u2)
         block[i + P[7]] = (gu0 * c0 + gv0 * d0) * free0
         block[i + P[8]] = (gu1 * c1 + gv1 * d1) * free1
         block[i + P[9]] = (gu2 * c2 + gv2 * d2) * free2
@@ -103,13 +128,9 @@ def _block_backward(block, camera):
         w00, w01, w02 = a0 * gu0 + b0 * gv0, a0 * gu1 + b0 * gv1, a0 * gu2 + b0 * gv2
         w10, w11, w12 = a1 * gu0 + b1 * gv0, a1 * gu1 + b1 * gv1, a1 * gu2 + b1 * gv2
         w20, w21, w22 = a2 * gu0 + b2 * gv0, a2 * gu1 + b2 * gv1, a2 * gu2 + b2 * gv2
-        h0 = qx * (w21 - w12) + qy * (w02 - w20) + qz * (w10 - w01)
-        h1 = qw * (w21 - w12) + qy * (w01 + w10) + qz * (w02 + w20) - two * qx * (w11 + w22)
-        h2 = qw * (w02 - w20) + qx * (w01 + w10) + qz * (w12 + w21) - two * qy * (w00 + w22)
-        h3 = qw * (w10 - w01) + qx * (w02 + w20) + qy * (w12 + w21) - two * qz * (w00 + w11)
-        along, h = h0 * qw + h1 * qx + h2 * qy + h3 * qz, h * qn
-        block[i + P[3]], block[i + P[4]] = h * (h0 - along * qw), h * (h1 - along * qx)
-        block[i + P[5]], block[i + P[6]] = h * (h2 - along * qy), h * (h3 - along * qz)
+        block[i + P[3]], block[i + P[4]], block[i + P[5]], block[i + P[6]] = _rotation_backward(
+            qw, qx, qy, qz, h * qn, w00, w01, w02, w10, w11, w12, w20, w21, w22
+        )
         # J W, and through it and the image position the camera position
         ga0, ga1, ga2 = (
             m00 * gu0 + m01 * gu1 + m02 * gu2,
@@ -202,3 +223,12 @@ def project_backward(
                 for lane in range(size):
                     total += block[P[20] + np.uint64(q * BLOCK + lane)]
                 grad_poses[start // BLOCK, q] = total
+
+
+@kernel
+def add_rows(ids, rows, totals):
+    """Add ``rows [m,c]`` to ``totals [n,c]`` at the ``ids [m]`` int32."""
+    for i in range(ids.shape[0]):
+        k = np.uint64(ids[i])
+        for c in range(rows.shape[1]):
+            totals[k, c] += rows[i, c]

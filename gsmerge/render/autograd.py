@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsmerge.kernels.project_backward import add_rows
 from gsmerge.render.blend import view_colors
 from gsmerge.render.gradient import DifferentiablePlan, color_gradients, gradients_of, plan_differentiable
 from gsmerge.render.images import Rendering, draw_views, prepare_views
@@ -74,7 +75,7 @@ class _Render(torch.autograd.Function):
             )
             rows, pose = _view_gradients(plan, image, left, grad_image, grad_alpha, ctx.needs_input_grad[-1])
             for total, row in zip(totals, rows, strict=True):
-                total[plan.ids] += row
+                add_rows(plan.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
             if pose is not None:
                 poses[view] = pose
         gradients = [
