@@ -28,6 +28,7 @@ PRESETS = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 DEPTH_RANGE = 1e3  # depths are held within this factor of the view's median
 GROUPS_PER_TASK = 8192
+PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
 
 
@@ -46,7 +47,7 @@ class AllocateOptions:
         knee_floor: Squared error per pixel and channel that no count removes (noise, views that disagree).
     """
 
-    depth_weight: float = 16.0
+    depth_weight: float = 1.0
     region_compactness: float = 1e-5
     max_extent: float = 1 / 8
     knee_slope: float = 1.0
@@ -260,7 +261,9 @@ def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarra
     def run(rows: np.ndarray) -> np.ndarray:
         local, own = gather_groups(starts, ids, rows)
         m = members
-        return split_errors(local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], max_children)
+        return split_errors(
+            local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
+        )
 
     tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
     return np.concatenate(parallel_map(run, tasks))

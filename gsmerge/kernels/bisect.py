@@ -89,16 +89,17 @@ def _thickness(scatter):
 
 
 @kernel
-def _error(members, weights, scatter):
-    """Squared error of colour and of the distance from a plane, as if every member weighed one."""
+def _error(members, weights, scatter, plane_weight):
+    """Squared error of colour and, weighted, of the distance from a plane, as if every member weighed one."""
     total = 0.0
     for i in members:
         total += weights[i]
-    return members.shape[0] / total * (scatter[0, 0] + scatter[1, 1] + scatter[2, 2] + _thickness(scatter))
+    colour = scatter[0, 0] + scatter[1, 1] + scatter[2, 2]
+    return members.shape[0] / total * (colour + plane_weight * _thickness(scatter))
 
 
 @kernel
-def _split(order, count, features, weights, cuts, errors):
+def _split(order, count, features, weights, cuts, errors, plane_weight):
     """Cut ``order`` (local member ids) into at most ``count`` runs, bounded by ``cuts`` -> number of runs.
 
     ``errors[r - 1]`` becomes the summed error of the first r runs found, if there is room for it.
@@ -110,7 +111,7 @@ def _split(order, count, features, weights, cuts, errors):
     runs = 1
     spread[0] = _axis(order, features, weights, mean[0], axis[0], scatter)
     if measured:
-        error[0] = errors[0] = _error(order, weights, scatter)
+        error[0] = errors[0] = _error(order, weights, scatter, plane_weight)
     while runs < count:
         widest = np.argmax(spread[:runs])
         if spread[widest] <= 1e-12:
@@ -129,7 +130,7 @@ def _split(order, count, features, weights, cuts, errors):
             run = order[cuts[r] : cuts[r + 1]]
             spread[r] = _axis(run, features, weights, mean[r], axis[r], scatter)
             if measured:
-                error[r] = _error(run, weights, scatter)
+                error[r] = _error(run, weights, scatter, plane_weight)
         if measured:
             errors[runs - 1] = error[:runs].sum()
     return runs
@@ -149,7 +150,7 @@ def _fill_features(own, means, sh, opacities, centre, footprint, features, weigh
 
 
 @kernel
-def _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, errors):
+def _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, errors, plane_weight):
     """Children of every group, at most ``counts [g]`` of them, and their ``errors [g, any]``."""
     num_groups = starts.shape[0] - 1
     first, longest, most = starts[0], 0, 1
@@ -165,7 +166,7 @@ def _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, erro
         own = ids[starts[g] : starts[g + 1]]
         n = own.shape[0]
         _fill_features(own, means, sh, opacities, centres[g], footprints[g], features, weights, order)
-        runs = _split(order[:n], counts[g], features, weights, cuts, errors[g])
+        runs = _split(order[:n], counts[g], features, weights, cuts, errors[g], plane_weight)
         for j in range(n):
             child_ids[starts[g] - first + j] = own[order[j]]
         for r in range(runs):
@@ -194,16 +195,17 @@ def bisect(starts, ids, means, sh, opacities, centres, footprints, num_children)
     """
     num_groups = len(starts) - 1
     counts = np.array(np.broadcast_to(num_children, num_groups), np.int64)
-    return _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, np.empty((num_groups, 0)))
+    return _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0)
 
 
-def split_errors(starts, ids, means, sh, opacities, centres, footprints, max_children):
+def split_errors(starts, ids, means, sh, opacities, centres, footprints, max_children, plane_weight):
     """``[g,max_children]`` squared error of every group with 1, 2, ... children, NaN beyond what its members give.
 
-    Children as in :func:`bisect`. A member's error is its squared distance from the child's mean colour plus that
-    from the plane fitted to the child, in features; every member weighs one on average, opaque ones more.
+    Children as in :func:`bisect`. A member's error is its squared distance from the child's mean colour, plus that
+    from the plane fitted to the child times ``plane_weight``, in features; members weigh one on average, opaque
+    ones more.
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
-    _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, errors)
+    _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, errors, plane_weight)
     return errors

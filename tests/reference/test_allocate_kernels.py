@@ -178,13 +178,13 @@ class Groups:
             return len(rows) * (weights[:, None] * delta).T @ delta / weights.sum()
 
         thickness = np.linalg.eigvalsh(scatter(0.012 / footprint * self.means[rows].astype(float)))[0]
-        return float(np.trace(scatter(SH_C0 * self.sh[rows, 0].astype(float)))) + max(thickness, 0)
+        return float(np.trace(scatter(SH_C0 * self.sh[rows, 0].astype(float)))) + 0.7 * max(thickness, 0)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_errors_are_those_of_the_children(seed: int) -> None:
     groups = Groups(seed)
-    errors = split_errors(*groups.arrays(), 6)
+    errors = split_errors(*groups.arrays(), 6, 0.7)
     for count in range(1, 7):
         starts, ids, parents = bisect(*groups.arrays(), count)
         found, number = np.zeros(4), np.zeros(4)

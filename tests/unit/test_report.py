@@ -90,7 +90,7 @@ def test_plan_counts() -> None:
 
 
 def test_plan_says_what_will_not_run() -> None:
-    assert (plan()["robust"], plan()["fit"]) == (True, "color")
+    assert (plan()["robust"], plan()["fit"]) == (True, "full")
     assert (plan(photos=False)["robust"], plan(photos=False)["fit"]) == (False, "none")
     assert plan(views=2)["robust"] is False
     assert plan(robust=False, fit="none")["fit"] == "none"
