@@ -43,7 +43,7 @@ class AllocateOptions:
         max_extent: Largest side of a region, as a share of the image's width: the rasterizer's affine
             approximation bends larger Gaussians. Exceeded only when the budget leaves no other choice.
         knee_slope: The automatic count stops where the predicted quality grows by less than this, dB per
-            relative increase of the count (2 means 0.02 dB per 1 % more).
+            relative increase of the count (1 means 0.01 dB per 1 % more).
         knee_floor: Squared error per pixel and channel that no count removes (noise, views that disagree).
     """
 
@@ -51,7 +51,7 @@ class AllocateOptions:
     region_compactness: float = 1e-5
     max_extent: float = 1 / 8
     knee_slope: float = 1.0
-    knee_floor: float = 1e-3
+    knee_floor: float = 3e-4
 
     def __post_init__(self) -> None:
         for name in ("depth_weight", "region_compactness", "knee_slope"):

@@ -15,7 +15,7 @@ from gsmerge.backing import encode_backing
 from gsmerge.canonical import canonicalise
 from gsmerge.decode import decode
 from gsmerge.encode import encode
-from gsmerge.fit import fit
+from gsmerge.fit import fit, start_share
 from gsmerge.match import match
 from gsmerge.memory import peak_memory, release_memory
 from gsmerge.merge import merge
@@ -142,12 +142,14 @@ def compact(
 
 def _merged_features(scene: PixelScene, members: Members, options: CompactOptions, run: _Run) -> FeatureGaussians:
     """Superpixels, one Feature Gaussian each, the merge that the photos prefer, and merging across views."""
-    robust = options.robust.robust and scene.images is not None
+    robust = options.robust.robust if options.robust.robust is not None else options.fit.fit != "full"
+    robust = robust and scene.images is not None
     with run.stage("segment"):
         height, width = scene.cameras.height, scene.cameras.width
-        count = count_for(options.segment, height, width)
-        if count > height * width:
-            raise ValueError(f"superpixels: expected at most {height * width}, one per pixel, got {count}")
+        asked = count_for(options.segment, height, width)
+        if asked > height * width:
+            raise ValueError(f"superpixels: expected at most {height * width}, one per pixel, got {asked}")
+        count = max(1, int(asked * start_share(options.fit))) if scene.images is not None else asked
         behind = robust and len(scene) >= MIN_VIEWS
         coarse = min(round(options.backing.backing * count), count - 1) if behind else 0
         pictures = scene.images if scene.images is not None else _own_colors(scene)
@@ -185,8 +187,9 @@ def _own_colors(scene: PixelScene) -> torch.Tensor:
 def _fitted(gaussians: Gaussians, scene: PixelScene, options: CompactOptions, run: _Run) -> Gaussians:
     """Gaussians that no photo shows left out, the rest fitted to the photos."""
     count, photos = len(gaussians), (scene_photos(scene), scene_photos(scene, 2))
-    gaussians, report = fit(gaussians, photos, options.fit, options.seed, run.fit_progress)
-    run.choices["pruned"] = count - len(gaussians)
+    asked = count_for(options.segment, photos[0].height, photos[0].width) * len(scene) * options.decode.k
+    gaussians, report = fit(gaussians, photos, options.fit, asked, options.seed, run.fit_progress)
+    run.choices["begun_with"] = count
     if report:
         run.choices["fit"] = asdict(report)
         if not report.accepted:

@@ -28,7 +28,8 @@ class RobustOptions:
     """The family of merges and how it is judged.
 
     Args:
-        robust: Choose among the family by the photos; otherwise the plain merge is taken.
+        robust: Choose among the family by the photos; otherwise the plain merge is taken. None: unless a full fit
+            follows, which closes holes and moves surfaces itself and is better in the same time.
         widen: Standard deviations of the "wide" members times this; a single layer of merged Gaussians is not
             closed at 1.
         boost: Factor on the optical depth before the other views' photos weigh it down.
@@ -39,7 +40,7 @@ class RobustOptions:
         ValueError: If a setting is out of range.
     """
 
-    robust: bool = True
+    robust: bool | None = None
     widen: float = 1.2
     boost: float = 3.0
     tolerance: float = 0.1

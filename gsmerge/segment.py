@@ -75,7 +75,7 @@ def count_for(options: SegmentOptions, height: int, width: int) -> int:
     """Superpixels that ``options`` ask for in a view of this size."""
     if options.superpixels is not None:
         return options.superpixels
-    return max(1, round(options.density * height * width))
+    return max(1, int(options.density * height * width))
 
 
 def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -> Groups:

@@ -7,6 +7,7 @@ linear system whose matrix is one splat and one transposed splat; a few precondi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -92,7 +93,7 @@ def fit_colors(
     pull = options.pull
     for _ in range(1 + MAX_RETRIES):
         system, offsets = _solve(plain, options, pull)
-        fitted = parallel_map(lambda view, offsets=offsets: _image(plain, view, offsets), range(len(photos)))
+        fitted = parallel_map(partial(_image, plain, offsets=offsets), range(len(photos)))
         after = holdout_psnr(fitted, photos, train)
         if after > before:
             offsets = _finish(system, offsets, options, pull)

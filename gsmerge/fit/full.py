@@ -1,7 +1,8 @@
 """gaussians -> fitted gaussians: all parameters moved onto the input photos by a short, confined optimisation.
 
 One view per step: L1 and structural similarity on a random background, half-size photos first, Adam with rates in
-units of each Gaussian's own size, a box about the start. The number of Gaussians never changes.
+units of each Gaussian's own size, a box about the start. Longer runs begin with fewer Gaussians than they may have
+and spend the rest where the error is.
 """
 
 from __future__ import annotations
@@ -11,95 +12,29 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
+from gsmerge.fit.grow import grow
 from gsmerge.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.options import FitOptions, Rates
 from gsmerge.fit.report import FitReport
+from gsmerge.fit.state import State, gaussians_of, start_state
 from gsmerge.kernels import optimise as kernels
 from gsmerge.photos import Photos
-from gsmerge.render import Splats, composite, plan_view
+from gsmerge.render import composite, plan_view
 from gsmerge.render.gradient import plan_differentiable, plan_gradients
 from gsmerge.threads import parallel_map
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
-CHECK = 60  # steps between two looks at the held-out blocks
-FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 100, 0.2
+GROWTH = 0.4  # part of the run after which Gaussians are added
+GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
+START = 0.57  # share of the Gaussians that a run which grows begins with
+FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.2
 PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
 
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
-
-
-@dataclass(eq=False)
-class State:
-    """Parameters under optimisation, and the arrays that they mean to the rasterizer.
-
-    Args:
-        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour.
-        x0: The start.
-        m: First moment.
-        v: Second moment.
-        units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales at the start.
-        splats: Means, quaternions, scales and opacities as the rasterizer takes them.
-        colors: ``[n,3]``.
-    """
-
-    x: np.ndarray
-    x0: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
-    units: np.ndarray
-    splats: Splats
-    colors: np.ndarray
-
-
-def start_state(gaussians: Gaussians) -> State:
-    """The optimiser's view of some Gaussians."""
-    count = len(gaussians)
-    x = np.empty((count, kernels.COLUMNS), np.float32)
-    scales = gaussians.scales.numpy().clip(1e-9)
-    opacities = gaussians.opacities.double().numpy().clip(0.004, 0.999)
-    x[:, :3] = gaussians.means.numpy()
-    x[:, kernels.SIZE : kernels.QUAT] = np.log(scales)
-    x[:, kernels.QUAT : kernels.LOGIT] = gaussians.quats.numpy()
-    x[:, kernels.LOGIT] = np.log(opacities / (1 - opacities))
-    x[:, kernels.COLOR :] = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()
-    sizes = np.sort(x[:, kernels.SIZE : kernels.QUAT], 1)
-    splats = Splats(
-        means=np.ascontiguousarray(x[:, :3]),
-        quats=np.ascontiguousarray(x[:, kernels.QUAT : kernels.LOGIT]),
-        scales=np.exp(x[:, kernels.SIZE : kernels.QUAT]),
-        opacities=(1 / (1 + np.exp(-x[:, kernels.LOGIT]))).astype(np.float32),
-        sh0=gaussians.sh0.numpy().copy(),
-        shN=gaussians.shN.numpy(),
-        origin=np.zeros(3),
-    )
-    units, colors = np.exp((sizes[:, 1] + sizes[:, 2]) / 2), np.ascontiguousarray(x[:, kernels.COLOR :])
-    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, splats, colors)
-
-
-def view_colors(state: State) -> np.ndarray | None:
-    """Colours as the rasterizer takes them: as they are, or None: from the harmonics, which are brought up to date."""
-    if state.splats.shN.shape[1] == 0:
-        return state.colors
-    np.divide(state.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=state.splats.sh0)
-    return None
-
-
-def end_state(x: np.ndarray, shN: torch.Tensor) -> Gaussians:
-    """Gaussians of parameters ``[n,14]``; the higher harmonics stay as they were."""
-    tensor = torch.from_numpy
-    return Gaussians(
-        means=tensor(x[:, :3].copy()),
-        quats=tensor(x[:, kernels.QUAT : kernels.LOGIT].copy()),
-        scales=tensor(np.exp(x[:, kernels.SIZE : kernels.QUAT])),
-        opacities=tensor(1 / (1 + np.exp(-x[:, kernels.LOGIT]))),
-        sh0=tensor((x[:, kernels.COLOR :] - 0.5) / SH_C0).float()[:, None],
-        shN=shN,
-    )
 
 
 @dataclass(frozen=True)
@@ -133,7 +68,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
         state.splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height,
         eps2d=photos.eps2d, opacities=opacities,
     )  # fmt: skip
-    colors = view_colors(state)
+    colors = state.view_colors()
     image, transmittance = composite(drawn, colors, background)
     gradient = image_gradient(image, photos.images[view], weight, plan.options.dssim)
     g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
@@ -163,7 +98,7 @@ def step_sizes(rates: Rates, progress: float) -> np.ndarray:
 
 def holdout_score(state: State, plan: Plan) -> float:
     """PSNR (dB) of the half-size held-out blocks."""
-    photos, colors = plan.photos[1], view_colors(state)
+    photos, colors = plan.photos[1], state.view_colors()
 
     def one_view(view: int) -> np.ndarray:
         drawn = plan_view(
@@ -178,42 +113,49 @@ def fit_full(
     gaussians: Gaussians,
     photos: tuple[Photos, Photos],
     options: FitOptions,
+    count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
-    The best state by the held-out blocks is returned, the start included.
+    Two states can be returned, judged by blocks of the photos that the half-size steps do not look at: the start, or
+    the end if the blocks were better after those steps. The full-size steps then look at everything.
 
     Args:
-        gaussians: n canonical Gaussians; the result has as many, in the same order.
+        gaussians: Canonical Gaussians.
         photos: The input views at full and at half size.
         options: Steps, rates, limits.
+        count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
         seed: Order of the views, backgrounds, dropout, held-out blocks.
         progress: Told after every step.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
-    before = best = score = holdout_score(state, plan)
-    kept, kept_at = state.x.copy(), 0
+    before = after = holdout_score(state, plan)
     queue: list[int] = []
-    step, steps, started, error = 0, options.fit_steps, time.perf_counter(), 0.0
+    step, steps, started, error, judged = 0, options.fit_steps, time.perf_counter(), 0.0, False
     while step < steps:
+        part = step / steps
+        if part >= GROWTH and len(state.x) < count and steps >= GROW_STEPS and (step - int(GROWTH * steps)) % 10 == 0:
+            state = grow(state, photos[1], count)
+        if part >= options.coarse and not judged:
+            after, judged = holdout_score(state, plan), True
+            if after <= before:
+                break
         if not queue:
             queue = rng.permutation(len(photos[0])).tolist()
-        error += 0.1 * (fit_step(state, plan, queue.pop(), step + 1, step / steps, rng) - error)
+        error += (fit_step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
         step += 1
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, plan)
-        if step % CHECK == 0 or step == steps:
-            score = holdout_score(state, plan)
-            if score > best:
-                best, kept, kept_at = score, state.x.copy(), step
         if progress:
-            progress(step, steps, -10 * np.log10(max(error, 1e-12)), score)
-    accepted = kept_at > 0
-    stopped = "all steps done" if kept_at == steps else f"held-out blocks were best after step {kept_at} of {steps}"
-    report = FitReport("full" if accepted else "none", accepted, kept_at, before, best, stopped)
-    return (end_state(kept, gaussians.shN) if accepted else gaussians), report
+            progress(step, steps, -10 * np.log10(max(error, 1e-12)), after)
+    after = after if judged else holdout_score(state, plan)
+    if after <= before:
+        why = f"held-out parts of the photos were no better after {step} steps"
+        return gaussians, FitReport("none", False, step, before, after, why)
+    why = "time budget spent" if options.time_budget is not None else "all steps done"
+    return gaussians_of(state.x, state.splats.shN), FitReport("full", True, step, before, after, why)
 
 
 def affordable_steps(seconds: float, plan: Plan) -> int:

@@ -46,7 +46,7 @@ class FitOptions:
         fit_steps: Steps of the full fit, one view each.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
-        dropout: Share of the Gaussians that a step leaves out; None: 0.2 for five views or fewer and 100 steps or
+        dropout: Share of the Gaussians that a step leaves out; None: 0.2 for five views or fewer and 150 steps or
             more, where the photos alone would be learnt by heart, otherwise 0.
         coarse: Share of the steps that look at half-size photos.
         dssim: Share of structural similarity in the loss, the rest is L1.
@@ -65,7 +65,7 @@ class FitOptions:
     """
 
     fit: Fit = "full"
-    fit_steps: int = 120
+    fit_steps: int = 200
     time_budget: float | None = None
     dropout: float | None = None
     coarse: float = 0.7

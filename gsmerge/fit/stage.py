@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gsmerge.fit.color import draw, fit_colors, seen
-from gsmerge.fit.full import Progress, fit_full
+from gsmerge.fit.full import GROW_STEPS, START, Progress, fit_full
 from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
 from gsmerge.photos import Photos
@@ -14,6 +14,7 @@ def fit(
     gaussians: Gaussians,
     photos: tuple[Photos, Photos],
     options: FitOptions,
+    count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Gaussians, FitReport | None]:
@@ -25,6 +26,7 @@ def fit(
         gaussians: Canonical Gaussians.
         photos: The input views at full and at half size.
         options: What to fit.
+        count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
         progress: Told after every step of the full fit.
 
@@ -37,8 +39,13 @@ def fit(
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, seed, progress)
+        fitted, report = fit_full(kept, photos, options, count, seed, progress)
         if report.accepted:
             return fitted, report
     gaussians, report = fit_colors(gaussians, drawn, photos[1], options, seed)
     return gaussians[keep], report
+
+
+def start_share(options: FitOptions) -> float:
+    """Share of the Gaussians asked for that the stages before the fit should leave for it to begin with."""
+    return START if options.fit == "full" and options.fit_steps >= GROW_STEPS else 1.0

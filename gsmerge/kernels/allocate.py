@@ -81,7 +81,7 @@ def region_sums(labels, pixels, depths, count, rows):
     return max(squares, 0.0)
 
 
-@kernel
+@kernel(part=True)
 def merge_growth(rows, u, v, depth_weight, compactness):
     """Growth of the error if u and v become one: of colour and depth, and of place times ``compactness``."""
     a, b = rows[u], rows[v]

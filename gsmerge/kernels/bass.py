@@ -67,7 +67,7 @@ def fit_regions(labels, colours, count):
     return rows
 
 
-@kernel
+@kernel(part=True)
 def log_posterior(rows, label, c0, c1, c2, x, y, num_foreign, precision):
     """Twice the logarithm of the posterior of a label for a pixel, up to a constant."""
     d0, d1, d2 = c0 - rows[label, 0], c1 - rows[label, 1], c2 - rows[label, 2]

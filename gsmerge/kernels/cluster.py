@@ -13,7 +13,7 @@ def _det(a):
     return a[0] * (a[3] * a[5] - a[4] * a[4]) - a[1] * (a[1] * a[5] - a[4] * a[2]) + a[2] * (a[1] * a[4] - a[3] * a[2])
 
 
-@kernel
+@kernel(part=True)
 def bhattacharyya(mean_a, cov_a, mean_b, cov_b, half):
     """Bhattacharyya coefficient of two Gaussians, 1 for equal ones; covariances as xx xy xz yy yz zz."""
     for k in range(6):
@@ -31,7 +31,7 @@ def bhattacharyya(mean_a, cov_a, mean_b, cov_b, half):
     return np.exp(-0.125 * distance) * np.sqrt(volume / det)
 
 
-@kernel
+@kernel(part=True)
 def box_overlap(mean_a, cov_a, mean_b, cov_b):
     """Intersection over union of the axis-aligned boxes of one standard deviation (paper section 4.4)."""
     shared, volume_a, volume_b = 1.0, 1.0, 1.0

@@ -8,9 +8,9 @@ what it inlined from another.
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -38,32 +38,61 @@ def _sources_hash() -> str:
     return digest.hexdigest()[:16]
 
 
+def _user_folders() -> list[Path]:
+    """The user's cache folder; none for an account without a home."""
+    try:
+        return [Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gsmerge"]
+    except RuntimeError:
+        return []
+
+
+def _temporary_folder() -> Path:
+    """A folder that only the user can have written: machine code will be loaded from it."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"gsmerge-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="gsmerge-"))
+    own = stat.S_ISDIR(found.st_mode) and (os.name == "nt" or (found.st_uid == user and not found.st_mode & 0o022))
+    return folder if own else Path(tempfile.mkdtemp(prefix="gsmerge-"))
+
+
 def cache_folder() -> Path:
     """Where this version's compiled kernels are kept."""
     given = os.environ.get("GSMERGE_CACHE_DIR") or os.environ.get("NUMBA_CACHE_DIR")
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gsmerge"
-    places = [Path(given)] if given else [Path(__file__).parent / "__pycache__", user]
+    places = [Path(given)] if given else [Path(__file__).parent / "__pycache__", *_user_folders()]
     name = f"kernels-{_sources_hash()}"
     for place in places:
         if _writable(place):
             return place / name
-    return Path(tempfile.gettempdir()) / f"gsmerge-{getpass.getuser()}" / name
+    return _temporary_folder() / name
 
 
 _CACHE = str(cache_folder())
 
 
-def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, exact: bool = False) -> Any:
+def kernel(
+    function: Callable[..., Any] | None = None, *, part: bool = False, inline: bool = False, exact: bool = False
+) -> Any:
     """Compile a kernel: cached, without the GIL, with float rules that keep NaN and inf.
+
+    What other kernels call must become part of each of them: otherwise every caller's machine code brings a copy of
+    its own, optimised in its own way, all under one name, and which of them runs, and how it rounds, depends on what
+    was compiled or loaded first. So functions whose names begin with an underscore are always inlined by LLVM, and
+    others that kernels call say ``part``.
 
     Args:
         function: The function, when used as a plain decorator.
-        inline: Inline at every call (for the small pieces of a loop).
+        part: Other kernels call it.
+        inline: Inline by numba itself, before types are known (for the small pieces of a loop).
         exact: No reassociation at all (for code whose order of operations matters).
     """
 
     def wrap(f: Callable[..., Any]) -> Any:
-        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, _CACHE
+        config: Any = numba.config
+        before, config.CACHE_DIR = config.CACHE_DIR, _CACHE
         try:
             return numba.njit(
                 cache=True,
@@ -71,8 +100,9 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, 
                 error_model="numpy",
                 fastmath=False if exact else set(FAST),
                 inline="always" if inline else "never",
+                forceinline=part or f.__name__.startswith("_"),
             )(f)
         finally:
-            numba.config.CACHE_DIR = before
+            config.CACHE_DIR = before
 
     return wrap(function) if function is not None else wrap

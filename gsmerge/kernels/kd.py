@@ -15,7 +15,7 @@ BUCKET_SHIFT = 20
 CUT, NEXT = 4, 5  # columns of a rectangle's row after y0, x0, y1, x1: its best cut (row, or minus column), its list
 
 
-@kernel
+@kernel(part=True)
 def integral_image(pixels):
     """``[(h+1)·(w+1),3]`` float64: sum of all pixels above and to the left."""
     height, width, _ = pixels.shape

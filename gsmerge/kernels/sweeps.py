@@ -38,7 +38,7 @@ def ring_mask(labels, y, x, label):
     )
 
 
-@kernel
+@kernel(part=True)
 def distance(rows, label, f0, f1, f2, f3, f4):
     """Squared distance of a pixel's feature to a region's mean."""
     d0, d1, d2 = f0 - rows[label, 0], f1 - rows[label, 1], f2 - rows[label, 2]

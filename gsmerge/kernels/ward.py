@@ -20,7 +20,7 @@ RETURN_MARGIN = 1.5  # a parked edge comes back when its old cost is at most thi
 TIE_BREAK = 1e-7  # squared colour; spreads equal costs, so that flat pictures do not merge one pair a round
 
 
-@kernel
+@kernel(part=True)
 def merge_cost(rows, u, v):
     """Growth of the squared error if u and v become one: n_u n_v / (n_u + n_v) |mean_u - mean_v|²."""
     d0, d1, d2 = rows[u, 0] - rows[v, 0], rows[u, 1] - rows[v, 1], rows[u, 2] - rows[v, 2]
