@@ -40,7 +40,7 @@ class AllocateOptions:
         depth_weight: Of squared relative depth errors against squared colour errors (sRGB in [0, 1]).
         region_compactness: Of squared pixels against squared colours while regions merge; without it they become
             snakes that no Gaussian fits.
-        max_extent: Largest side of a region, as a share of the image's width: the rasterizer's affine
+        max_extent: Largest side of a region, as a share of the image's longer side: the rasterizer's affine
             approximation bends larger Gaussians. Exceeded only when the budget leaves no other choice.
         knee_slope: The automatic count stops where the predicted quality grows by less than this, dB per
             relative increase of the count (1 means 0.01 dB per 1 % more).
@@ -122,7 +122,7 @@ def region_tree(
     """
     options = options or AllocateOptions()
     _check_pictures(images, depths, groups, valid)
-    extent = max(1.0, options.max_extent * images.shape[2])
+    extent = max(1.0, options.max_extent * max(images.shape[1:3]))
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
         usable = _usable_depths(depths[view].numpy(), valid[view].numpy())

@@ -172,8 +172,8 @@ def plan_document(
     """
     views, height, width = grid
     pixels = views * height * width
-    robust = bool(options["robust"]) and photos and views >= 3
     fit = options["fit"] if photos else "none"
+    robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
     work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
     work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
     steps = options["fit_steps"] if fit == "full" else 0

@@ -123,8 +123,8 @@ RobustOption = Annotated[
     bool | None,
     typer.Option(
         "--robust/--no-robust",
-        help="Choose among merges by what the photos say; needs three views.",
-        show_default="robust",
+        help="Choose among merges by what the photos say.",
+        show_default="unless --fit full",
         rich_help_panel=MERGING,
     ),
 ]

@@ -78,7 +78,8 @@ def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
     assert set(told) == {"k", "density", "method", "preset", "robust", "match", "fit", "seed"}
-    real = {name: "robust" if library[name] is True else str(library[name]) for name in told}
+    assert library["robust"] is None
+    real = {name: "unless --fit full" if name == "robust" else str(library[name]) for name in told}
     assert told == real
 
 
@@ -86,7 +87,7 @@ def test_readme_s_defaults_are_the_library_s(root: Path) -> None:
     rows = re.findall(r"^\| `--([a-z-]+)`[^|]*\| ([^|]*) \|", (root / "README.md").read_text(), re.MULTILINE)
     told = dict(rows)
     for name, default in cli_defaults():
-        assert told[name] == ("on" if default == "robust" else default)
+        assert told[name].replace("`", "") == default
 
 
 def test_every_option_is_a_field_of_the_api() -> None:

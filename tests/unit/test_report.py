@@ -90,10 +90,16 @@ def test_plan_counts() -> None:
 
 
 def test_plan_says_what_will_not_run() -> None:
-    assert (plan()["robust"], plan()["fit"]) == (True, "full")
-    assert (plan(photos=False)["robust"], plan(photos=False)["fit"]) == (False, "none")
-    assert plan(views=2)["robust"] is False
-    assert plan(robust=False, fit="none")["fit"] == "none"
+    def told(**settings: Any) -> tuple[bool, str]:
+        document = plan(**settings)
+        return document["robust"], document["fit"]
+
+    assert told() == (False, "full")
+    assert told(fit="color") == (True, "color")
+    assert told(fit="color", robust=False) == (False, "color")
+    assert told(robust=True) == (True, "full")
+    assert told(photos=False) == (False, "none")
+    assert told(photos=False, robust=True) == (False, "none")
 
 
 def test_plan_of_less_work_takes_less() -> None:
