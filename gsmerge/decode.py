@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,21 +22,26 @@ class DecodeOptions:
     """How many Gaussians a Feature Gaussian becomes.
 
     Args:
-        k: Children of each group, 1 to 8.
+        k: Children of each group, 1 to 8; ``"auto"``: one, of groups that follow what the scene needs.
         min_opacity: Gaussians below this opacity are left out (paper section 4.3).
 
     Raises:
         ValueError: If K is not within 1 to 8 or the opacity not within 0 to 1.
     """
 
-    k: int = 1
+    k: int | Literal["auto"] = 1
     min_opacity: float = 1 / 255
 
     def __post_init__(self) -> None:
-        if not 1 <= self.k <= MAX_CHILDREN:
-            raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, got {self.k}")
+        if self.k != "auto" and not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
+            raise ValueError(f'k: expected 1 to {MAX_CHILDREN} or "auto", got {self.k!r}')
         if not 0 <= self.min_opacity <= 1:
             raise ValueError(f"min_opacity: expected 0 to 1, got {self.min_opacity}")
+
+    @property
+    def count(self) -> int:
+        """Children of each group as a number."""
+        return 1 if self.k == "auto" else self.k
 
 
 def decode(
@@ -64,7 +70,7 @@ def decode(
         ValueError: If ``counts`` has the wrong shape or a count below 1.
     """
     if counts is None:
-        counts = np.full(len(features), options.k)
+        counts = np.full(len(features), options.count)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     divided = (counts > 1) & ~features.backing.numpy()

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
+from gsmerge.allocate import AllocateOptions
 from gsmerge.backing import BackingOptions
 from gsmerge.decode import DecodeOptions
 from gsmerge.encode import EncodeOptions
@@ -21,23 +22,29 @@ class CompactOptions:
 
     Args:
         segment: Superpixels.
+        allocate: How a budget is spread over the views.
         encode: How a group becomes one Gaussian.
         robust: Choice among merges by the photos.
         backing: The coarse layer that the choice may add.
         match: Merging across views.
         decode: Gaussians per group.
         fit: Fit to the photos.
+        budget: Gaussians in the result: a number, or a share of the input as "2%". Met, and never exceeded.
+        max_bytes: Largest size of the result as a ``.ply``: bytes, or as "5MB".
         seed: Everything random hangs on it; runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
+    allocate: AllocateOptions = field(default_factory=AllocateOptions)
     encode: EncodeOptions = field(default_factory=EncodeOptions)
     robust: RobustOptions = field(default_factory=RobustOptions)
     backing: BackingOptions = field(default_factory=BackingOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     decode: DecodeOptions = field(default_factory=DecodeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
+    budget: int | str | None = None
+    max_bytes: int | str | None = None
     seed: int = 0
     threads: int | None = None
 

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsmerge.allocate import split_counts
 from gsmerge.backing import encode_backing
 from gsmerge.canonical import canonicalise
 from gsmerge.decode import decode
 from gsmerge.encode import encode
 from gsmerge.fit import fit, start_share
+from gsmerge.grouping import Grouping, group_scene
 from gsmerge.match import match
 from gsmerge.memory import peak_memory, release_memory
 from gsmerge.merge import merge
@@ -24,10 +26,9 @@ from gsmerge.moments import Members, scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
-from gsmerge.robust import MIN_VIEWS, choose_merge, close_holes
-from gsmerge.segment import count_for, segment
+from gsmerge.robust import choose_merge, close_holes
 from gsmerge.threads import parallel_map, use_threads
-from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, PixelScene
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
 
 Progress = Callable[[str, int, int], None]
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
@@ -117,13 +118,16 @@ def compact(
         with run.stage("prepare"):
             canonical, frame = canonicalise(scene)
             members = scene_members(canonical)
-        features = _merged_features(canonical, members, options, run)
+        with run.stage("segment"):
+            grouping = group_scene(canonical, options)
+        features = _merged_features(canonical, members, grouping, options, run)
         with run.stage("decode"):
-            gaussians = decode(features, members, options.decode, rule=options.encode.rule)
+            children = _filled(features, members, grouping, options)
+            gaussians = decode(features, members, options.decode, children, options.encode.rule)
         del features, members
         if canonical.images is not None:
             with run.stage("fit"):
-                gaussians = _fitted(gaussians, canonical, options, run)
+                gaussians = _fitted(gaussians, canonical, grouping, options, run)
         del canonical
         gaussians = frame.leave(gaussians)
         before = after = None
@@ -140,28 +144,18 @@ def compact(
     return CompactResult(gaussians, report)
 
 
-def _merged_features(scene: PixelScene, members: Members, options: CompactOptions, run: _Run) -> FeatureGaussians:
-    """Superpixels, one Feature Gaussian each, the merge that the photos prefer, and merging across views."""
-    robust = options.robust.robust if options.robust.robust is not None else options.fit.fit != "full"
-    robust = robust and scene.images is not None
-    with run.stage("segment"):
-        height, width = scene.cameras.height, scene.cameras.width
-        asked = count_for(options.segment, height, width)
-        if asked > height * width:
-            raise ValueError(f"superpixels: expected at most {height * width}, one per pixel, got {asked}")
-        count = max(1, int(asked * start_share(options.fit))) if scene.images is not None else asked
-        behind = robust and len(scene) >= MIN_VIEWS
-        coarse = min(round(options.backing.backing * count), count - 1) if behind else 0
-        pictures = scene.images if scene.images is not None else _own_colors(scene)
-        groups = segment(pictures, options.segment, count - coarse)
-        coarse_groups = segment(pictures, options.segment, coarse) if coarse else None
+def _merged_features(
+    scene: PixelScene, members: Members, grouping: Grouping, options: CompactOptions, run: _Run
+) -> FeatureGaussians:
+    """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
     with run.stage("encode"):
-        features = encode(scene, members, groups, options.encode)
-    if not robust:
+        features = encode(scene, members, grouping.groups, options.encode)
+    if not grouping.robust:
         with run.stage("match"):
             return _matched(features, options, run)
     with run.stage("robust"):
-        backing = encode_backing(scene, members, coarse_groups, options.backing) if coarse_groups else None
+        coarse = grouping.coarse
+        backing = encode_backing(scene, members, coarse, options.backing) if coarse is not None else None
         photos = scene_photos(scene, 2)
         features, choice = choose_merge(features, backing, photos, options.robust)
         run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
@@ -171,6 +165,15 @@ def _merged_features(scene: PixelScene, members: Members, options: CompactOption
         return features
 
 
+def _filled(
+    features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
+) -> np.ndarray | None:
+    """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
+    if not grouping.exact or start_share(options.fit) < 1:
+        return None
+    return split_counts(features, members, max(0, grouping.wanted - len(features)))
+
+
 def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> FeatureGaussians:
     """Merged across views."""
     matches = match(features, options.match)
@@ -178,18 +181,13 @@ def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> 
     return merge(features, matches)
 
 
-def _own_colors(scene: PixelScene) -> torch.Tensor:
-    """Pictures made of the Gaussians' base colours, for scenes without photos."""
-    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
-
-
-def _fitted(gaussians: Gaussians, scene: PixelScene, options: CompactOptions, run: _Run) -> Gaussians:
+def _fitted(
+    gaussians: Gaussians, scene: PixelScene, grouping: Grouping, options: CompactOptions, run: _Run
+) -> Gaussians:
     """Gaussians that no photo shows left out, the rest fitted to the photos."""
-    count, photos = len(gaussians), (scene_photos(scene), scene_photos(scene, 2))
-    asked = count_for(options.segment, photos[0].height, photos[0].width) * len(scene) * options.decode.k
-    gaussians, report = fit(gaussians, photos, options.fit, asked, options.seed, run.fit_progress)
-    run.choices["begun_with"] = count
+    photos = scene_photos(scene), scene_photos(scene, 2)
+    run.choices["begun_with"] = len(gaussians)
+    gaussians, report = fit(gaussians, photos, options.fit, grouping.wanted, options.seed, run.fit_progress)
     if report:
         run.choices["fit"] = asdict(report)
         if not report.accepted:

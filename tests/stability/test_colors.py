@@ -10,7 +10,8 @@ import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.fit import FitOptions, draw, fit_colors
+from gsmerge.fit import FitOptions
+from gsmerge.fit.color import draw, fit_colors
 from gsmerge.photos import scene_photos
 from gsmerge.types import SH_C0
 

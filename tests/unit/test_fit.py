@@ -8,7 +8,8 @@ import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.fit import FitOptions, FitReport, draw, fit_colors, seen
+from gsmerge.fit import FitOptions, FitReport
+from gsmerge.fit.color import draw, fit_colors, seen
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.types import SH_C0
 
@@ -71,7 +72,7 @@ def test_fit_that_makes_it_worse_is_refused(gaussians: Gaussians, photos: Photos
     grey = replace(gaussians, sh0=torch.zeros_like(gaussians.sh0))
     result, report = fitted(grey, noise, replace(FEW, pull=1e-6, iterations=60, huber=10.0))
     assert not report.accepted
-    assert report.pull == 0
+    assert report.method == "none"
     assert report.holdout_after <= report.holdout_before
     assert torch.equal(result.sh0, grey.sh0)
 

@@ -13,7 +13,7 @@ from gsmerge.encode import EncodeOptions, encode
 from gsmerge.metrics import psnr
 from gsmerge.moments import Members, feature_to_gaussians, principal_axes, scene_members
 from gsmerge.photos import Photos, scene_photos
-from gsmerge.robust import RobustOptions, choose_merge, leave_one_out, weigh
+from gsmerge.robust import RobustOptions, choose_merge, close_holes, photo_psnr, weigh
 from gsmerge.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians
 
@@ -51,8 +51,8 @@ def test_best_score_wins(features: FeatureGaussians, backing: FeatureGaussians, 
     found, choice = choose_merge(features, backing, photos, RobustOptions())
     assert sorted(choice.scores) == sorted(NAMES)
     assert choice.scores[choice.name] == max(choice.scores.values())
-    assert leave_one_out(found, photos) == pytest.approx(choice.scores[choice.name], abs=1e-9)
-    assert choice.scores["plain"] == pytest.approx(leave_one_out(features, photos), abs=1e-9)
+    assert photo_psnr(found, photos, left_out=True) == pytest.approx(choice.scores[choice.name], abs=1e-9)
+    assert choice.scores["plain"] == pytest.approx(photo_psnr(features, photos, left_out=True), abs=1e-9)
     assert bool(found.backing.any()) == choice.name.endswith("back")
 
 
@@ -62,7 +62,7 @@ def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos:
     for view in range(3):
         image = scenes.images_of(gaussians[features.views != view], scene.cameras[view : view + 1])[0][0]
         scores.append(psnr(np.clip(image, 0, 1), photos.images[view]))
-    assert leave_one_out(features, photos) == pytest.approx(np.mean(scores), abs=0.01)
+    assert photo_psnr(features, photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
 
 
 def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
