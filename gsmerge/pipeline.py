@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -187,7 +187,10 @@ def _fitted(
     """Gaussians that no photo shows left out, the rest fitted to the photos."""
     photos = scene_photos(scene), scene_photos(scene, 2)
     run.choices["begun_with"] = len(gaussians)
-    gaussians, report = fit(gaussians, photos, options.fit, grouping.wanted, options.seed, run.fit_progress)
+    # where nothing grows to the number asked for, nothing may fall below it either
+    grows = start_share(options.fit) < 1
+    settings = replace(options.fit, prune=0.0) if grouping.exact and not grows else options.fit
+    gaussians, report = fit(gaussians, photos, settings, grouping.wanted, options.seed, run.fit_progress)
     if report:
         run.choices["fit"] = asdict(report)
         if not report.accepted:
