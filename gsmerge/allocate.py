@@ -331,7 +331,7 @@ def parse_budget(budget: str | int, num_input: int) -> int:
     else:
         count = min(int(text), num_input)
     if count < 1:
-        raise ValueError(f"budget: expected at least one Gaussian, got {text!r} of {num_input}")
+        raise ValueError(f"budget: expected at least one Gaussian, got {text!r}")
     return count
 
 

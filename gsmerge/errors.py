@@ -15,8 +15,8 @@ class GsmergeError(Exception):
     exit_code = 1
 
 
-class UsageError(GsmergeError):
-    """The command was called with options that do not go together."""
+class UsageError(GsmergeError, ValueError):
+    """Options do not go together, or not with this scene."""
 
     exit_code = 2
 

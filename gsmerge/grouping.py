@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from gsmerge.allocate import auto_count, count_for_bytes, cut_tree, parse_budget, parse_bytes, pixel_depths, region_tree
+from gsmerge.errors import UsageError
 from gsmerge.fit import start_share
 from gsmerge.options import CompactOptions
 from gsmerge.robust import MIN_VIEWS
@@ -45,7 +46,7 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
         options: All settings.
 
     Raises:
-        ValueError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
+        UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
     """
     views, pixels = len(scene), scene.pixels_per_view
     pictures = scene.images if scene.images is not None else own_colors(scene)
@@ -54,7 +55,7 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
     share = start_share(options.fit) if scene.images is not None else 1.0
     asked = count_for(options.segment, scene.cameras.height, scene.cameras.width)
     if asked > pixels:
-        raise ValueError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
+        raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
     wanted, auto = target_count(scene, options), options.decode.k == "auto"
     if wanted is None and not auto:
         count = max(1, int(asked * share))
@@ -68,7 +69,7 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
         knee = auto_count(tree, options.allocate) if auto else len(tree)
         total = min(knee, wanted) if wanted is not None and auto else wanted if wanted is not None else knee
         if total < views:
-            raise ValueError(f"budget: expected at least {views}, one for each view, got {total}")
+            raise UsageError(f"budget: expected at least {views}, one for each view, got {total}")
         begun = max(views, int(total * share))
         coarse = int(behind * begun / views)
         groups = cut_tree(tree, max(views, begun - coarse * views))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gsmerge.allocate import AllocateOptions
+from gsmerge.allocate import AllocateOptions, parse_budget, parse_bytes
 from gsmerge.backing import BackingOptions
 from gsmerge.decode import DecodeOptions
 from gsmerge.encode import EncodeOptions
@@ -33,6 +34,9 @@ class CompactOptions:
         max_bytes: Largest size of the result as a ``.ply``: bytes, or as "5MB".
         seed: Everything random hangs on it; runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
+
+    Raises:
+        ValueError: If the budget or the size cannot be read.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -47,6 +51,12 @@ class CompactOptions:
     max_bytes: int | str | None = None
     seed: int = 0
     threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.budget is not None:
+            parse_budget(self.budget, sys.maxsize)
+        if self.max_bytes is not None:
+            parse_bytes(self.max_bytes)
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""

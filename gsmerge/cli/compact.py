@@ -33,6 +33,10 @@ def compact(
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
     fit: opt.FitOption = None,
+    fit_steps: opt.FitStepsOption = None,
+    time_budget: opt.TimeBudgetOption = None,
+    budget: opt.BudgetOption = None,
+    max_bytes: opt.MaxBytesOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -60,7 +64,8 @@ def compact(
         "method": method,
         "preset": preset,
     }
-    chosen |= {"robust": robust, "match": match, "fit": fit, "seed": seed, "threads": threads}
+    chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
+    chosen |= {"budget": budget, "max_bytes": max_bytes, "seed": seed, "threads": threads}
     settings = _settings(chosen)
     if dry_run:
         _print_plan(files, settings, out, opacity=opacity.value, as_json=json)

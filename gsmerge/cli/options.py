@@ -108,16 +108,41 @@ PresetOption = Annotated[
     Preset | None,
     typer.Option(help="Effort of rdseg.", show_default="default", rich_help_panel=SEGMENTATION),
 ]
+
+
+def parse_k(text: str) -> int | str:
+    """``--k``: a number from 1 to 8, or auto."""
+    if text == "auto":
+        return text
+    if not text.isdigit() or not 1 <= int(text) <= 8:
+        raise typer.BadParameter(f'expected 1 to 8 or "auto", got {text!r}')
+    return int(text)
+
+
 KOption = Annotated[
-    int | None,
+    str | None,
     typer.Option(
         "--k",
-        min=1,
-        max=8,
-        help="Gaussians per superpixel: finer with more.",
+        parser=parse_k,
+        metavar="[1-8|auto]",
+        help="Gaussians per superpixel: finer with more. auto: as many as the scene needs.",
         show_default="1",
         rich_help_panel=MERGING,
     ),
+]
+BudgetOption = Annotated[
+    str | None,
+    typer.Option(help='Gaussians in the result, such as 40000 or "2%"; met exactly.', rich_help_panel=MERGING),
+]
+MaxBytesOption = Annotated[
+    str | None, typer.Option(help="Largest size of the result, such as 5MB.", rich_help_panel=MERGING)
+]
+FitStepsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Steps of the full fit: more takes longer.", show_default="200", rich_help_panel=MERGING),
+]
+TimeBudgetOption = Annotated[
+    float | None, typer.Option(min=0.0, help="Seconds that the full fit may take.", rich_help_panel=MERGING)
 ]
 RobustOption = Annotated[
     bool | None,

@@ -133,10 +133,11 @@ def fit_full(
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
     before = after = holdout_score(state, plan)
     queue: list[int] = []
+    grows = options.fit_steps >= GROW_STEPS
     step, steps, started, error, judged = 0, options.fit_steps, time.perf_counter(), 0.0, False
     while step < steps:
         part = step / steps
-        if part >= GROWTH and len(state.x) < count and steps >= GROW_STEPS and (step - int(GROWTH * steps)) % 10 == 0:
+        if grows and part >= GROWTH and len(state.x) < count and step % 10 == 0:
             state = grow(state, photos[1], count)
         if part >= options.coarse and not judged:
             after, judged = holdout_score(state, plan), True
