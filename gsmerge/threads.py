@@ -8,10 +8,11 @@ OpenCV and torch are held to one thread each while a pool is in use, so that the
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -66,7 +67,7 @@ def use_threads(count: int | None = None) -> Iterator[int]:
         yield _local.count
         return
     _hold_libraries()
-    _local.pool = ThreadPoolExecutor(count, thread_name_prefix="gsmerge", initializer=_enter_pool)
+    _local.pool = ThreadPoolExecutor(max(1, count - 1), thread_name_prefix="gsmerge", initializer=_enter_pool)
     _local.count = count
     try:
         yield count
@@ -98,11 +99,35 @@ def _release_libraries() -> None:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """``[function(item) for item in items]`` on the pool; results in the order of the items.
 
-    Outside :func:`use_threads` a pool of all processors is made for the call; inside a pool thread the items are
-    worked off one by one.
+    Outside :func:`use_threads` a pool of all processors is made for the call; inside another call the items are
+    worked off one by one. The calling thread takes its share, so that a short call costs one hand-over, not one
+    for each item.
     """
     items = list(items)
     with use_threads() as count:
-        if count == 1 or len(items) < 2 or _local.pool is None:
+        if count == 1 or len(items) < 2 or _local.pool is None or _local.inside:
             return [function(item) for item in items]
-        return list(_local.pool.map(function, items))
+        return _share(_local.pool, function, items, min(count, len(items)) - 1)
+
+
+def _share(pool: ThreadPoolExecutor, function: Callable[[T], R], items: list[T], helpers: int) -> list[R]:
+    """Work off the items on this thread and some of the pool's; who is free takes the next."""
+    results: list[R] = [None] * len(items)  # type: ignore[list-item]
+    following = itertools.count()  # its next() is atomic
+
+    def work() -> None:
+        for index in following:
+            if index >= len(items):
+                return
+            results[index] = function(items[index])
+
+    futures = [pool.submit(work) for _ in range(helpers)]
+    _local.inside = True
+    try:
+        work()
+    finally:
+        _local.inside = False
+        wait(futures)
+    for future in futures:
+        future.result()
+    return results

@@ -27,7 +27,7 @@ def _gather(row, row_x, unit, k, g_means, g_quats, g_scales, g_opacities, g_colo
 
 @kernel
 def _confine(x, x0, unit, limits):
-    """Box trust region about the start, range of colours, unit quaternion."""
+    """Box trust region about the start, range of colours (no farther out than the start), unit quaternion."""
     d0, d1, d2 = x[0] - x0[0], x[1] - x0[1], x[2] - x0[2]
     far, reach = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), limits[0] * unit
     if far > reach:
@@ -38,7 +38,7 @@ def _confine(x, x0, unit, limits):
     logit = min(x0[LOGIT] + limits[2], max(x0[LOGIT] - limits[2], x[LOGIT]))
     x[LOGIT] = min(MAX_LOGIT, max(MIN_LOGIT, logit))
     for c in range(COLOR, COLOR + 3):
-        x[c] = min(f4(1.05), max(f4(-0.05), x[c]))
+        x[c] = min(max(f4(1.05), x0[c]), max(min(f4(-0.05), x0[c]), x[c]))
     norm = x[6] * x[6] + x[7] * x[7] + x[8] * x[8] + x[9] * x[9]
     norm = f4(1.0) / np.sqrt(norm) if norm > f4(0.0) else f4(0.0)
     for c in range(QUAT, QUAT + 4):

@@ -17,7 +17,7 @@ from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
 
-PIECE = 1 << 15  # Gaussians or intersections that are worth handing to another thread
+PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
 MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are kept in 16 bits
 
 

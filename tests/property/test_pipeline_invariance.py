@@ -47,7 +47,10 @@ def test_map_coordinates(east: float, north: float) -> None:
     scenes.assert_same_set(there, scenes.move_gaussians(here, np.eye(3), 1.0, shift), atol=1e-4)
 
 
-CASES = [{}, {"k": 4, "seed": 3}, {"robust": False, "match": "aabb"}, {"method": "bass-st", "fit": "none"}]
+CASES = [
+    {}, {"fit": "color", "k": 4, "seed": 3}, {"robust": False, "match": "aabb", "fit": "color"},
+    {"method": "bass-st", "fit": "none"}, {"robust": True, "dropout": 0.2, "k": 2, "seed": 5},
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("settings", CASES, ids=str)

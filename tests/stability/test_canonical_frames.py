@@ -24,7 +24,7 @@ def room() -> PixelScene:
 # 13: flyaways
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"match": "aabb"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"fit": "color", "match": "aabb"}], ids=str)
 def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> None:
     means = room.gaussians.means.clone()
     rows = np.random.default_rng(0).choice(len(means), 5, replace=False)
@@ -42,7 +42,7 @@ def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> N
 # 37: coordinates of maps
 
 
-@pytest.mark.parametrize("settings", [{"robust": False, "fit": "none"}, {"fit": "none"}, {"k": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{"robust": False, "fit": "none"}, {"fit": "none"}, {"fit": "color", "k": 2}], ids=str)
 def test_map_coordinates(room: PixelScene, settings: dict) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     here, there = scenes.compacted(room, **settings).gaussians, scenes.compacted(far, **settings).gaussians
@@ -54,10 +54,18 @@ def test_map_coordinates(room: PixelScene, settings: dict) -> None:
 
 def test_map_coordinates_at_every_stage_of_the_report(room: PixelScene) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
-    here, there = scenes.compacted(room).report, scenes.compacted(far).report
+    here, there = scenes.compacted(room, fit="color").report, scenes.compacted(far, fit="color").report
     assert there.psnr_before == pytest.approx(here.psnr_before, abs=0.01)
     assert there.psnr_after == pytest.approx(here.psnr_after, abs=0.05)
     assert there.choices["merge"] == here.choices["merge"]
+
+
+def test_map_coordinates_with_the_full_fit(room: PixelScene) -> None:
+    """Its steps make much of the last bit, but not of what it reaches."""
+    far = scenes.move(room, np.eye(3), 1.0, UTM)
+    here, there = scenes.compacted(room), scenes.compacted(far)
+    assert len(there.gaussians) == len(here.gaussians)
+    assert there.report.psnr_after == pytest.approx(here.report.psnr_after, abs=0.7)
 
 
 # 38: similarity transforms
@@ -83,8 +91,9 @@ def test_similarity_of_equal_opacities(room: PixelScene) -> None:
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
 def test_similarity_with_everything_on(room: PixelScene, factor: float) -> None:
     moved = scenes.move(room, scenes.random_rotation(2), factor, np.zeros(3))
-    one, other = scenes.compacted(room, k=2), scenes.compacted(moved, k=2)
-    assert len(other.gaussians) == pytest.approx(len(one.gaussians), rel=0.005)
-    assert other.report.choices["merge"] == one.report.choices["merge"]
-    assert other.report.psnr_before == pytest.approx(one.report.psnr_before, abs=0.02)
-    assert other.report.psnr_after == pytest.approx(one.report.psnr_after, abs=0.1)
+    for settings, most in (({"fit": "color"}, 0.1), ({"robust": True}, 0.7)):
+        one, other = (scenes.compacted(s, k=2, **settings) for s in (room, moved))
+        assert len(other.gaussians) == pytest.approx(len(one.gaussians), rel=0.005)
+        assert other.report.choices["merge"] == one.report.choices["merge"]
+        assert other.report.psnr_before == pytest.approx(one.report.psnr_before, abs=0.02)
+        assert other.report.psnr_after == pytest.approx(one.report.psnr_after, abs=most)

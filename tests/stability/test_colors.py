@@ -53,15 +53,20 @@ def test_exposure_that_changes_between_views(room: PixelScene) -> None:
     assert varied > steady - 0.2
 
 
-@pytest.mark.parametrize("robust", [True, False])
-def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool) -> None:
-    """The whole command: the fit still helps."""
+@pytest.mark.parametrize(("robust", "fit"), [(True, "color"), (False, "color"), (False, "full")])
+def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: str) -> None:
+    """The whole command: the fit still helps. Now and then it is refused, since exposure weighs on the judge, too."""
     assert room.images is not None
     factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)
-    fitted, unfitted = (scenes.compacted(scene, robust=robust, fit=fit).gaussians for fit in ("color", "none"))
     surfaces = [scenes.Surface(s.trace, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
-    assert novel_psnr(fitted, surfaces) > novel_psnr(unfitted, surfaces)
+    before = novel_psnr(scenes.compacted(scene, robust=robust, fit="none").gaussians, surfaces)
+    after = [
+        novel_psnr(scenes.compacted(scene, robust=robust, fit=fit, seed=seed).gaussians, surfaces) for seed in range(3)
+    ]
+    fewer = 0.6 if fit == "full" else 0.0  # a full fit that is refused leaves those that it was to grow from
+    assert min(after) >= before - fewer
+    assert np.mean(after) > before + 1.5
 
 
 # 30, 31: nothing to see, and too much
@@ -97,7 +102,7 @@ def shiny(scene: PixelScene, strength: float) -> PixelScene:
     return replace(made, images=torch.from_numpy(images).float())
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
 def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     found = scenes.compacted(scene, **settings).gaussians
@@ -121,23 +126,23 @@ def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
     offset = replace(scene, gaussians=replace(scene.gaussians, sh0=sh0, shN=shN))
     images = scenes.images_of(offset.gaussians, offset.cameras)[0].clip(0, 1)
     offset = replace(offset, images=torch.from_numpy(images).float())
-    for settings in ({"fit": "none"}, {}):
+    for settings, most in (({"fit": "none"}, 1.0), ({"fit": "color"}, 1.0), ({}, 2.5)):
         result = scenes.compacted(offset, robust=False, **settings)
         usual = scenes.compacted(scene, robust=False, **settings)
-        assert result.report.psnr_after > usual.report.psnr_after - 1.0  # type: ignore[operator]
+        assert result.report.psnr_after > usual.report.psnr_after - most  # type: ignore[operator]
 
 
 # 54: something that moves
 
 
-@pytest.mark.parametrize("robust", [True, False])
-def test_passer_by_in_one_view_does_not_haunt_the_others(room: PixelScene, robust: bool) -> None:
+@pytest.mark.parametrize(("robust", "fit"), [(True, "color"), (False, "color"), (False, "full")])
+def test_passer_by_in_one_view_does_not_haunt_the_others(room: PixelScene, robust: bool, fit: str) -> None:
     """A red patch in the photo of view 1 and on its Gaussians."""
     assert room.images is not None
     images = room.images.clone()
     images[1, 10:24, 14:28] = torch.tensor([1.0, 0.0, 0.0])
-    haunted = scenes.compacted(painted(room, images), robust=robust).gaussians
-    clean = scenes.compacted(room, robust=robust).gaussians
+    haunted = scenes.compacted(painted(room, images), robust=robust, fit=fit).gaussians
+    clean = scenes.compacted(room, robust=robust, fit=fit).gaussians
     others = room.cameras[torch.tensor([0, 2, 3])]
     a, b = (scenes.images_of(g, others)[0].clip(0, 1) for g in (haunted, clean))
     ghost = np.abs(a - b)[:, 8:28, 10:34].mean()

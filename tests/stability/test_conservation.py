@@ -39,15 +39,16 @@ def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
 # 47: more children, more detail
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}], ids=str)
 def test_more_children_show_more(scene: PixelScene, settings: dict) -> None:
     found = [scenes.compacted(scene, density=0.044, k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in found]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in found]) > -0.05).all()
 
 
-def test_more_superpixels_show_more(scene: PixelScene) -> None:
-    found = [scenes.compacted(scene, density=density).gaussians for density in (0.01, 0.03, 0.1)]
+@pytest.mark.parametrize("fit", ["color", "full"])
+def test_more_superpixels_show_more(scene: PixelScene, fit: str) -> None:
+    found = [scenes.compacted(scene, density=density, fit=fit).gaussians for density in (0.01, 0.03, 0.1)]
     assert (np.diff([len(g) for g in found]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in found]) > -0.05).all()
 
@@ -55,13 +56,22 @@ def test_more_superpixels_show_more(scene: PixelScene) -> None:
 # 48: coverage and brightness
 
 
-@pytest.mark.parametrize("settings", [{}, {"k": 4}, {"fit": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color", "k": 4}, {"fit": "none", "match": "none"}], ids=str)
 def test_photos_keep_coverage_and_brightness(scene: PixelScene, settings: dict) -> None:
-    """With the choice among merges, within a hundredth."""
+    """With the full fit or the choice among merges, within a hundredth."""
     before = coverage(scene.gaussians, scene)
     after = coverage(scenes.compacted(scene, density=0.044, **settings).gaussians, scene)
     assert after[0] == pytest.approx(before[0], abs=0.01)
     assert after[1] == pytest.approx(before[1], abs=0.01)
+
+
+@pytest.mark.parametrize("fit", ["none", "color"])
+def test_matched_backing_keeps_coverage(scene: PixelScene, fit: str) -> None:
+    """Matching also makes one backing layer of the views' several, so a little more shines through."""
+    before = coverage(scene.gaussians, scene)
+    after = coverage(scenes.compacted(scene, density=0.044, fit=fit).gaussians, scene)
+    assert after[0] == pytest.approx(before[0], abs=0.025)
+    assert after[1] == pytest.approx(before[1], abs=0.015)
 
 
 # One layer of merged Gaussians is not closed: a tile's corners lie 2.4 of its standard deviations away. What is
@@ -88,7 +98,7 @@ def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
 # 55: glass
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"match": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"match": "none"}], ids=str)
 def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
     opacities = 0.05 * torch.ones_like(scene.gaussians.opacities)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))

@@ -38,7 +38,7 @@ def one_group_per_view(scene: PixelScene) -> FeatureGaussians:
 # 1: coincident Gaussians
 
 
-@pytest.mark.parametrize("settings", [{}, {"k": 4}, {"match": "aabb"}, {"robust": False, "fit": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color", "k": 4}, {"match": "aabb"}, {"robust": False, "fit": "none"}], ids=str)
 def test_all_gaussians_in_one_place(room: PixelScene, settings: dict) -> None:
     means = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand(len(room.gaussians), 3)
     first = {name: getattr(room.gaussians, name)[:1].expand_as(getattr(room.gaussians, name)) for name in scenes.FIELDS}
@@ -115,7 +115,7 @@ def test_needles_hardly_show(room: PixelScene) -> None:
     assert scenes.psnr_of(found, room) > scenes.psnr_of(clean, room) - 1
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"k": 4}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"fit": "color", "k": 4}], ids=str)
 def test_scales_at_the_ends_of_the_range(room: PixelScene, settings: dict) -> None:
     scales = room.gaussians.scales.clone()
     scales[::30] = 2e17  # exp(40)
@@ -149,10 +149,11 @@ def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
     scenes.assert_same_set(found, others, atol=1e-4)
 
 
+@pytest.mark.parametrize("fit", ["color", "full"])
 @pytest.mark.parametrize("opacity", [0.0, 1e-5])
-def test_wholly_transparent_scene(room: PixelScene, opacity: float) -> None:
+def test_wholly_transparent_scene(room: PixelScene, opacity: float, fit: str) -> None:
     scene = changed(room, opacities=torch.full_like(room.gaussians.opacities, opacity))
-    scenes.compacted(scene)
+    scenes.compacted(scene, fit=fit)
 
 
 def test_wholly_opaque_scene(room: PixelScene) -> None:
@@ -203,7 +204,7 @@ def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("where", ["at", "behind"])
-@pytest.mark.parametrize("settings", [{}, {"k": 4}, {"robust": False, "fit": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color", "k": 4}, {"robust": False, "fit": "none"}], ids=str)
 def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settings: dict) -> None:
     """A tenth of every view, superpixels as a whole among them."""
     means = room.gaussians.means.clone().reshape(3, 36, 48, 3)
@@ -218,7 +219,7 @@ def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settin
 # 15, 16: depth edges
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(1e6, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
@@ -249,7 +250,7 @@ def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
 # 17: thin things
 
 
-@pytest.mark.parametrize("settings", [{}, {"k": 2}, {"robust": False, "fit": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"k": 2}, {"robust": False, "fit": "none"}], ids=str)
 def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
     """Two pixels wide; contrast against the wall beside it."""
     scene = scenes.make_scene(scenes.pole(), scenes.arc(3))

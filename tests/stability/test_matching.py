@@ -33,9 +33,10 @@ def chain(count: int, apart: float) -> FeatureGaussians:
 @pytest.mark.parametrize("apart", [0.2, 0.5, 1.0, 1.5])
 def test_chain_of_a_thousand_does_not_collapse(apart: float) -> None:
     features = chain(1000, apart)
-    found = diameters(features)
-    assert found.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
-    assert len(found) >= 250
+    for size, most in ((None, 7), (4, 4)):  # one of each of the seven views, unless told
+        found = diameters(features, cluster_size=size)
+        assert found.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
+        assert len(found) >= 1000 / most
 
 
 def test_chained_wall_stays_covered() -> None:

@@ -74,10 +74,22 @@ def test_one_view_is_left_alone(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_backing_is_left_alone(method: str) -> None:
+def test_backing_is_matched_by_itself(method: str) -> None:
     features = make_features(np.zeros((4, 3)))
     features = replace(features, backing=torch.tensor([False, True, False, True]))
+    assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1, 3])}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_transparent_ones_are_left_alone(method: str) -> None:
+    features = make_features(np.zeros((4, 3)), opacities=[0.8, 0.0, 0.8, 0.0])
     assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1]), frozenset([3])}
+
+
+def test_as_many_to_a_cluster_as_there_are_views() -> None:
+    """Those of no view, merged before, count like any other."""
+    features = make_features(np.zeros((9, 3)), views=[-1, -1, -1, -1, -1, -1, 0, 1, 2])
+    assert sorted(map(len, sets(features))) == [1, 4, 4]
 
 
 def test_one_of_each_view() -> None:

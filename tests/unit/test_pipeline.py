@@ -16,7 +16,7 @@ def scene() -> PixelScene:
 
 
 def test_report(scene: PixelScene) -> None:
-    result = scenes.compacted(scene)
+    result = scenes.compacted(scene, fit="color")
     report = result.report
     assert report.num_input == 3 * 32 * 24
     assert 0 < report.num_output == len(result.gaussians) < report.num_input
@@ -28,12 +28,36 @@ def test_report(scene: PixelScene) -> None:
     assert report.options["density"] == 0.1
 
 
+def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
+    """Unless it is asked for."""
+    full = scenes.compacted(scene).report
+    assert set(STAGES) - set(full.seconds) == {"robust"}
+    assert not {"merge", "merge_scores", "closed"} & set(full.choices)
+    assert full.choices["fit"]["method"] == "full"
+    asked = scenes.compacted(scene, robust=True).report
+    assert list(asked.seconds) == list(STAGES)
+    assert "merge" in asked.choices
+    assert "merge" in scenes.compacted(scene, fit="none").report.choices
+    assert "merge" not in scenes.compacted(scene, fit="color", robust=False).report.choices
+
+
 def test_progress_tells_every_stage(scene: PixelScene) -> None:
     calls: list[tuple[str, int, int]] = []
-    compact(scene, progress=lambda *call: calls.append(call))
+    compact(scene, fit="color", progress=lambda *call: calls.append(call))
     assert [name for name, _, _ in calls] == [*STAGES, "done"]
     assert [done for _, done, _ in calls] == list(range(len(STAGES) + 1))
     assert {total for _, _, total in calls} == {len(STAGES)}
+
+
+def test_progress_tells_every_step_of_the_full_fit(scene: PixelScene) -> None:
+    calls: list[tuple[str, int, int]] = []
+    compact(scene, fit_steps=12, progress=lambda *call: calls.append(call))
+    steps = [call for call in calls if call[0].startswith("fit:")]
+    assert [call[1:] for call in steps] == [(step, 12) for step in range(1, 13)]
+    assert all("photos" in name and "held out" in name for name, _, _ in steps)
+    assert [name for name, _, _ in calls if not name.startswith("fit:")] == [
+        *(stage for stage in STAGES if stage != "robust"), "done",
+    ]  # fmt: skip
 
 
 def test_without_photos(scene: PixelScene) -> None:
@@ -42,9 +66,11 @@ def test_without_photos(scene: PixelScene) -> None:
     assert not {"robust", "fit", "score"} & set(result.report.seconds)
 
 
-def test_two_views_take_the_plain_merge(scene: PixelScene) -> None:
-    result = scenes.compacted(scenes.take_views(scene, [0, 1]))
-    assert "merge" not in result.report.choices
+@pytest.mark.parametrize("views", [[0], [0, 1]])
+def test_few_views_choose_among_spreads(scene: PixelScene, views: list[int]) -> None:
+    """Nothing can be left out, so no weighing; and no backing layer."""
+    result = scenes.compacted(scenes.take_views(scene, views), fit="none")
+    assert sorted(result.report.choices["merge_scores"]) == ["plain", "wide", "wider"]
 
 
 def test_options_and_settings_combine(scene: PixelScene) -> None:
@@ -60,7 +86,7 @@ def test_options_and_settings_combine(scene: PixelScene) -> None:
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_count_is_what_was_asked_for(scene: PixelScene, robust: bool, match: str, k: int) -> None:
     """The backing layer is part of it."""
-    found = scenes.compacted(scene, superpixels=40, robust=robust, match=match, k=k)
+    found = scenes.compacted(scene, superpixels=40, robust=robust, match=match, k=k, fit="color")
     assert len(found.gaussians) <= 3 * 40 * k
     if match == "none" and not robust:
         assert len(found.gaussians) >= 0.95 * 3 * 40 * k
@@ -119,7 +145,11 @@ def test_double_precision_input(scene: PixelScene) -> None:
     columns = {name: getattr(scene.gaussians, name).double() for name in scenes.FIELDS}
     assert scene.images is not None
     doubled = replace(scene, gaussians=replace(scene.gaussians, **columns), images=scene.images.double())
-    scenes.assert_same_set(scenes.compacted(doubled).gaussians, scenes.compacted(scene).gaussians, atol=1e-4)
+    found = [scenes.compacted(s, fit="color").gaussians for s in (doubled, scene)]
+    scenes.assert_same_set(*found, atol=1e-4)
+    assert scenes.psnr_of(scenes.compacted(doubled).gaussians, scene) == pytest.approx(
+        scenes.psnr_of(scenes.compacted(scene).gaussians, scene), abs=0.7
+    )
 
 
 def test_input_is_left_alone(scene: PixelScene) -> None:
@@ -134,7 +164,7 @@ def test_input_is_left_alone(scene: PixelScene) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"k": 0}, "k: expected 1 to 8, got 0"),
+        ({"k": 0}, 'k: expected 1 to 8 or "auto", got 0'),
         ({"superpixels": 32 * 24 + 1}, "superpixels: expected at most 768"),
         ({"match": "iou"}, "match: expected"),
         ({"kk": 1}, "unknown setting 'kk'"),
