@@ -152,6 +152,7 @@ def plan_document(
     per_view: int,
     photos: bool,
     threads: int,
+    wanted: int | None = None,
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory.
@@ -161,9 +162,10 @@ def plan_document(
         grid: Views, height and width of the Gaussian grid.
         options: All settings by flat name, as of ``CompactOptions.to_dict()``.
         output_path: The ``.ply`` that would be written.
-        per_view: Superpixels per view.
+        per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
+        wanted: Gaussians that a budget or a file size asks for; None without either.
         notes: What the reader had to say.
 
     Returns:
@@ -178,6 +180,8 @@ def plan_document(
     work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
     steps = options["fit_steps"] if fit == "full" else 0
     seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
+    children = 1 if options["k"] == "auto" else options["k"]
+    at_most = per_view * views * children if wanted is None else wanted
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
         **document_head(),
@@ -185,9 +189,9 @@ def plan_document(
         "input": {**files, "num_gaussians": pixels, "num_views": views, "height": height, "width": width},
         "output": {
             "path": os.fspath(output_path),
-            "num_gaussians_at_most": min(pixels, per_view * views * options["k"]),
+            "num_gaussians_at_most": min(pixels, at_most),
         },
-        "superpixels_per_view": per_view,
+        "superpixels_per_view": per_view if wanted is None and options["k"] != "auto" else None,
         "robust": robust,
         "fit": fit,
         "estimate": {
@@ -201,11 +205,15 @@ def plan_document(
 
 def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     """The plan for people."""
-    found, guess = plan["input"], plan["estimate"]
+    found, guess, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
+    even = per_view is not None
+    superpixels = (
+        f"{per_view:,} per view, {plan['options']['k']} Gaussian(s) each" if even else "where the scene needs them"
+    )
     return [
         f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",
         f"would write  {plan['output']['path']}: at most {plan['output']['num_gaussians_at_most']:,} Gaussians",
-        f"superpixels  {plan['superpixels_per_view']:,} per view, {plan['options']['k']} Gaussian(s) each",
+        f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
         f" across views: {plan['options']['match']}",
         f"fit          {plan['fit']}",

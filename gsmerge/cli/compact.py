@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gsmerge.io import SceneFiles, SceneLoad
     from gsmerge.io.ply import OpacityChoice
     from gsmerge.options import CompactOptions
+    from gsmerge.types import PixelScene
 
 
 def compact(
@@ -163,9 +164,18 @@ def _print_plan(
         per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height),
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
+        wanted=_wanted(scene, settings),
         notes=loaded.notes,
     )
     if as_json:
         sys.stdout.write(to_json(document))
     else:
         print("\n".join(plan_lines(document)))
+
+
+def _wanted(scene: PixelScene, settings: CompactOptions) -> int | None:
+    """Gaussians that a budget or a file size asks for, refused as wrong usage where that cannot be."""
+    from gsmerge.grouping import target_count
+
+    with told_as_usage():
+        return target_count(scene, settings)

@@ -30,7 +30,7 @@ ROWS = 16384  # Gaussians per piece of an optimiser step
 GROWTH = 0.4  # part of the run after which Gaussians are added
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 START = 0.57  # share of the Gaussians that a run which grows begins with
-FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.2
+FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.1
 PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
 

@@ -30,7 +30,7 @@ class Rates:
     quat: float = 0.03
     logit: float = 0.3
     color: float = 0.03
-    decay: float = 0.1
+    decay: float = 0.2
     betas: tuple[float, float] = (0.7, 0.99)
     reach_mean: float = 2.0
     reach_size: float = 2.5
@@ -46,7 +46,7 @@ class FitOptions:
         fit_steps: Steps of the full fit, one view each.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
-        dropout: Share of the Gaussians that a step leaves out; None: 0.2 for five views or fewer and 150 steps or
+        dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the photos alone would be learnt by heart, otherwise 0.
         coarse: Share of the steps that look at half-size photos.
         dssim: Share of structural similarity in the loss, the rest is L1.

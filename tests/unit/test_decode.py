@@ -135,5 +135,5 @@ def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
 
 @pytest.mark.parametrize("k", [0, -1, 9])
 def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
-    with pytest.raises(ValueError, match=f"k: expected 1 to 8, got {k}"):
+    with pytest.raises(ValueError, match=f'k: expected 1 to 8 or "auto", got {k}'):
         decode(features, members, DecodeOptions(k=k))

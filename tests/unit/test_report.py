@@ -70,7 +70,7 @@ def test_human_bytes(count: float, text: str) -> None:
     assert report.human_bytes(count) == text
 
 
-def plan(*, photos: bool = True, views: int = 12, **settings: Any) -> dict[str, Any]:
+def plan(*, photos: bool = True, views: int = 12, wanted: int | None = None, **settings: Any) -> dict[str, Any]:
     options = CompactOptions().with_settings(settings)
     return report.plan_document(
         {"ply": "scene.ply", "cameras": "transforms.json", "images": None},
@@ -80,6 +80,7 @@ def plan(*, photos: bool = True, views: int = 12, **settings: Any) -> dict[str, 
         per_view=800,
         photos=photos,
         threads=2,
+        wanted=wanted,
     )
 
 
@@ -87,6 +88,15 @@ def test_plan_counts() -> None:
     assert plan(k=2)["output"]["num_gaussians_at_most"] == 12 * 800 * 2
     assert plan(views=1, k=8)["output"]["num_gaussians_at_most"] == 6400
     assert plan()["input"]["num_gaussians"] == 240_000
+    assert plan(k="auto")["output"]["num_gaussians_at_most"] == 12 * 800
+
+
+def test_plan_of_a_budget() -> None:
+    document = plan(budget="2%", wanted=4800)
+    assert document["output"]["num_gaussians_at_most"] == 4800
+    assert document["superpixels_per_view"] is None
+    assert any("at most 4,800" in line for line in report.plan_lines(document))
+    assert all(report.plan_lines(plan(k="auto")))
 
 
 def test_plan_says_what_will_not_run() -> None:

@@ -1,0 +1,119 @@
+"""The image loss: against finite differences and autograd of a plain float64 loss."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from gsmerge.fit.loss import image_gradient
+from gsmerge.kernels.optimise import C1, C2, similarity_terms
+
+SIZES = [(20, 17), (7, 7), (3, 5), (1, 9)]
+
+
+def pictures(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render, photo, weights of the pixels (a part of them zero)."""
+    rng = np.random.default_rng(seed)
+    photo = rng.uniform(0, 1, (*size, 3))
+    image = photo + rng.normal(size=photo.shape) * 0.2
+    weight = rng.uniform(0.2, 1, size) * (rng.random(size) > 0.2)
+    return image.astype(np.float32), photo.astype(np.float32), weight.astype(np.float32)
+
+
+def box(images: torch.Tensor) -> torch.Tensor:
+    """Means over 7 x 7 windows of ``[h,w,3]``, zero beyond the border."""
+    return F.avg_pool2d(images.permute(2, 0, 1)[None], 7, 1, 3, count_include_pad=True)[0].permute(1, 2, 0)
+
+
+def similarity(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
+    """SSIM ``[h,w,3]`` (Wang et al., 2004)."""
+    mx, my = box(image), box(photo)
+    xx, yy, xy = box(image * image) - mx * mx, box(photo * photo) - my * my, box(image * photo) - mx * my
+    c1, c2 = float(C1), float(C2)
+    return (2 * mx * my + c1) * (2 * xy + c2) / ((mx * mx + my * my + c1) * (xx + yy + c2))
+
+
+def loss(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor, dssim: float) -> torch.Tensor:
+    each = (1 - dssim) * (image - photo).abs() + dssim * (1 - similarity(image, photo))
+    return (weight[..., None] * each).sum() / (image.shape[0] * image.shape[1])
+
+
+def autograd(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dssim: float) -> np.ndarray:
+    variable = torch.from_numpy(image).double().requires_grad_()
+    loss(variable, torch.from_numpy(photo).double(), torch.from_numpy(weight).double(), dssim).backward()
+    assert variable.grad is not None
+    return variable.grad.numpy()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("dssim", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("weighted", [True, False])
+def test_gradient_matches_autograd(size: tuple[int, int], dssim: float, weighted: bool) -> None:
+    image, photo, weight = pictures(size)
+    weight = weight if weighted else np.ones_like(weight)
+    found, wanted = image_gradient(image, photo, weight, dssim), autograd(image, photo, weight, dssim)
+    assert found.dtype == np.float32
+    assert np.linalg.norm(found - wanted) <= 1e-3 * np.linalg.norm(wanted)
+
+
+def test_gradient_matches_finite_differences() -> None:
+    image, photo, weight = pictures((12, 10), seed=1)
+    found = image_gradient(image, photo, weight, 0.2)
+    rng, step = np.random.default_rng(0), 1e-6
+    for _ in range(5):
+        way = rng.normal(size=image.shape)
+        ends = [
+            float(loss(*(torch.from_numpy(a) for a in (image + sign * step * way, photo, weight)), 0.2))
+            for sign in (1.0, -1.0)
+        ]
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((found * way).sum()), rel=2e-3, abs=1e-5)
+
+
+def test_terms_match_finite_differences() -> None:
+    """Of one window's SSIM in its mean, mean square and mean product."""
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(0, 1, (2, 30, 49))
+    moments = [a.mean(1), b.mean(1), (a * a).mean(1), (b * b).mean(1), (a * b).mean(1)]
+
+    def ssim(mx: np.ndarray, my: np.ndarray, xx: np.ndarray, yy: np.ndarray, xy: np.ndarray) -> np.ndarray:
+        c1, c2 = float(C1), float(C2)
+        over = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
+        return over / ((mx**2 + my**2 + c1) * (xx - mx**2 + yy - my**2 + c2))
+
+    found = [np.empty(30, np.float32) for _ in range(3)]
+    similarity_terms(*(m.astype(np.float32) for m in moments), *found)
+    for which, term in zip((0, 2, 4), found, strict=True):
+        ends = []
+        for step in (1e-6, -1e-6):
+            moved = list(moments)
+            moved[which] = moved[which] + step
+            ends.append(ssim(*moved))
+        np.testing.assert_allclose(term, (ends[0] - ends[1]) / 2e-6, rtol=5e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("dssim", [0.0, 0.2, 1.0])
+def test_no_gradient_at_the_photo(dssim: float) -> None:
+    _, photo, weight = pictures((16, 16))
+    assert np.abs(image_gradient(photo, photo, weight, dssim)).max() < 1e-5
+
+
+def test_pixels_without_weight_teach_nothing() -> None:
+    """Nor do windows about them; what is learnt near them is of their neighbours' windows."""
+    image, photo, _ = pictures((40, 40))
+    weight = np.ones((40, 40), np.float32)
+    weight[:, 20:] = 0
+    gradient = image_gradient(image, photo, weight, 0.2)
+    assert (gradient[:, 23:] == 0).all()
+    assert (gradient[:, :20] != 0).any(-1).all()
+    elsewhere = photo.copy()
+    elsewhere[:, 23:] = 0.3  # seen by no window of a weighted pixel
+    np.testing.assert_allclose(image_gradient(image, elsewhere, weight, 0.2), gradient, atol=1e-7)
+
+
+def test_flat_pictures_stay_finite() -> None:
+    flat, weight = np.zeros((9, 9, 3), np.float32), np.ones((9, 9), np.float32)
+    for image in (flat, flat + 1):
+        assert np.isfinite(image_gradient(image, flat, weight, 0.2)).all()
+    assert np.isfinite(image_gradient(flat, flat + 1, 0 * weight, 0.2)).all()

@@ -1,0 +1,272 @@
+"""The optimiser's step against a slow, obvious twin in float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pytest
+
+from gsmerge.kernels.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE, adam
+
+RATES = np.array([0.1] * 3 + [0.2] * 3 + [0.03] * 4 + [0.3] + [0.03] * 3)
+LIMITS, BETAS = np.array([2.0, 2.5, 4.0]), np.array([0.7, 0.99])
+MEAN, TURN = slice(0, SIZE), slice(QUAT, LOGIT)
+
+
+@dataclass
+class Run:
+    """All that a step reads and writes, n rows."""
+
+    x: np.ndarray
+    x0: np.ndarray
+    m: np.ndarray
+    v: np.ndarray
+    units: np.ndarray
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+    def copy(self) -> Run:
+        return Run(*(getattr(self, f.name).copy() for f in fields(self)))
+
+
+@dataclass
+class Wanted:
+    """Gradients of some rows, as the rasterizer gives them: of linear scales and opacities."""
+
+    ids: np.ndarray
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+
+def make_run(count: int, seed: int = 0) -> Run:
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(count, COLUMNS)).astype(np.float32)
+    x[:, SIZE:QUAT] -= 3
+    x[:, TURN] /= np.linalg.norm(x[:, TURN], axis=1, keepdims=True)
+    x[:, COLOR:] = rng.uniform(0, 1, (count, 3))
+    zeros = np.zeros_like(x)
+    units = rng.uniform(0.02, 0.2, count).astype(np.float32)
+    opacities = 1 / (1 + np.exp(-x[:, LOGIT]))
+    return Run(
+        x, x.copy(), zeros, zeros.copy(), units, x[:, MEAN].copy(), x[:, TURN].copy(),
+        np.exp(x[:, SIZE:QUAT]), opacities, x[:, COLOR:].copy(),
+    )  # fmt: skip
+
+
+def gradients(count: int, seed: int, share: float = 0.6, size: float = 1.0) -> Wanted:
+    """Of a part of the rows."""
+    rng = np.random.default_rng(seed)
+    ids = np.flatnonzero(rng.random(count) < share).astype(np.int32)
+
+    def normal(*width: int) -> np.ndarray:
+        return (size * rng.normal(size=(len(ids), *width))).astype(np.float32)
+
+    return Wanted(ids, normal(3), normal(4), normal(3), normal(), normal(3))
+
+
+def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None, rates: np.ndarray = RATES) -> None:
+    edges = pieces or [0, len(run.x)]
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        adam(
+            run.x, run.x0, run.m, run.v, run.units, g.ids, g.means, g.quats, g.scales, g.opacities, g.colors,
+            rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), step, first, last,
+            run.means, run.quats, run.scales, run.opacities, run.colors,
+        )  # fmt: skip
+
+
+def step_slowly(run: Run, g: Wanted, step: int) -> None:
+    """The textbook, row by row and in float64 (Kingma and Ba, 2015), with what is said in the kernel's docstring."""
+    for i in range(len(run.x)):
+        row = np.zeros(COLUMNS)
+        at = np.flatnonzero(g.ids == i)
+        if len(at):
+            k = at[0]
+            alpha = run.opacities[i]
+            row[:] = np.concatenate([
+                g.means[k] * run.units[i], g.scales[k] * run.scales[i], g.quats[k],
+                [g.opacities[k] * alpha * (1 - alpha)], g.colors[k],
+            ])  # fmt: skip
+        energy = row**2
+        energy[MEAN], energy[TURN] = energy[MEAN].mean(), energy[TURN].sum() / 3  # a rotation has three freedoms
+        run.m[i] = BETAS[0] * run.m[i] + (1 - BETAS[0]) * row
+        run.v[i] = BETAS[1] * run.v[i] + (1 - BETAS[1]) * energy
+        first, second = run.m[i] / (1 - BETAS[0] ** step), run.v[i] / (1 - BETAS[1] ** step)
+        move = RATES * first / (np.sqrt(second) + 1e-15)
+        move[MEAN] *= run.units[i]
+        x, x0 = run.x[i] - move, run.x0[i]
+        way = x[MEAN] - x0[MEAN]
+        x[MEAN] = x0[MEAN] + way * min(1, LIMITS[0] * run.units[i] / max(np.linalg.norm(way), 1e-30))
+        x[SIZE:QUAT] = np.clip(x[SIZE:QUAT], x0[SIZE:QUAT] - LIMITS[1], x0[SIZE:QUAT] + LIMITS[1])
+        logit = np.clip(x[LOGIT], x0[LOGIT] - LIMITS[2], x0[LOGIT] + LIMITS[2])
+        x[LOGIT] = np.clip(logit, MIN_LOGIT, MAX_LOGIT)
+        x[COLOR:] = np.clip(x[COLOR:], np.minimum(x0[COLOR:], -0.05), np.maximum(x0[COLOR:], 1.05))
+        x[TURN] /= np.linalg.norm(x[TURN])
+        run.x[i] = x
+        run.means[i], run.quats[i], run.colors[i] = x[MEAN], x[TURN], x[COLOR:]
+        run.scales[i], run.opacities[i] = np.exp(x[SIZE:QUAT]), 1 / (1 + np.exp(-x[LOGIT]))
+
+
+def doubled(run: Run) -> Run:
+    return Run(*(getattr(run, f.name).astype(np.float64) for f in fields(run)))
+
+
+def test_steps_match_the_slow_twin() -> None:
+    """Thirty steps, each with gradients of other rows; long enough for many to reach the box."""
+    run = make_run(40)
+    slow = doubled(run)
+    for step in range(1, 31):
+        g = gradients(40, seed=step)
+        step_kernel(run, g, step)
+        step_slowly(slow, g, step)
+    for name in ("m", "v", "x", "means", "quats", "scales", "opacities", "colors"):
+        np.testing.assert_allclose(getattr(run, name), getattr(slow, name), rtol=2e-4, atol=2e-5, err_msg=name)
+
+
+def test_first_step_goes_by_the_rates() -> None:
+    """With the bias corrected, one component's first step is its rate; a vector's has the rate as its rms."""
+    run, g = make_run(30), gradients(30, seed=7, share=1.1)
+    before = run.x.copy()
+    step_kernel(run, g, 1)
+    move = run.x - before
+    np.testing.assert_allclose(np.abs(move[:, SIZE:QUAT]), 0.2, rtol=1e-3)
+    np.testing.assert_allclose(np.abs(move[:, LOGIT]), 0.3, rtol=1e-3)
+    rms = np.sqrt((move[:, MEAN] ** 2).mean(1)) / run.units
+    np.testing.assert_allclose(rms, 0.1, rtol=1e-3)
+    np.testing.assert_array_equal(np.sign(move[:, SIZE:QUAT]), -np.sign(g.scales))
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_size_of_the_gradient_does_not_matter(factor: float) -> None:
+    one, other = make_run(20), make_run(20)
+    for step in (1, 2, 3):
+        g, scaled = gradients(20, seed=step), gradients(20, seed=step, size=factor)
+        step_kernel(one, g, step)
+        step_kernel(other, scaled, step)
+    np.testing.assert_allclose(one.x, other.x, atol=1e-4)
+
+
+def test_mean_turns_with_the_scene() -> None:
+    """One second moment for the vector: turning gradients and state turns the step."""
+    turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    one, other = make_run(20), make_run(20)
+    for array in (other.x, other.x0, other.means):
+        array[:, MEAN] = array[:, MEAN] @ turn.T
+    for step in range(1, 6):
+        g, turned = gradients(20, seed=step), gradients(20, seed=step)
+        turned.means = (turned.means @ turn.T).astype(np.float32)
+        step_kernel(one, g, step)
+        step_kernel(other, turned, step)
+    np.testing.assert_allclose(one.x[:, MEAN] @ turn.T, other.x[:, MEAN], atol=1e-5)
+    np.testing.assert_allclose(one.x[:, SIZE:], other.x[:, SIZE:], atol=1e-6)
+
+
+def test_unit_of_length_does_not_matter() -> None:
+    one, other = make_run(20), make_run(20)
+    for array in (other.x, other.x0, other.means):
+        array[:, MEAN] *= 64
+    other.units *= 64
+    for step in range(1, 6):
+        g, scaled = gradients(20, seed=step), gradients(20, seed=step)
+        scaled.means = scaled.means / np.float32(64)
+        step_kernel(one, g, step)
+        step_kernel(other, scaled, step)
+    np.testing.assert_allclose(64 * one.x[:, MEAN], other.x[:, MEAN], rtol=1e-5, atol=1e-4)
+
+
+def test_box_holds() -> None:
+    """Pulled the same way for a hundred steps."""
+    run, g = make_run(25), gradients(25, seed=1, share=1.1)
+    for step in range(1, 101):
+        step_kernel(run, g, step)
+    far = np.linalg.norm(run.x[:, MEAN] - run.x0[:, MEAN], axis=1)
+    np.testing.assert_allclose(far, 2 * run.units, rtol=1e-3)
+    np.testing.assert_allclose(np.abs(run.x - run.x0)[:, SIZE:QUAT], 2.5, rtol=1e-5)
+    assert np.abs(run.x[:, LOGIT] - run.x0[:, LOGIT]).max() <= 4.0001
+    assert run.x[:, LOGIT].min() >= MIN_LOGIT
+    assert run.x[:, LOGIT].max() <= MAX_LOGIT
+    wanted = np.where(g.colors > 0, np.float32(-0.05), np.float32(1.05))
+    np.testing.assert_allclose(run.x[:, COLOR:], wanted, atol=1e-6)
+
+
+def test_colours_that_begin_outside_the_range_may_stay_there() -> None:
+    run = make_run(4)
+    run.x[:, COLOR:] = run.x0[:, COLOR:] = [[-0.5, 1.5, 0.5]] * 4
+    g = gradients(4, seed=0, share=1.1)
+    g.colors[:] = [[1, -1, 0]] * 4
+    step_kernel(run, g, 1)
+    np.testing.assert_array_equal(run.x[:, COLOR:], run.x0[:, COLOR:])
+    g.colors[:] = [[-1, 1, 0]] * 4
+    for step in range(2, 6):
+        step_kernel(run, g, step)
+    assert (run.x[:, COLOR] > -0.5).all()
+    assert (run.x[:, COLOR + 1] < 1.5).all()
+
+
+def test_quaternions_stay_of_length_one() -> None:
+    run = make_run(30)
+    for step in range(1, 20):
+        step_kernel(run, gradients(30, seed=step), step)
+    np.testing.assert_allclose(np.linalg.norm(run.quats, axis=1), 1, atol=1e-6)
+    np.testing.assert_array_equal(run.quats, run.x[:, TURN])
+
+
+def test_those_without_a_gradient_coast() -> None:
+    """On what they had of momentum, ever slower."""
+    run, g = make_run(10), gradients(10, seed=2, share=1.1)
+    for step in range(1, 4):
+        step_kernel(run, g, step)
+    none = gradients(10, seed=0, share=-1.0)
+    assert len(none.ids) == 0
+    moves = []
+    for step in range(4, 8):
+        before = run.x.copy()
+        step_kernel(run, none, step)
+        moves.append(np.abs(run.x - before)[:, SIZE:QUAT].mean())
+    assert moves[0] > 0.01
+    assert moves[0] > moves[1] > moves[2] > moves[3]
+
+
+def test_those_that_never_had_one_stay() -> None:
+    run = make_run(30)
+    start = run.copy()
+    untouched = np.ones(30, bool)
+    for step in range(1, 10):
+        g = gradients(30, seed=step, share=0.1)
+        untouched[g.ids] = False
+        step_kernel(run, g, step)
+    assert 5 < untouched.sum() < 30
+    for columns in (MEAN, slice(SIZE, QUAT), slice(LOGIT, COLUMNS)):
+        np.testing.assert_array_equal(run.x[untouched, columns], start.x[untouched, columns])
+    np.testing.assert_allclose(run.quats[untouched], start.quats[untouched], atol=1e-6)
+
+
+@pytest.mark.parametrize("pieces", [[0, 1, 33], [0, 16, 33], [0, 5, 6, 6, 20, 33]])
+def test_rows_may_be_split_anywhere(pieces: list[int]) -> None:
+    whole, split = make_run(33), make_run(33)
+    for step in range(1, 8):
+        g = gradients(33, seed=step)
+        step_kernel(whole, g, step)
+        step_kernel(split, g, step, pieces)
+    for f in fields(Run):
+        np.testing.assert_array_equal(getattr(split, f.name), getattr(whole, f.name), err_msg=f.name)
+
+
+def test_no_rate_no_step() -> None:
+    run = make_run(10)
+    start = run.copy()
+    step_kernel(run, gradients(10, seed=0), 1, rates=np.zeros(COLUMNS))
+    np.testing.assert_allclose(run.x, start.x, atol=1e-6)
+
+
+def test_zero_quaternion_stays_finite() -> None:
+    run = make_run(3)
+    run.x[0, TURN] = run.quats[0] = 0
+    step_kernel(run, gradients(3, seed=0, share=-1.0), 1)
+    assert np.isfinite(run.x).all()
