@@ -108,7 +108,10 @@ def _run(
         loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
         superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
         read = perf_counter()
-        with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
+        with (
+            announce_compilation(quiet=quiet, share=settings.fit.fit == "full"),
+            stage_progress(quiet=quiet) as progress,
+        ):
             result = pipeline.compact(loaded.scene, settings, progress=progress)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)

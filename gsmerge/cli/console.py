@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
@@ -36,11 +38,32 @@ def plain_warnings() -> Iterator[None]:
         yield
 
 
-def announce_compilation(*, quiet: bool) -> AbstractContextManager[None]:
-    """A block that says so, once, when a kernel has to be compiled (the first run after installation)."""
+@contextmanager
+def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[None]:
+    """A block that says so, once, when a kernel has to be compiled (the first run after installation).
+
+    Args:
+        quiet: Say nothing.
+        share: Let a second process compile the kernels of the fit in the meantime.
+    """
     from gsmerge.kernels.compilation import watch_compilation
 
-    return watch_compilation(lambda: say("compiling kernels, once after installation, up to 25 s", quiet=quiet))
+    second: list[subprocess.Popen[bytes]] = []
+
+    def begin() -> None:
+        say("compiling kernels, once after installation, up to 25 s", quiet=quiet)
+        if share and (os.cpu_count() or 1) > 1:
+            silent = subprocess.DEVNULL
+            command = [sys.executable, "-m", "gsmerge.warm"]
+            second.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
+
+    with watch_compilation(begin):
+        try:
+            yield
+        finally:
+            for process in second:
+                process.terminate()
+                process.wait()
 
 
 @contextmanager

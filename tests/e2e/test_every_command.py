@@ -80,6 +80,18 @@ def test_a_dry_run_writes_nothing(command: str, scene_copy: Path, run: Run) -> N
     assert not (scene_copy / WRITERS[command][0]).exists()
 
 
+@pytest.mark.parametrize(
+    ("wish", "most"),
+    [(("--k", "auto"), 5 * 200), (("--budget", "2%"), 614), (("--budget", "2%", "--max-bytes", "20KB"), 285)],
+)
+def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, scene_copy: Path, run: Run) -> None:
+    arguments = ["compact", scene_copy, "--superpixels", 200, *wish, "--dry-run"]
+    plan = json.loads(run(*arguments, "--json").out)
+    assert plan["output"]["num_gaussians_at_most"] == most
+    assert plan["superpixels_per_view"] is None
+    assert f"at most {most:,} Gaussians" in run(*arguments).out
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_odd_rows_are_told_by_every_command(command: str, scene_copy: Path, run: Run) -> None:
     spoil_rows(scene_copy / "scene.ply")

@@ -163,7 +163,7 @@ def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos)
 
 
 def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: PixelScene, photos: Photos) -> None:
-    """Each is clearer than the parent, both together look much like it."""
+    """Each is clearer than the parent; both together cover a little more, so as to close gaps."""
     state = start_state(gaussians)
     n = len(gaussians)
     grown = grow(state, photos, 2 * n)
@@ -171,8 +171,7 @@ def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: PixelSc
     before, after = (
         scenes.images_of(gaussians_of(s.x, s.splats.shN), scene.cameras)[1].mean() for s in (state, grown)
     )
-    assert after == pytest.approx(before, abs=0.05)
-    assert after >= before
+    assert before <= after <= before + 0.1
 
 
 def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
@@ -257,7 +256,8 @@ def test_share_of_the_blocks() -> None:
 def test_reduced_weights_hold_out_the_same_places(size: tuple[int, int]) -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
     full, half = scene_photos(scene), scene_photos(scene, 2)
-    for weight, small in zip(*(lambda w: (w, reduced(w, half)))(training_weights(full, 0.3, 0)), strict=True):
+    weights = training_weights(full, 0.3, 0)
+    for weight, small in zip(weights, reduced(weights, half), strict=True):
         assert small.shape == (half.height, half.width)
         assert small.mean() == pytest.approx(weight.mean(), abs=0.05)
         np.testing.assert_array_equal(small, weight[::2, ::2][: half.height, : half.width])
@@ -273,4 +273,4 @@ def test_holdout_psnr_looks_at_held_out_pixels_only(photos: Photos) -> None:
     noisy = [photo + 0.1 * rng.normal(size=photo.shape).astype(np.float32) for photo in photos.images]
     held = np.concatenate([np.clip(n, 0, 1)[w == 0] for n, w in zip(noisy, weights, strict=True)])
     truth = np.concatenate([p[w == 0] for p, w in zip(photos.images, weights, strict=True)])
-    assert holdout_psnr(noisy, photos, weights) == pytest.approx(psnr(held, truth), abs=1e-3)
+    assert holdout_psnr(noisy, photos, weights) == pytest.approx(psnr(held[None], truth[None]), abs=1e-3)

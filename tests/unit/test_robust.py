@@ -10,6 +10,7 @@ import torch
 from gsmerge import PixelScene
 from gsmerge.backing import BackingOptions, encode_backing
 from gsmerge.encode import EncodeOptions, encode
+from gsmerge.merge import take
 from gsmerge.metrics import psnr
 from gsmerge.moments import Members, feature_to_gaussians, principal_axes, scene_members
 from gsmerge.photos import Photos, scene_photos
@@ -109,3 +110,75 @@ def test_backing_draws_no_curtain() -> None:
     thickness = principal_axes(layer.covars.double().numpy())[0][:, 0]
     depths = layer.means[:, 2].double().numpy()
     assert (thickness < 0.3 * depths).all()
+
+
+# one or two views, no backing layer
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_few_views_differ_in_spread_alone(scene: PixelScene, members: Members, views: int) -> None:
+    """Rendered from everything, since nothing can be left out."""
+    own = scenes.take_views(scene, list(range(views)))
+    assert own.images is not None
+    features = encode(own, scene_members(own), segment(own.images, SegmentOptions(), 150), EncodeOptions())
+    photos = scene_photos(own)
+    found, choice = choose_merge(features, None, photos, RobustOptions())
+    assert list(choice.scores) == ["plain", "wide", "wider"]
+    assert choice.scores[choice.name] == max(choice.scores.values())
+    power = list(choice.scores).index(choice.name)
+    torch.testing.assert_close(found.spreads, torch.full((len(features),), 1.2**power))
+    for name in ("means", "covars", "gains", "extinctions"):
+        assert torch.equal(getattr(found, name), getattr(features, name))
+    assert choice.scores["plain"] == pytest.approx(photo_psnr(features, photos, left_out=False), abs=1e-9)
+
+
+def test_without_a_backing_layer_no_candidate_has_one(features: FeatureGaussians, photos: Photos) -> None:
+    found, choice = choose_merge(features, None, photos, RobustOptions())
+    assert sorted(choice.scores) == sorted(name for name in NAMES if not name.endswith("back"))
+    assert not found.backing.any()
+
+
+def test_rendering_everything_shows_more(features: FeatureGaussians, photos: Photos, scene: PixelScene) -> None:
+    gaussians = feature_to_gaussians(features)
+    images = scenes.images_of(gaussians, scene.cameras)[0]
+    wanted = np.mean([psnr(np.clip(i, 0, 1), p) for i, p in zip(images, photos.images, strict=True)])
+    found = photo_psnr(features, photos, left_out=False)
+    assert found == pytest.approx(wanted, abs=0.01)
+    assert found > photo_psnr(features, photos, left_out=True)
+
+
+# holes after merging
+
+
+def test_holes_are_closed_by_what_shows_the_photos_best(
+    features: FeatureGaussians, backing: FeatureGaussians, photos: Photos
+) -> None:
+    """A thinned layer: every candidate is tried, and the best is taken."""
+    thin = take(features, torch.arange(0, len(features), 2))
+    found, choice = close_holes(thin, backing, photos, RobustOptions())
+    assert list(choice.scores) == ["as it is", "wide", "back", "wide+back"]
+    assert choice.scores[choice.name] == max(choice.scores.values())
+    assert choice.name != "as it is"
+    assert photo_psnr(found, photos, left_out=False) == pytest.approx(choice.scores[choice.name], abs=1e-9)
+    assert bool(found.backing.any()) == choice.name.endswith("back")
+
+
+def test_closed_layers_stay_as_they_are(features: FeatureGaussians, photos: Photos) -> None:
+    """Where nothing may be added, the very same Feature Gaussians come back."""
+    wide = replace(features, spreads=1.2 * features.spreads)
+    found, choice = close_holes(wide, None, photos, RobustOptions())
+    assert list(choice.scores) == ["as it is"]
+    assert found is wide
+
+
+def test_candidates_are_not_widened_or_backed_twice(
+    features: FeatureGaussians, backing: FeatureGaussians, photos: Photos
+) -> None:
+    options = RobustOptions()
+    wide = replace(features, spreads=1.2 * features.spreads)
+    backed = FeatureGaussians.concat([features, backing])
+    assert list(close_holes(wide, backing, photos, options)[1].scores) == ["as it is", "back"]
+    assert list(close_holes(backed, backing, photos, options)[1].scores) == ["as it is", "wide"]
+    both = FeatureGaussians.concat([wide, backing])
+    assert list(close_holes(both, backing, photos, options)[1].scores) == ["as it is"]
+    assert list(close_holes(backing, None, photos, options)[1].scores) == ["as it is"]

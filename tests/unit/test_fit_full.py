@@ -1,0 +1,468 @@
+"""The full fit and the stage, on a tiny scene whose photos some known Gaussians made."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.fit import FitOptions, FitReport, Rates, fit, start_share
+from gsmerge.fit import full as full_module
+from gsmerge.fit.color import draw, seen
+from gsmerge.fit.full import affordable_steps, fit_full, holdout_score, plan_run, step_sizes
+from gsmerge.fit.state import start_state
+from gsmerge.photos import Photos, scene_photos
+from gsmerge.threads import use_threads
+from gsmerge.types import SH_C0
+
+Pair = tuple[Photos, Photos]
+QUICK = FitOptions(fit_steps=30, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+def identical(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in scenes.FIELDS)
+
+
+def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
+    """All parameters off by some of what a fit may move them."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def noise(like: torch.Tensor, sigma: float) -> torch.Tensor:
+        return size * sigma * torch.randn(like.shape, generator=rng)
+
+    unit = gaussians.scales.amax(1, keepdim=True)
+    quats = gaussians.quats + noise(gaussians.quats, 0.1)
+    return replace(
+        gaussians,
+        means=gaussians.means + unit * noise(gaussians.means, 0.3),
+        quats=quats / quats.norm(dim=1, keepdim=True),
+        scales=gaussians.scales * noise(gaussians.scales, 0.3).exp(),
+        opacities=(gaussians.opacities + noise(gaussians.opacities, 0.1)).clamp(0.1, 0.95),
+        sh0=gaussians.sh0 + noise(gaussians.sh0, 0.1) / SH_C0,
+    )
+
+
+def truth_of(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
+    """A scene whose photos show exactly these Gaussians."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(views, 48, 36), degree=degree)
+    gaussians = scenes.plain(scene, density=0.08)
+    gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
+    images = scenes.images_of(gaussians, scene.cameras)[0].clip(0, 1)
+    return replace(scene, images=torch.from_numpy(images).float()), gaussians
+
+
+def pair_of(scene: PixelScene) -> Pair:
+    return scene_photos(scene), scene_photos(scene, 2)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return truth_of(0)[0]
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    return truth_of(0)[1]
+
+
+@pytest.fixture(scope="module")
+def photos(scene: PixelScene) -> Pair:
+    return pair_of(scene)
+
+
+@pytest.fixture(scope="module")
+def noise(photos: Pair) -> Pair:
+    """Nothing that is learned of one block holds in another."""
+    rng = np.random.default_rng(0)
+    made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
+    return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
+
+
+# what it reaches
+
+
+def test_perturbed_scene_comes_back(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    result, report = fit_full(start, photos, replace(LONG, dropout=0.0))
+    assert (report.method, report.accepted, report.steps) == ("full", True, 160)
+    assert report.holdout_after > report.holdout_before + 4
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
+    assert len(result) == len(start)
+    scenes.assert_invariants(result, scene)
+
+
+def test_view_between_gets_better(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+    """Not one of the photos."""
+    between = scenes.arc(1, 48, 36, start=-0.25)
+    wanted = scenes.images_of(truth, between)[0].clip(0, 1)
+
+    def score(gaussians: Gaussians) -> float:
+        image = scenes.images_of(gaussians, between)[0].clip(0, 1)
+        return float(-10 * np.log10(((image - wanted) ** 2).mean()))
+
+    start = spoil(truth)
+    assert score(fit_full(start, photos, LONG)[0]) > score(start) + 3
+
+
+@pytest.mark.parametrize("steps", [1, 12])
+def test_few_steps_help_already(truth: Gaussians, photos: Pair, steps: int) -> None:
+    start = spoil(truth)
+    _, report = fit_full(start, photos, replace(QUICK, fit_steps=steps))
+    assert report.steps == steps
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    if steps > 1:
+        assert report.accepted
+
+
+def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    result, _ = fit_full(start, photos, QUICK)
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        moved = (getattr(result, name) != getattr(start, name)).reshape(len(start), -1).any(1)
+        assert moved.float().mean() > 0.9, name
+
+
+def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
+    rates = Rates(reach_mean=0.5, reach_size=0.1, reach_logit=0.2)
+    start = spoil(truth)
+    result, report = fit_full(start, photos, replace(QUICK, rates=rates))
+    assert report.accepted
+    unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
+    assert ((result.means - start.means).norm(dim=1) <= 0.501 * unit).all()
+    assert float((result.scales / start.scales).log().abs().max()) <= 0.1001
+    logits = [g.opacities.double().logit() for g in (start, result)]
+    assert float((logits[1] - logits[0]).abs().max()) <= 0.2001
+
+
+# counts
+
+
+@pytest.mark.parametrize("extra", [0, 1, 30, 70])
+def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, extra: int) -> None:
+    start = spoil(truth)
+    result, report = fit_full(start, photos, LONG, count=len(start) + extra)
+    assert report.accepted
+    assert len(result) == len(start) + extra
+
+
+def test_more_than_double_is_grown_in_turns(truth: Gaussians, photos: Pair) -> None:
+    start = truth[::4]
+    result, report = fit_full(start, photos, LONG, count=3 * len(start) + 5)
+    assert report.accepted
+    assert len(result) == 3 * len(start) + 5
+
+
+def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    assert len(fit_full(start, photos, QUICK, count=2 * len(start))[0]) == len(start)
+    assert start_share(QUICK) == 1
+    assert start_share(replace(LONG, fit="color")) == 1
+    assert 0 < start_share(LONG) < 1
+
+
+def test_growing_pays(scene: PixelScene, photos: Pair) -> None:
+    """At the same final number, against nothing but the first ones."""
+    start = scenes.plain(scene, density=0.03)
+    start = replace(start, means=start.means.float())
+    alone, grown = (fit_full(start, photos, LONG, count=c * len(start))[0] for c in (1, 2))
+    assert scenes.psnr_of(grown, scene) > scenes.psnr_of(alone, scene) + 0.5
+
+
+# safety
+
+
+def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair) -> None:
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    result, report = fit_full(grey, noise, LONG, count=2 * len(grey))
+    assert (report.method, report.accepted) == ("none", False)
+    assert report.holdout_after <= report.holdout_before
+    assert result is grey
+    assert report.steps < 160  # judged before the steps that look at everything
+    assert "no better" in report.stopped
+
+
+def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    before = [getattr(start, name).clone() for name in scenes.FIELDS]
+    images = [p.images.copy() for p in photos]
+    fit_full(start, photos, QUICK)
+    assert all(torch.equal(getattr(start, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
+    for photo, image in zip(photos, images, strict=True):
+        np.testing.assert_array_equal(photo.images, image)
+
+
+def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+    result, report = fit_full(truth, photos, LONG)
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    assert report.accepted or result is truth
+    found, wanted = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
+    assert np.abs(found - wanted).mean() < 0.01
+
+
+def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+    """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
+    options = replace(QUICK, coarse=1.0, dssim=0.0)
+    start = spoil(truth)
+    weights = plan_run(photos, options, seed=0).weights[1]
+    painted = photos[1].images.copy()
+    for image, weight in zip(painted, weights, strict=True):
+        image[weight == 0] = 1 - image[weight == 0]
+    one = run_steps(start, photos, options)
+    other = run_steps(start, (photos[0], replace(photos[1], images=painted)), options)
+    np.testing.assert_array_equal(one, other)
+
+
+def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.ndarray:
+    """The state after some steps, without a judge."""
+    rng, state, plan = np.random.default_rng(0), start_state(gaussians), plan_run(photos, options, 0)
+    for step in range(options.fit_steps):
+        full_module.fit_step(state, plan, step % len(photos[0]), step + 1, step / options.fit_steps, rng)
+    return state.x
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_unseen_ones_stay_as_they_are(degree: int) -> None:
+    """Outside all photos; also with colours that no photo has."""
+    scene, truth = truth_of(degree)
+    behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=torch.full((4, 1, 3), 4.0))
+    start = Gaussians.concat([spoil(truth), behind])
+    result, report = fit_full(start, pair_of(scene), QUICK)
+    assert report.accepted
+    for name in scenes.FIELDS:
+        torch.testing.assert_close(getattr(result, name)[-4:], getattr(behind, name), rtol=1e-5, atol=1e-6)
+
+
+# views, harmonics
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_few_views(views: int) -> None:
+    scene, truth = truth_of(0, views)
+    start = spoil(truth)
+    result, report = fit_full(start, pair_of(scene), QUICK)
+    assert report.accepted
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 2
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_harmonics_keep_their_degree_and_values(degree: int) -> None:
+    scene, truth = truth_of(degree)
+    start = spoil(truth)
+    result, report = fit_full(start, pair_of(scene), QUICK)
+    assert report.accepted
+    assert result.sh_degree == degree
+    assert torch.equal(result.shN, start.shN)
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 2
+
+
+def test_harmonics_are_inherited_by_grown_ones() -> None:
+    scene, truth = truth_of(1)
+    start = spoil(truth)
+    result, report = fit_full(start, pair_of(scene), LONG, count=len(start) + 20)
+    assert report.accepted
+    assert len(result) == len(start) + 20
+    assert torch.equal(result.shN[: len(start)], start.shN)
+    assert all((row == start.shN).all((1, 2)).any() for row in result.shN[len(start) :])
+
+
+# dropout
+
+
+def test_dropout_where_there_are_few_views(photos: Pair) -> None:
+    many = Photos(*(np.concatenate([a, a]) for a in (photos[0].images, photos[0].viewmats, photos[0].Ks)), eps2d=0.3)
+    pair = many, replace(photos[1], images=np.concatenate([photos[1].images] * 2))
+    assert len(photos[0]) <= full_module.FEW_VIEWS < len(many)
+    assert plan_run(photos, LONG, 0).dropout == full_module.DROPOUT > 0
+    assert plan_run(photos, replace(LONG, fit_steps=full_module.MANY_STEPS - 1), 0).dropout == 0
+    assert plan_run(pair, LONG, 0).dropout == 0
+    assert plan_run(pair, replace(LONG, dropout=0.15), 0).dropout == 0.15
+    assert plan_run(photos, replace(LONG, dropout=0.0), 0).dropout == 0
+
+
+def test_dropout_changes_the_run_and_still_helps(truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    one, other = (fit_full(start, photos, replace(QUICK, dropout=share)) for share in (0.0, 0.3))
+    assert one[1].accepted
+    assert other[1].accepted
+    assert not identical(one[0], other[0])
+
+
+# time
+
+
+def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
+    """Hardly any: a few steps, and still judged."""
+    result, report = fit_full(spoil(truth), photos, replace(LONG, time_budget=1e-6))
+    assert full_module.PROBE < report.steps <= full_module.PROBE + 1
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    if report.accepted:
+        assert report.stopped == "time budget spent"
+        assert len(result) == len(truth)
+
+
+def test_steps_follow_the_time_budget(photos: Pair) -> None:
+    def steps(budget: float, seconds: float) -> int:
+        return affordable_steps(seconds, plan_run(photos, replace(LONG, time_budget=budget), 0))
+
+    probe, most = full_module.PROBE, full_module.MAX_STEPS
+    assert steps(1e-9, 1.0) == probe + 1
+    assert steps(1e9, 1.0) == most
+    found = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
+    assert found == sorted(found)
+    assert found[0] > probe + 1
+    # a step of 10 ms at half size: 70 % of the steps at that, the rest at three times it
+    assert steps(1.0, 0.06) == pytest.approx(probe + (1.0 - 0.06) / (0.01 * (0.7 + 3 * 0.3)), abs=1)
+
+
+# rates, report, progress
+
+
+def test_rates_decay() -> None:
+    rates = Rates()
+    start, half, end = (step_sizes(rates, p) for p in (0.0, 0.5, 1.0))
+    wanted = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
+    np.testing.assert_allclose(start, wanted, rtol=1e-6)
+    np.testing.assert_allclose(end, rates.decay * start, rtol=1e-6)
+    assert rates.decay < 1
+    np.testing.assert_allclose(half**2, start * end, rtol=1e-6)
+
+
+def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
+    calls: list[tuple[int, int, float, float]] = []
+    _, report = fit_full(spoil(truth), photos, QUICK, progress=lambda *call: calls.append(call))
+    assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
+    assert calls[-1][2] > calls[0][2]  # of the photos
+    assert calls[0][3] == pytest.approx(report.holdout_before)
+    assert calls[-1][3] == pytest.approx(report.holdout_after)
+    assert np.isfinite(np.array(calls, float)).all()
+
+
+def test_score_is_that_of_the_half_size_blocks(truth: Gaussians, photos: Pair) -> None:
+    plan = plan_run(photos, QUICK, 0)
+    state = start_state(spoil(truth))
+    _, report = fit_full(spoil(truth), photos, QUICK)
+    assert holdout_score(state, plan) == report.holdout_before
+
+
+# the same again
+
+
+@pytest.mark.parametrize("settings", [{}, {"dropout": 0.2}, {"fit_steps": 160}], ids=str)
+def test_threads_change_no_bit(truth: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
+    start, found = spoil(truth), []
+    for threads in (1, 2, 8):
+        with use_threads(threads):
+            found.append(fit_full(start, photos, replace(QUICK, **settings), count=len(start) + 20, seed=3))
+    assert all(identical(a[0], b[0]) and a[1] == b[1] for a, b in itertools.pairwise(found))
+
+
+def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = fit_full(spoil(truth), photos, QUICK)
+    monkeypatch.setattr(full_module, "ROWS", 17)
+    assert identical(fit_full(spoil(truth), photos, QUICK)[0], one[0])
+
+
+def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    one, two, other = (fit_full(start, photos, QUICK, seed=seed) for seed in (5, 5, 6))
+    assert identical(one[0], two[0])
+    assert one[1] == two[1]
+    assert not identical(one[0], other[0])
+
+
+# the stage
+
+
+def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
+    start = spoil(truth)
+    result, report = fit(start, photos, QUICK, seed=4)
+    wanted, own = fit_full(start, photos, QUICK, seed=4)
+    assert report == own
+    assert identical(result, wanted)
+
+
+def test_stage_falls_back_to_colours(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the full fit is refused."""
+    refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
+    monkeypatch.setattr("gsmerge.fit.stage.fit_full", lambda gaussians, *_: (gaussians, refused))
+    start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
+    result, report = fit(start, photos, QUICK)
+    assert report is not None
+    assert (report.method, report.accepted) == ("color", True)
+    colored, _ = fit(start, photos, replace(QUICK, fit="color"))
+    assert identical(result, colored)
+    assert torch.equal(result.means, start.means)
+    assert not torch.equal(result.sh0, start.sh0)
+
+
+def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    options = replace(LONG, pull=1e-6, iterations=60, huber=10.0)
+    result, report = fit(grey, noise, options, count=2 * len(grey))
+    assert report is not None
+    assert not report.accepted
+    assert identical(result, grey)
+
+
+def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None:
+    """Hidden ones go, those outside all photos stay, nothing else changes."""
+    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
+    behind = replace(truth[:3], means=truth.means[:3] - 100)
+    start = Gaussians.concat([opaque, hidden, behind])
+    result, report = fit(start, photos, replace(QUICK, fit="none"))
+    assert report is None
+    keep = seen(draw(start, photos[1]), QUICK.prune)
+    assert identical(result, start[keep])
+    assert not keep[-6:-3].any()
+    assert keep[-3:].all()
+    assert identical(fit(start, photos, replace(QUICK, fit="none", prune=0.0))[0], start)
+
+
+def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
+    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
+    for method in ("color", "full"):
+        options = replace(QUICK, fit=method)  # type: ignore[arg-type]
+        alone, both = (fit(g, photos, options)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
+        assert len(both) == len(alone)
+
+
+@pytest.mark.parametrize("method", ["none", "color", "full"])
+def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
+    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))  # type: ignore[arg-type]
+    assert len(result) == 0
+
+
+@pytest.mark.parametrize("size", [(8, 6), (5, 1), (1, 1)])
+def test_tiny_photos(size: tuple[int, int]) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
+    start = replace(scene.gaussians, means=scene.gaussians.means.float())
+    result, report = fit_full(start, pair_of(scene), QUICK)
+    assert len(result) == len(start)
+    assert np.isfinite([report.holdout_before, report.holdout_after]).all()
+    for name in scenes.FIELDS:
+        assert torch.isfinite(getattr(result, name)).all()
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"fit": "best"}, {"fit_steps": 0}, {"time_budget": 0.0}, {"time_budget": -1.0}, {"dropout": 1.0},
+        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(setting: dict[str, Any]) -> None:
+    (name,) = setting
+    with pytest.raises(ValueError, match=name):
+        FitOptions(**setting)
