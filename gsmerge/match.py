@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsmerge.kernels.cluster import connected_components, edge_scores, leader_clusters
-from gsmerge.threads import available_threads
+from gsmerge.threads import use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
 Method = Literal["overlap", "aabb", "none"]
@@ -92,7 +92,8 @@ def _nearest(means: np.ndarray, count: int) -> np.ndarray:
     from scipy.spatial import cKDTree  # late: a quarter of a second that --match none does not need
 
     k = min(count + 1, len(means))
-    _, found = cKDTree(means).query(means, k=k, workers=min(2, available_threads()))
+    with use_threads() as threads:
+        _, found = cKDTree(means).query(means, k=k, workers=threads)
     found = found.astype(np.int64)
     found[found == np.arange(len(means))[:, None]] = -1
     return found

@@ -80,6 +80,8 @@ class FitOptions:
     prune: float = 1 / 255
 
     def __post_init__(self) -> None:
+        if isinstance(self.rates, dict):  # as CompactOptions.to_dict() and JSON have it
+            object.__setattr__(self, "rates", Rates(**self.rates))
         if self.fit not in ("none", "color", "full"):
             raise ValueError(f'fit: expected "none", "color" or "full", got "{self.fit}"')
         for name in ("fit_steps", "iterations"):

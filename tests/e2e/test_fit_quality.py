@@ -21,9 +21,7 @@ NUM_VIEWS = 5
 
 
 @pytest.fixture
-def compacted(
-    made_scene: Path, tmp_path: Path, target_psnr: Measure
-) -> Callable[..., tuple[CompactResult, float]]:
+def compacted(made_scene: Path, tmp_path: Path, target_psnr: Measure) -> Callable[..., tuple[CompactResult, float]]:
     """``compacted(k=2)``: the result, and its PSNR (dB) on the targets."""
     scene, out = gsmerge.read_scene(made_scene), tmp_path / "small.ply"
 

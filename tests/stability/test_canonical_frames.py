@@ -24,7 +24,9 @@ def room() -> PixelScene:
 # 13: flyaways
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"fit": "color", "match": "aabb"}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"fit": "color", "match": "aabb"}], ids=str
+)
 def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> None:
     means = room.gaussians.means.clone()
     rows = np.random.default_rng(0).choice(len(means), 5, replace=False)
@@ -42,7 +44,9 @@ def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> N
 # 37: coordinates of maps
 
 
-@pytest.mark.parametrize("settings", [{"robust": False, "fit": "none"}, {"fit": "none"}, {"fit": "color", "k": 2}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{"robust": False, "fit": "none"}, {"fit": "none"}, {"fit": "color", "k": 2}], ids=str
+)
 def test_map_coordinates(room: PixelScene, settings: dict) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
     here, there = scenes.compacted(room, **settings).gaussians, scenes.compacted(far, **settings).gaussians

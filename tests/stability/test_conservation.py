@@ -98,7 +98,9 @@ def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
 # 55: glass
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"match": "none"}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"match": "none"}], ids=str
+)
 def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
     opacities = 0.05 * torch.ones_like(scene.gaussians.opacities)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))

@@ -66,6 +66,25 @@ def test_children_keep_the_groups_moments(features: FeatureGaussians, members: M
         assert (own <= high + 1e-5).all()
 
 
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k: int) -> None:
+    """The paper's: members of one opacity have children of that opacity; the own rule makes them denser."""
+    assert scene.images is not None
+    even = replace(members, opacities=np.full_like(members.opacities, 0.5))
+    groups = segment(scene.images, SegmentOptions(), COUNT)
+    paper = encode(scene, even, groups, EncodeOptions("paper"))
+    found = decode(paper, even, DecodeOptions(k=k), rule="paper")
+    assert len(found) == 2 * COUNT * k
+    np.testing.assert_allclose(found.opacities, 0.5, rtol=1e-3)
+    if k > 1:
+        assert (decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).abs().max() > 0.1
+
+
+def test_auto_is_one_child(features: FeatureGaussians, members: Members) -> None:
+    assert DecodeOptions(k="auto").count == 1
+    assert_alike(decode(features, members, DecodeOptions(k="auto")), feature_to_gaussians(features))
+
+
 def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -> None:
     same = Members(*(np.repeat(getattr(members, n)[:1], 10, axis=0) for n in members.__dataclass_fields__))
     one = scenes.make_features(same.means[:1], sizes=0.01)

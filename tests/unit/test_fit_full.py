@@ -388,9 +388,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     assert identical(result, wanted)
 
 
-def test_stage_falls_back_to_colours(
-    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the full fit is refused."""
     refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
     monkeypatch.setattr("gsmerge.fit.stage.fit_full", lambda gaussians, *_: (gaussians, refused))

@@ -168,9 +168,7 @@ def test_halves_cover_what_their_parent_did(gaussians: Gaussians, scene: PixelSc
     n = len(gaussians)
     grown = grow(state, photos, 2 * n)
     assert (grown.splats.opacities[:n] < state.splats.opacities).all()
-    before, after = (
-        scenes.images_of(gaussians_of(s.x, s.splats.shN), scene.cameras)[1].mean() for s in (state, grown)
-    )
+    before, after = (scenes.images_of(gaussians_of(s.x, s.splats.shN), scene.cameras)[1].mean() for s in (state, grown))
     assert before <= after <= before + 0.1
 
 

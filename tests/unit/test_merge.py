@@ -96,6 +96,13 @@ def test_backing_stays_backing() -> None:
     assert merge(features, matches(0, 1, 0)).backing.tolist() == [True, False]
 
 
+def test_merged_backing_is_backing() -> None:
+    features = replace(make_features(np.zeros((5, 3))), backing=torch.tensor([True, False, True, False, True]))
+    merged = merge(features, matches(0, 1, 0, 1, 2))
+    assert merged.backing.tolist() == [True, True, False]
+    assert merged.views.tolist() == [4, -1, -1]
+
+
 def test_every_member_once_whatever_the_clusters() -> None:
     rng = np.random.default_rng(0)
     sizes = rng.integers(1, 5, 40).tolist()

@@ -126,8 +126,39 @@ def test_many_groups_match_one_by_one() -> None:
             np.testing.assert_array_equal(getattr(at_once, name)[g], getattr(alone, name)[0])
 
 
-def test_no_groups() -> None:
-    m = pool_members(members(3), np.array([0]), np.zeros(0, np.int64))
+def test_paper_rule_by_hand() -> None:
+    """Spread of the means alone, and an opacity that is the members' mean."""
+    of = members(3)
+    of.means[:] = [[0, 0, 0], [2, 0, 0], [0, 4, 0]]
+    of.opacities[:] = [0.2, 0.2, 0.4]
+    m = pool_members(of, np.array([0, 3]), np.arange(3), "paper")
+    np.testing.assert_allclose(m.means[0], [0.5, 2, 0], atol=1e-6)
+    floor = 0.005**2
+    np.testing.assert_allclose(m.covars[0], [[0.75 + floor, -1, 0], [-1, 4 + floor, 0], [0, 0, floor]], atol=1e-6)
+    made = to_gaussians(m.covars, m.extinctions, np.ones(1), torch.from_numpy(m.means), torch.from_numpy(m.sh))
+    assert float(made.opacities[0]) == pytest.approx(0.8 / 3, rel=1e-5)
+
+
+@pytest.mark.parametrize("opacity", [0.01, 0.5, 0.9, 0.999])
+def test_paper_rule_keeps_an_opacity_that_all_have(opacity: float) -> None:
+    """The own rule makes layers of them."""
+    of, groups = members(30, opacity=opacity), (np.array([0, 10, 11, 30]), np.arange(30))
+    m = pool_members(of, *groups, "paper")
+    made = to_gaussians(m.covars, m.extinctions, np.ones(3), torch.from_numpy(m.means), torch.from_numpy(m.sh))
+    np.testing.assert_allclose(made.opacities, opacity, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rule", ["depth", "paper"])
+def test_rules_agree_on_sums_and_means(rule: str) -> None:
+    of, groups = members(40, coefficients=4), (np.array([0, 1, 15, 40]), np.arange(40))
+    m, other = pool_members(of, *groups, rule), pool_members(of, *groups)  # type: ignore[arg-type]
+    for name in ("means", "weights", "footprints", "sh"):
+        np.testing.assert_allclose(getattr(m, name), getattr(other, name), rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("rule", ["depth", "paper"])
+def test_no_groups(rule: str) -> None:
+    m = pool_members(members(3), np.array([0]), np.zeros(0, np.int64), rule)  # type: ignore[arg-type]
     assert m.means.shape == (0, 3)
     assert principal_axes(np.zeros((0, 3, 3)))[0].shape == (0, 3)
 
