@@ -254,6 +254,34 @@ def images_of(gaussians: Gaussians, cameras: Cameras) -> tuple[np.ndarray, np.nd
     return drawn.images.double().numpy(), drawn.alphas[..., 0].double().numpy()
 
 
+def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
+    """All parameters off by some of what a fit may move them."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def noise(like: torch.Tensor, sigma: float) -> torch.Tensor:
+        return size * sigma * torch.randn(like.shape, generator=rng)
+
+    unit = gaussians.scales.amax(1, keepdim=True)
+    quats = gaussians.quats + noise(gaussians.quats, 0.1)
+    return replace(
+        gaussians,
+        means=gaussians.means + unit * noise(gaussians.means, 0.3),
+        quats=quats / quats.norm(dim=1, keepdim=True),
+        scales=gaussians.scales * noise(gaussians.scales, 0.3).exp(),
+        opacities=(gaussians.opacities + noise(gaussians.opacities, 0.1)).clamp(0.1, 0.95),
+        sh0=gaussians.sh0 + noise(gaussians.sh0, 0.1) / SH_C0,
+    )
+
+
+def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
+    """A scene whose photos show exactly these Gaussians."""
+    scene = make_scene(room(), arc(views, 48, 36), degree=degree)
+    gaussians = plain(scene, density=0.08)
+    gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
+    images = images_of(gaussians, scene.cameras)[0].clip(0, 1)
+    return replace(scene, images=torch.from_numpy(images).float()), gaussians
+
+
 def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:
     """PSNR (dB) over all views of a scene with photos."""
     assert scene.images is not None
@@ -274,6 +302,11 @@ def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
 def plain(scene: PixelScene, **settings: Any) -> Gaussians:
     """The merge alone: no choice by photos, no fit."""
     return compacted(scene, **{"robust": False, "fit": "none", **settings}).gaussians
+
+
+def identical(a: Gaussians, b: Gaussians) -> bool:
+    """To the last bit."""
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
 
 
 def assert_invariants(gaussians: Gaussians, scene: PixelScene) -> None:

@@ -27,7 +27,7 @@ from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
-GROWTH = 0.4  # part of the run after which Gaussians are added
+GROWTH = 0.5  # part of the run after which Gaussians are added
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 START = 0.57  # share of the Gaussians that a run which grows begins with
 FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.1
@@ -75,7 +75,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     rates, s = plan.options.rates, state.splats
     steps = step_sizes(rates, progress)
     limits = np.array([rates.reach_mean, rates.reach_size, rates.reach_logit], np.float32)
-    betas = np.array(rates.betas, np.float32)
+    betas = np.array([rates.beta1, rates.beta2], np.float32)
 
     def update(first: int) -> None:
         last = min(first + ROWS, len(state.x))

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from gsmerge.kernels.optimise import similarity_terms
+from gsmerge.threads import parallel_map
 
 WINDOW = (7, 7)
 
@@ -28,9 +29,18 @@ def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dss
         ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size.
     """
     mean, square, cross = np.empty_like(image), np.empty_like(image), np.empty_like(image)
-    windows = [_box(image), _box(photo), _box(image * image), _box(photo * photo), _box(image * photo)]
+    windows = parallel_map(lambda pair: _box(pair[0] if pair[1] is None else pair[0] * pair[1]), _pairs(image, photo))
     similarity_terms(*(w.reshape(-1) for w in windows), mean.reshape(-1), square.reshape(-1), cross.reshape(-1))
     channels = weight[..., None]
-    similarity = _box(mean * channels) + 2 * image * _box(square * channels) + photo * _box(cross * channels)
-    gradient = (1 - dssim) * channels * np.sign(image - photo) - dssim * similarity
-    return (gradient / np.float32(image.shape[0] * image.shape[1])).astype(np.float32)
+    from_mean, from_square, from_cross = parallel_map(lambda a: _box(a * channels), (mean, square, cross))
+    from_square *= image
+    from_cross *= photo
+    similarity = from_mean + 2 * from_square + from_cross
+    gradient = np.float32(1 - dssim) * channels * np.sign(image - photo) - np.float32(dssim) * similarity
+    gradient /= np.float32(image.shape[0] * image.shape[1])
+    return gradient
+
+
+def _pairs(image: np.ndarray, photo: np.ndarray) -> list[tuple[np.ndarray, np.ndarray | None]]:
+    """What structural similarity takes window means of: both, their squares and their product."""
+    return [(image, None), (photo, None), (image, image), (photo, photo), (image, photo)]

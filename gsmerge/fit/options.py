@@ -19,7 +19,8 @@ class Rates:
         logit: Step of an opacity's logit.
         color: Step of a colour, sRGB in [0, 1].
         decay: Factor on all steps at the end of the run.
-        betas: Decay of Adam's first and second moments.
+        beta1: Decay of Adam's first moment.
+        beta2: Decay of its second moment.
         reach_mean: Farthest that a mean may go from its start, in units of the Gaussian's size.
         reach_size: Largest change of a log scale.
         reach_logit: Largest change of an opacity's logit.
@@ -31,7 +32,8 @@ class Rates:
     logit: float = 0.3
     color: float = 0.03
     decay: float = 0.2
-    betas: tuple[float, float] = (0.7, 0.99)
+    beta1: float = 0.7
+    beta2: float = 0.99
     reach_mean: float = 2.0
     reach_size: float = 2.5
     reach_logit: float = 4.0

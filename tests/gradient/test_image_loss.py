@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
+from torch.nn.functional import avg_pool2d
 
 from gsmerge.fit.loss import image_gradient
 from gsmerge.kernels.optimise import C1, C2, similarity_terms
@@ -24,7 +24,7 @@ def pictures(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 def box(images: torch.Tensor) -> torch.Tensor:
     """Means over 7 x 7 windows of ``[h,w,3]``, zero beyond the border."""
-    return F.avg_pool2d(images.permute(2, 0, 1)[None], 7, 1, 3, count_include_pad=True)[0].permute(1, 2, 0)
+    return avg_pool2d(images.permute(2, 0, 1)[None], 7, 1, 3, count_include_pad=True)[0].permute(1, 2, 0)
 
 
 def similarity(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:

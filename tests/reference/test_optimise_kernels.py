@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def gradients(count: int, seed: int, share: float = 0.6, size: float = 1.0) -> W
 
 def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None, rates: np.ndarray = RATES) -> None:
     edges = pieces or [0, len(run.x)]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         adam(
             run.x, run.x0, run.m, run.v, run.units, g.ids, g.means, g.quats, g.scales, g.opacities, g.colors,
             rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), step, first, last,

@@ -1,4 +1,4 @@
-"""The full fit and the stage, on a tiny scene whose photos some known Gaussians made."""
+"""The full fit, on a tiny scene whose photos some known Gaussians made."""
 
 from __future__ import annotations
 
@@ -12,50 +12,16 @@ import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.fit import FitOptions, FitReport, Rates, fit, start_share
+from gsmerge.fit import FitOptions, Rates, start_share
 from gsmerge.fit import full as full_module
-from gsmerge.fit.color import draw, seen
 from gsmerge.fit.full import affordable_steps, fit_full, holdout_score, plan_run, step_sizes
 from gsmerge.fit.state import start_state
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.threads import use_threads
-from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
-
-
-def identical(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in scenes.FIELDS)
-
-
-def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
-    """All parameters off by some of what a fit may move them."""
-    rng = torch.Generator().manual_seed(seed)
-
-    def noise(like: torch.Tensor, sigma: float) -> torch.Tensor:
-        return size * sigma * torch.randn(like.shape, generator=rng)
-
-    unit = gaussians.scales.amax(1, keepdim=True)
-    quats = gaussians.quats + noise(gaussians.quats, 0.1)
-    return replace(
-        gaussians,
-        means=gaussians.means + unit * noise(gaussians.means, 0.3),
-        quats=quats / quats.norm(dim=1, keepdim=True),
-        scales=gaussians.scales * noise(gaussians.scales, 0.3).exp(),
-        opacities=(gaussians.opacities + noise(gaussians.opacities, 0.1)).clamp(0.1, 0.95),
-        sh0=gaussians.sh0 + noise(gaussians.sh0, 0.1) / SH_C0,
-    )
-
-
-def truth_of(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
-    """A scene whose photos show exactly these Gaussians."""
-    scene = scenes.make_scene(scenes.room(), scenes.arc(views, 48, 36), degree=degree)
-    gaussians = scenes.plain(scene, density=0.08)
-    gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
-    images = scenes.images_of(gaussians, scene.cameras)[0].clip(0, 1)
-    return replace(scene, images=torch.from_numpy(images).float()), gaussians
 
 
 def pair_of(scene: PixelScene) -> Pair:
@@ -64,12 +30,12 @@ def pair_of(scene: PixelScene) -> Pair:
 
 @pytest.fixture(scope="module")
 def scene() -> PixelScene:
-    return truth_of(0)[0]
+    return scenes.self_made(0)[0]
 
 
 @pytest.fixture(scope="module")
 def truth() -> Gaussians:
-    return truth_of(0)[1]
+    return scenes.self_made(0)[1]
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +55,7 @@ def noise(photos: Pair) -> Pair:
 
 
 def test_perturbed_scene_comes_back(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     result, report = fit_full(start, photos, replace(LONG, dropout=0.0))
     assert (report.method, report.accepted, report.steps) == ("full", True, 160)
     assert report.holdout_after > report.holdout_before + 4
@@ -107,13 +73,13 @@ def test_view_between_gets_better(scene: PixelScene, truth: Gaussians, photos: P
         image = scenes.images_of(gaussians, between)[0].clip(0, 1)
         return float(-10 * np.log10(((image - wanted) ** 2).mean()))
 
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     assert score(fit_full(start, photos, LONG)[0]) > score(start) + 3
 
 
 @pytest.mark.parametrize("steps", [1, 12])
 def test_few_steps_help_already(truth: Gaussians, photos: Pair, steps: int) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     _, report = fit_full(start, photos, replace(QUICK, fit_steps=steps))
     assert report.steps == steps
     assert report.accepted == (report.holdout_after > report.holdout_before)
@@ -122,7 +88,7 @@ def test_few_steps_help_already(truth: Gaussians, photos: Pair, steps: int) -> N
 
 
 def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     result, _ = fit_full(start, photos, QUICK)
     for name in ("means", "quats", "scales", "opacities", "sh0"):
         moved = (getattr(result, name) != getattr(start, name)).reshape(len(start), -1).any(1)
@@ -131,7 +97,7 @@ def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
 
 def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
     rates = Rates(reach_mean=0.5, reach_size=0.1, reach_logit=0.2)
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     result, report = fit_full(start, photos, replace(QUICK, rates=rates))
     assert report.accepted
     unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
@@ -146,7 +112,7 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
 
 @pytest.mark.parametrize("extra", [0, 1, 30, 70])
 def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, extra: int) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     result, report = fit_full(start, photos, LONG, count=len(start) + extra)
     assert report.accepted
     assert len(result) == len(start) + extra
@@ -160,7 +126,7 @@ def test_more_than_double_is_grown_in_turns(truth: Gaussians, photos: Pair) -> N
 
 
 def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     assert len(fit_full(start, photos, QUICK, count=2 * len(start))[0]) == len(start)
     assert start_share(QUICK) == 1
     assert start_share(replace(LONG, fit="color")) == 1
@@ -189,7 +155,7 @@ def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair)
 
 
 def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     before = [getattr(start, name).clone() for name in scenes.FIELDS]
     images = [p.images.copy() for p in photos]
     fit_full(start, photos, QUICK)
@@ -209,7 +175,7 @@ def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos
 def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = replace(QUICK, coarse=1.0, dssim=0.0)
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     weights = plan_run(photos, options, seed=0).weights[1]
     painted = photos[1].images.copy()
     for image, weight in zip(painted, weights, strict=True):
@@ -230,9 +196,9 @@ def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.nda
 @pytest.mark.parametrize("degree", [0, 3])
 def test_unseen_ones_stay_as_they_are(degree: int) -> None:
     """Outside all photos; also with colours that no photo has."""
-    scene, truth = truth_of(degree)
+    scene, truth = scenes.self_made(degree)
     behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=torch.full((4, 1, 3), 4.0))
-    start = Gaussians.concat([spoil(truth), behind])
+    start = Gaussians.concat([scenes.spoil(truth), behind])
     result, report = fit_full(start, pair_of(scene), QUICK)
     assert report.accepted
     for name in scenes.FIELDS:
@@ -244,8 +210,8 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
 
 @pytest.mark.parametrize("views", [1, 2])
 def test_few_views(views: int) -> None:
-    scene, truth = truth_of(0, views)
-    start = spoil(truth)
+    scene, truth = scenes.self_made(0, views)
+    start = scenes.spoil(truth)
     result, report = fit_full(start, pair_of(scene), QUICK)
     assert report.accepted
     assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 2
@@ -253,8 +219,8 @@ def test_few_views(views: int) -> None:
 
 @pytest.mark.parametrize("degree", [1, 3])
 def test_harmonics_keep_their_degree_and_values(degree: int) -> None:
-    scene, truth = truth_of(degree)
-    start = spoil(truth)
+    scene, truth = scenes.self_made(degree)
+    start = scenes.spoil(truth)
     result, report = fit_full(start, pair_of(scene), QUICK)
     assert report.accepted
     assert result.sh_degree == degree
@@ -263,8 +229,8 @@ def test_harmonics_keep_their_degree_and_values(degree: int) -> None:
 
 
 def test_harmonics_are_inherited_by_grown_ones() -> None:
-    scene, truth = truth_of(1)
-    start = spoil(truth)
+    scene, truth = scenes.self_made(1)
+    start = scenes.spoil(truth)
     result, report = fit_full(start, pair_of(scene), LONG, count=len(start) + 20)
     assert report.accepted
     assert len(result) == len(start) + 20
@@ -287,11 +253,11 @@ def test_dropout_where_there_are_few_views(photos: Pair) -> None:
 
 
 def test_dropout_changes_the_run_and_still_helps(truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     one, other = (fit_full(start, photos, replace(QUICK, dropout=share)) for share in (0.0, 0.3))
     assert one[1].accepted
     assert other[1].accepted
-    assert not identical(one[0], other[0])
+    assert not scenes.identical(one[0], other[0])
 
 
 # time
@@ -299,7 +265,7 @@ def test_dropout_changes_the_run_and_still_helps(truth: Gaussians, photos: Pair)
 
 def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
     """Hardly any: a few steps, and still judged."""
-    result, report = fit_full(spoil(truth), photos, replace(LONG, time_budget=1e-6))
+    result, report = fit_full(scenes.spoil(truth), photos, replace(LONG, time_budget=1e-6))
     assert full_module.PROBE < report.steps <= full_module.PROBE + 1
     assert report.accepted == (report.holdout_after > report.holdout_before)
     if report.accepted:
@@ -336,7 +302,7 @@ def test_rates_decay() -> None:
 
 def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
     calls: list[tuple[int, int, float, float]] = []
-    _, report = fit_full(spoil(truth), photos, QUICK, progress=lambda *call: calls.append(call))
+    _, report = fit_full(scenes.spoil(truth), photos, QUICK, progress=lambda *call: calls.append(call))
     assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
     assert calls[-1][2] > calls[0][2]  # of the photos
     assert calls[0][3] == pytest.approx(report.holdout_before)
@@ -346,8 +312,8 @@ def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
 
 def test_score_is_that_of_the_half_size_blocks(truth: Gaussians, photos: Pair) -> None:
     plan = plan_run(photos, QUICK, 0)
-    state = start_state(spoil(truth))
-    _, report = fit_full(spoil(truth), photos, QUICK)
+    state = start_state(scenes.spoil(truth))
+    _, report = fit_full(scenes.spoil(truth), photos, QUICK)
     assert holdout_score(state, plan) == report.holdout_before
 
 
@@ -356,89 +322,25 @@ def test_score_is_that_of_the_half_size_blocks(truth: Gaussians, photos: Pair) -
 
 @pytest.mark.parametrize("settings", [{}, {"dropout": 0.2}, {"fit_steps": 160}], ids=str)
 def test_threads_change_no_bit(truth: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
-    start, found = spoil(truth), []
+    start, found = scenes.spoil(truth), []
     for threads in (1, 2, 8):
         with use_threads(threads):
             found.append(fit_full(start, photos, replace(QUICK, **settings), count=len(start) + 20, seed=3))
-    assert all(identical(a[0], b[0]) and a[1] == b[1] for a, b in itertools.pairwise(found))
+    assert all(scenes.identical(a[0], b[0]) and a[1] == b[1] for a, b in itertools.pairwise(found))
 
 
 def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = fit_full(spoil(truth), photos, QUICK)
+    one = fit_full(scenes.spoil(truth), photos, QUICK)
     monkeypatch.setattr(full_module, "ROWS", 17)
-    assert identical(fit_full(spoil(truth), photos, QUICK)[0], one[0])
+    assert scenes.identical(fit_full(scenes.spoil(truth), photos, QUICK)[0], one[0])
 
 
 def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
+    start = scenes.spoil(truth)
     one, two, other = (fit_full(start, photos, QUICK, seed=seed) for seed in (5, 5, 6))
-    assert identical(one[0], two[0])
+    assert scenes.identical(one[0], two[0])
     assert one[1] == two[1]
-    assert not identical(one[0], other[0])
-
-
-# the stage
-
-
-def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
-    start = spoil(truth)
-    result, report = fit(start, photos, QUICK, seed=4)
-    wanted, own = fit_full(start, photos, QUICK, seed=4)
-    assert report == own
-    assert identical(result, wanted)
-
-
-def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the full fit is refused."""
-    refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
-    monkeypatch.setattr("gsmerge.fit.stage.fit_full", lambda gaussians, *_: (gaussians, refused))
-    start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
-    result, report = fit(start, photos, QUICK)
-    assert report is not None
-    assert (report.method, report.accepted) == ("color", True)
-    colored, _ = fit(start, photos, replace(QUICK, fit="color"))
-    assert identical(result, colored)
-    assert torch.equal(result.means, start.means)
-    assert not torch.equal(result.sh0, start.sh0)
-
-
-def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
-    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
-    options = replace(LONG, pull=1e-6, iterations=60, huber=10.0)
-    result, report = fit(grey, noise, options, count=2 * len(grey))
-    assert report is not None
-    assert not report.accepted
-    assert identical(result, grey)
-
-
-def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None:
-    """Hidden ones go, those outside all photos stay, nothing else changes."""
-    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
-    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
-    behind = replace(truth[:3], means=truth.means[:3] - 100)
-    start = Gaussians.concat([opaque, hidden, behind])
-    result, report = fit(start, photos, replace(QUICK, fit="none"))
-    assert report is None
-    keep = seen(draw(start, photos[1]), QUICK.prune)
-    assert identical(result, start[keep])
-    assert not keep[-6:-3].any()
-    assert keep[-3:].all()
-    assert identical(fit(start, photos, replace(QUICK, fit="none", prune=0.0))[0], start)
-
-
-def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
-    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
-    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
-    for method in ("color", "full"):
-        options = replace(QUICK, fit=method)  # type: ignore[arg-type]
-        alone, both = (fit(g, photos, options)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
-        assert len(both) == len(alone)
-
-
-@pytest.mark.parametrize("method", ["none", "color", "full"])
-def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
-    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))  # type: ignore[arg-type]
-    assert len(result) == 0
+    assert not scenes.identical(one[0], other[0])
 
 
 @pytest.mark.parametrize("size", [(8, 6), (5, 1), (1, 1)])
@@ -450,17 +352,3 @@ def test_tiny_photos(size: tuple[int, int]) -> None:
     assert np.isfinite([report.holdout_before, report.holdout_after]).all()
     for name in scenes.FIELDS:
         assert torch.isfinite(getattr(result, name)).all()
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        {"fit": "best"}, {"fit_steps": 0}, {"time_budget": 0.0}, {"time_budget": -1.0}, {"dropout": 1.0},
-        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_settings_out_of_range_are_refused(setting: dict[str, Any]) -> None:
-    (name,) = setting
-    with pytest.raises(ValueError, match=name):
-        FitOptions(**setting)

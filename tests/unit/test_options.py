@@ -63,7 +63,8 @@ def test_every_setting_is_documented(stage: str) -> None:
     [
         {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5}, {"method": "voronoi"},
         {"preset": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
-        {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"holdout": 2.0}, {"iterations": 0}, {"pull": -1.0},
+        {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
+        {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
         {"min_opacity": -1.0}, {"rounds": -1}, {"tolerance": 0.0}, {"overlap": float("nan")}, {"boost": 0.0},
         {"widen": 0.0}, {"backing": 1.5}, {"push": -0.1}, {"backing_spread": 0.0}, {"compactness": 2.0},
     ],

@@ -148,7 +148,7 @@ def test_double_precision_input(scene: PixelScene) -> None:
     found = [scenes.compacted(s, fit="color").gaussians for s in (doubled, scene)]
     scenes.assert_same_set(*found, atol=1e-4)
     assert scenes.psnr_of(scenes.compacted(doubled).gaussians, scene) == pytest.approx(
-        scenes.psnr_of(scenes.compacted(scene).gaussians, scene), abs=0.7
+        scenes.psnr_of(scenes.compacted(scene).gaussians, scene), abs=1.5
     )
 
 
