@@ -55,7 +55,7 @@ def test_exposure_that_changes_between_views(room: PixelScene) -> None:
 
 @pytest.mark.parametrize(("robust", "fit"), [(True, "color"), (False, "color"), (False, "full")])
 def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: str) -> None:
-    """The whole command: the fit still helps. Now and then it is refused, since exposure weighs on the judge, too."""
+    """The whole command: the fit never hurts, and mostly helps."""
     assert room.images is not None
     factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)
@@ -64,8 +64,7 @@ def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: s
     after = [
         novel_psnr(scenes.compacted(scene, robust=robust, fit=fit, seed=seed).gaussians, surfaces) for seed in range(3)
     ]
-    fewer = 0.6 if fit == "full" else 0.0  # a full fit that is refused leaves those that it was to grow from
-    assert min(after) >= before - fewer
+    assert min(after) >= before
     assert np.mean(after) > before + 1.5
 
 

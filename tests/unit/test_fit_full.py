@@ -252,6 +252,17 @@ def test_dropout_where_there_are_few_views(photos: Pair) -> None:
     assert plan_run(photos, replace(LONG, dropout=0.0), 0).dropout == 0
 
 
+def test_dropout_leaves_out_its_share(truth: Gaussians, photos: Pair) -> None:
+    """What is left out learns nothing from the step."""
+    moved = []
+    for share in (0.0, 0.5):
+        state, plan = start_state(truth), plan_run(photos, replace(QUICK, dropout=share), 0)
+        full_module.fit_step(state, plan, 1, 1, 0.0, np.random.default_rng(0))
+        moved.append(state.m.any(1).mean())
+    assert moved[0] > 0.6
+    assert moved[1] == pytest.approx(0.5 * moved[0], abs=0.1)
+
+
 def test_dropout_changes_the_run_and_still_helps(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     one, other = (fit_full(start, photos, replace(QUICK, dropout=share)) for share in (0.0, 0.3))
