@@ -89,12 +89,12 @@ def fit_colors(
     """
     train = training_weights(photos, options.holdout, seed)
     plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)))
-    before = holdout_psnr(drawn.images, photos, train)
+    before = holdout_psnr(drawn.images, photos, train, options.min_gain)
     pull = options.pull
     for _ in range(1 + MAX_RETRIES):
         system, offsets = _solve(plain, options, pull)
         fitted = parallel_map(partial(_image, plain, offsets=offsets), range(len(photos)))
-        after = holdout_psnr(fitted, photos, train)
+        after = holdout_psnr(fitted, photos, train, options.min_gain)
         if after > before:
             offsets = _finish(system, offsets, options, pull)
             report = FitReport("color", True, options.iterations, before, after, f"solved with a pull of {pull:g}")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.fit.grow import grow
+from gsmerge.fit.grow import grow_to
 from gsmerge.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.options import FitOptions, Rates
@@ -106,7 +106,8 @@ def holdout_score(state: State, plan: Plan) -> float:
         )
         return composite(drawn, colors)[0]
 
-    return holdout_psnr(parallel_map(one_view, range(len(photos))), photos, plan.weights[1])
+    images = parallel_map(one_view, range(len(photos)))
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain)
 
 
 def fit_full(
@@ -137,8 +138,8 @@ def fit_full(
     step, steps, started, error, judged = 0, options.fit_steps, time.perf_counter(), 0.0, False
     while step < steps:
         part = step / steps
-        if grows and part >= GROWTH and len(state.x) < count and step % 10 == 0:
-            state = grow(state, photos[1], count)
+        if grows and part >= GROWTH and len(state.x) < count:
+            state = grow_to(state, photos[1], count)
         if part >= options.coarse and not judged:
             after, judged = holdout_score(state, plan), True
             if after <= before:
@@ -155,6 +156,8 @@ def fit_full(
     if after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why)
+    if grows:  # a time budget may end before the growth
+        state = grow_to(state, photos[1], count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
     return gaussians_of(state.x, state.splats.shN), FitReport("full", True, step, before, after, why)
 

@@ -29,21 +29,30 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
     return np.stack(parallel_map(one_view, range(len(photos)))).sum(0, dtype=np.float64)
 
 
+def grow_to(state: State, photos: Photos, count: int) -> State:
+    """:func:`grow` again and again, until there are ``count`` or nothing that the photos show is left to halve."""
+    before = 0
+    while before < len(state.x) < count:
+        before, state = len(state.x), grow(state, photos, count)
+    return state
+
+
 def grow(state: State, photos: Photos, count: int) -> State:
     """Halve the Gaussians with the largest error masses across their longest axis, until there are ``count``.
 
-    Each is halved at most once, so the number at most doubles. The halves start with their parent's momentum; the
-    old ones come first and in order, the second halves after them.
+    Each is halved at most once, so the number at most doubles, and what no photo shows is left alone. The halves
+    start with their parent's momentum; the old ones come first and in order, the second halves after them.
 
     Args:
         state: n Gaussians under optimisation.
         photos: What they are to look like.
         count: Wanted number, not below n.
     """
-    num = min(count - len(state.x), len(state.x))
+    masses = error_masses(state, photos)
+    num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:
         return state
-    picked = np.sort(np.argsort(-error_masses(state, photos), kind="stable")[:num])
+    picked = np.sort(np.argsort(-masses, kind="stable")[:num])
     parents, rows = state.x[picked], np.arange(num)
     longest = parents[:, SIZE:QUAT].argmax(1)
     reach = OFFSET * np.exp(parents[rows, SIZE + longest])

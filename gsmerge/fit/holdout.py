@@ -31,13 +31,45 @@ def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
-def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndarray]) -> float:
-    """PSNR (dB) of renders on the held-out blocks."""
+def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
+    """PSNR (dB) of renders on the held-out blocks, exposure of the photos set aside.
+
+    Args:
+        images: ``[h,w,3]`` render of every photo.
+        photos: The photos.
+        weights: ``[h,w]`` 0 on the held-out blocks of each view, 1 elsewhere.
+        min_gain: Exposure against the mean, as a factor, from which on it is set aside.
+    """
+    views = range(len(photos))
+    shown = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
+    gains = exposure_gains(shown, photos, weights, min_gain)
 
     def one_view(view: int) -> tuple[float, float]:
-        error = ((np.clip(images[view], 0, 1) - photos.images[view]) ** 2).sum(-1)
+        error = ((shown[view] * gains[view] - photos.images[view]) ** 2).sum(-1)
         held = weights[view] == 0
         return float(error[held].sum(dtype=np.float64)), float(held.sum())
 
-    error, count = np.sum(parallel_map(one_view, range(len(photos))), axis=0)
+    error, count = np.sum(parallel_map(one_view, views), axis=0)
     return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+
+
+def exposure_gains(
+    images: list[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float, max_gain: float = 2.0
+) -> np.ndarray:
+    """``[v,3]`` float32 factors that bring renders to the photos' exposure, with geometric mean one.
+
+    Least squares on the weighted pixels, per view and channel; ones where no view differs by ``min_gain``.
+    """
+
+    def one_view(view: int) -> np.ndarray:
+        image, weight = images[view], weights[view][..., None]
+        with_photo, with_image = (
+            (weight * other * image).sum((0, 1), dtype=np.float64) for other in (photos.images[view], image)
+        )
+        return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / max_gain, max_gain)
+
+    gains = np.stack(parallel_map(one_view, range(len(photos))))
+    gains /= np.exp(np.log(gains).mean(0))
+    if np.abs(np.log(gains)).max() < np.log(min_gain):
+        gains[:] = 1
+    return gains.astype(np.float32)

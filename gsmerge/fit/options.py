@@ -93,6 +93,14 @@ class FitOptions:
             raise ValueError(f"pull: expected at least 0, got {self.pull}")
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
+        for name in ("coarse", "dssim", "prune"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a number from 0 to 1, got {getattr(self, name)}")
+        for name in ("min_gain", "max_gain"):
+            if not getattr(self, name) >= 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if not self.huber > 0:
+            raise ValueError(f"huber: expected more than 0, got {self.huber}")
         if self.dropout is not None and not 0 <= self.dropout < 1:
             raise ValueError(f"dropout: expected a number from 0 to below 1, got {self.dropout}")
         if self.time_budget is not None and not self.time_budget > 0:

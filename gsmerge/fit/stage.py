@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from gsmerge.fit.color import draw, fit_colors, seen
 from gsmerge.fit.full import GROW_STEPS, START, Progress, fit_full
+from gsmerge.fit.grow import grow_to
 from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
+from gsmerge.fit.state import gaussians_of, start_state
 from gsmerge.photos import Photos
 from gsmerge.types import Gaussians
 
@@ -42,6 +44,11 @@ def fit(
         fitted, report = fit_full(kept, photos, options, count, seed, progress)
         if report.accepted:
             return fitted, report
+        if start_share(options) < 1:  # the stages before left room for a growth that did not happen
+            state = grow_to(start_state(kept), photos[1], count)
+            grown = gaussians_of(state.x, state.splats.shN)
+            fitted, report = fit_colors(grown, draw(grown, photos[1]), photos[1], options, seed)
+            return (fitted if report.accepted else kept), report
     gaussians, report = fit_colors(gaussians, drawn, photos[1], options, seed)
     return gaussians[keep], report
 

@@ -266,9 +266,21 @@ def test_holdout_psnr_looks_at_held_out_pixels_only(photos: Photos) -> None:
     images = [photo.copy() for photo in photos.images]
     for image, weight in zip(images, weights, strict=True):
         image[weight == 1] = 9.0
-    assert holdout_psnr(images, photos, weights) == pytest.approx(120)
+    assert holdout_psnr(images, photos, weights, np.inf) == pytest.approx(120)
     rng = np.random.default_rng(0)
     noisy = [photo + 0.1 * rng.normal(size=photo.shape).astype(np.float32) for photo in photos.images]
     held = np.concatenate([np.clip(n, 0, 1)[w == 0] for n, w in zip(noisy, weights, strict=True)])
     truth = np.concatenate([p[w == 0] for p, w in zip(photos.images, weights, strict=True)])
-    assert holdout_psnr(noisy, photos, weights) == pytest.approx(psnr(held[None], truth[None]), abs=1e-3)
+    assert holdout_psnr(noisy, photos, weights, np.inf) == pytest.approx(psnr(held[None], truth[None]), abs=1e-3)
+
+
+def test_holdout_psnr_sets_exposure_aside(photos: Photos) -> None:
+    """Views that are brighter or darker than the mean cost nothing; what they have in common still counts."""
+    weights = training_weights(photos, 0.2, 0)
+    factors = np.array([0.8, 1.25] * len(photos), np.float32)[: len(photos)]
+    factors /= np.exp(np.log(factors).mean())
+    images = [0.5 * photo / factor for photo, factor in zip(photos.images, factors, strict=True)]
+    halved = replace(photos, images=0.5 * photos.images)
+    assert holdout_psnr(images, halved, weights, 1.15) > 60
+    assert holdout_psnr(images, halved, weights, np.inf) < 40
+    assert holdout_psnr(images, photos, weights, 1.15) < 15
