@@ -109,10 +109,17 @@ def _run(
         superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
         read = perf_counter()
         with (
-            announce_compilation(quiet=quiet, share=settings.fit.fit == "full"),
+            announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
             stage_progress(quiet=quiet) as progress,
         ):
-            result = pipeline.compact(loaded.scene, settings, progress=progress)
+
+            def moved(stage: str, done: int, total: int) -> None:
+                if stage == "fit":
+                    finish()
+                if progress is not None:
+                    progress(stage, done, total)
+
+            result = pipeline.compact(loaded.scene, settings, progress=moved)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
     return report_document(

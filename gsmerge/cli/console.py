@@ -39,12 +39,15 @@ def plain_warnings() -> Iterator[None]:
 
 
 @contextmanager
-def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[None]:
+def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callable[[], None]]:
     """A block that says so, once, when a kernel has to be compiled (the first run after installation).
 
     Args:
         quiet: Say nothing.
         share: Let a second process compile the kernels of the fit in the meantime.
+
+    Yields:
+        What waits for the second process; to be called before the fit, which would compile the same again.
     """
     from gsmerge.kernels.compilation import watch_compilation
 
@@ -57,9 +60,13 @@ def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[None]:
             command = [sys.executable, "-m", "gsmerge.warm"]
             second.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
 
+    def finish() -> None:
+        for process in second:
+            process.wait()
+
     with watch_compilation(begin):
         try:
-            yield
+            yield finish
         finally:
             for process in second:
                 process.terminate()
