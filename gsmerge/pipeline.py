@@ -33,6 +33,7 @@ from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
 Progress = Callable[[str, int, int], None]
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 NEAR = 0.01  # near plane, in canonical units
+RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
 STAGES = ("prepare", "segment", "encode", "robust", "match", "decode", "fit", "score")
 
 
@@ -90,7 +91,8 @@ class _Run:
             self.progress(name, STAGES.index(name), len(STAGES))
         start = time.perf_counter()
         yield
-        release_memory()
+        if name in RELEASED:
+            release_memory()
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
