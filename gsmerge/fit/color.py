@@ -22,6 +22,7 @@ from gsmerge.types import SH_C0, Gaussians
 from gsmerge.weights import ViewWeights, apply, apply_transposed, peak_weights, view_weights
 
 MAX_RETRIES = 2
+HOLDOUT = 4  # times the share: the last steps see everything, and a small sample misjudges a scene of few views
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ def fit_colors(
     Returns:
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
-    train = training_weights(photos, options.holdout, seed)
+    train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)))
     before = holdout_psnr(drawn.images, photos, train, options.min_gain)
     pull = options.pull
