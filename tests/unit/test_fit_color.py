@@ -45,7 +45,8 @@ def test_wrong_colours_come_back(gaussians: Gaussians, photos: Photos) -> None:
     rng = torch.Generator().manual_seed(0)
     noise = 0.1 * torch.randn(gaussians.sh0.shape, generator=rng)
     spoilt = replace(gaussians, sh0=gaussians.sh0 + noise / SH_C0)
-    result, report = fitted(spoilt, photos, replace(FEW, pull=0.01, iterations=18, holdout=0.0125))  # one block in twenty
+    # one block in twenty is held out
+    result, report = fitted(spoilt, photos, replace(FEW, pull=0.01, iterations=18, holdout=0.0125))
     assert report.accepted
     assert report.holdout_after > report.holdout_before + 6
     error = SH_C0 * (result.sh0 - gaussians.sh0)
