@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-
 from gsmerge.allocate import auto_count, count_for_bytes, cut_tree, parse_budget, parse_bytes, pixel_depths, region_tree
 from gsmerge.errors import UsageError
 from gsmerge.fit import start_share
 from gsmerge.options import CompactOptions
+from gsmerge.photos import scene_pictures
 from gsmerge.robust import MIN_VIEWS
 from gsmerge.segment import count_for, segment
-from gsmerge.types import SH_C0, Groups, PixelScene
+from gsmerge.types import Groups, PixelScene
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
         UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
     """
     views, pixels = len(scene), scene.pixels_per_view
-    pictures = scene.images if scene.images is not None else own_colors(scene)
+    pictures = scene_pictures(scene)
     robust = uses_robust(scene, options)
     behind = options.backing.backing if robust and views >= MIN_VIEWS else 0.0
     share = start_share(options.fit) if scene.images is not None else 1.0
@@ -91,9 +90,3 @@ def target_count(scene: PixelScene, options: CompactOptions) -> int | None:
     if options.max_bytes is not None:
         wanted.append(count_for_bytes(parse_bytes(options.max_bytes), scene.gaussians.sh_degree))
     return min(*wanted, num_input) if wanted else None
-
-
-def own_colors(scene: PixelScene) -> torch.Tensor:
-    """Pictures made of the Gaussians' base colours, for scenes without photos."""
-    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)

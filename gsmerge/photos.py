@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from torch import Tensor
 
 from gsmerge.threads import parallel_map
-from gsmerge.types import PixelScene
+from gsmerge.types import SH_C0, PixelScene
 
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
@@ -42,6 +44,24 @@ class Photos:
     def width(self) -> int:
         """Columns."""
         return self.images.shape[2]
+
+    def camera(self, view: int) -> dict[str, Any]:
+        """The arguments that :func:`gsmerge.render.plan_view` needs to render into a photo."""
+        return {
+            "viewmat": self.viewmats[view],
+            "K": self.Ks[view],
+            "width": self.width,
+            "height": self.height,
+            "eps2d": self.eps2d,
+        }
+
+
+def scene_pictures(scene: PixelScene) -> Tensor:
+    """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none."""
+    if scene.images is not None:
+        return scene.images
+    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
+    return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
 
 
 def scene_photos(scene: PixelScene, level: int = 1) -> Photos:

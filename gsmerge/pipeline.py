@@ -16,7 +16,7 @@ from gsmerge.backing import encode_backing
 from gsmerge.canonical import canonicalise
 from gsmerge.decode import decode
 from gsmerge.encode import encode
-from gsmerge.fit import fit, start_share
+from gsmerge.fit import fit
 from gsmerge.grouping import Grouping, group_scene
 from gsmerge.match import match
 from gsmerge.memory import peak_memory, release_memory
@@ -171,7 +171,7 @@ def _filled(
     features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
 ) -> np.ndarray | None:
     """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
-    if not grouping.exact or start_share(options.fit) < 1:
+    if not grouping.exact or options.fit.grows:
         return None
     return split_counts(features, members, max(0, grouping.wanted - len(features)))
 
@@ -190,8 +190,7 @@ def _fitted(
     photos = scene_photos(scene), scene_photos(scene, 2)
     run.choices["begun_with"] = len(gaussians)
     # where nothing grows to the number asked for, nothing may fall below it either
-    grows = start_share(options.fit) < 1
-    settings = replace(options.fit, prune=0.0) if grouping.exact and not grows else options.fit
+    settings = replace(options.fit, prune=0.0) if grouping.exact and not options.fit.grows else options.fit
     gaussians, report = fit(gaussians, photos, settings, grouping.wanted, options.seed, run.fit_progress)
     if report:
         run.choices["fit"] = asdict(report)
@@ -205,9 +204,7 @@ def input_psnr(gaussians: Gaussians, photos: Photos, near: float) -> float:
     splats = prepare(gaussians)
 
     def one_view(view: int) -> float:
-        plan = plan_view(
-            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d, near=near
-        )
+        plan = plan_view(splats, **photos.camera(view), near=near)
         return psnr(np.clip(composite(plan)[0], 0, 1), photos.images[view])
 
     if len(gaussians) > ONE_AT_A_TIME:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsmerge.metrics import psnr
 from gsmerge.render import render
-from gsmerge.types import SH_C0, Cameras, Gaussians, PixelScene
+from gsmerge.types import Cameras, Gaussians
 
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
 BAND = 22  # height of the band that carries a tile's label, pixels
@@ -22,14 +22,6 @@ GAP = 4
 def to_picture(image: Tensor) -> Picture:
     """``[h,w,3]`` float in [0, 1] -> 8 bit, RGB."""
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-
-
-def view_pictures(scene: PixelScene) -> Tensor:
-    """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none."""
-    if scene.images is not None:
-        return scene.images
-    shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
 
 
 def pick_views(num_views: int, most: int) -> list[int]:

@@ -149,10 +149,7 @@ def photo_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) ->
     splats, views = prepare(feature_to_gaussians(features)), features.views.numpy()
 
     def score(view: int) -> float:
-        plan = plan_view(
-            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height,
-            eps2d=photos.eps2d, keep=views != view if left_out else None,
-        )  # fmt: skip
+        plan = plan_view(splats, **photos.camera(view), keep=views != view if left_out else None)
         image, _ = composite(plan)
         return psnr(np.clip(image, 0, 1), photos.images[view])
 
@@ -174,10 +171,7 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
         opacities = np.clip(1 - np.exp(-boosted * trust), 1e-4, 0.999).astype(np.float32)
 
         def testimony(view: int, opacities: np.ndarray = opacities) -> np.ndarray:
-            plan = plan_view(
-                splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height,
-                eps2d=photos.eps2d, keep=views != view, opacities=opacities,
-            )  # fmt: skip
+            plan = plan_view(splats, **photos.camera(view), keep=views != view, opacities=opacities)
             image = photos.images[view]
             squares = np.einsum("hwc,hwc->hw", image, image)
             return splat_adjoint(plan, np.dstack([np.ones_like(squares), image, squares]))

@@ -70,11 +70,12 @@ def _write_overlays(
     scene: PixelScene, options: SegmentOptions, pictures: Sequence[Path], *, overwrite: bool
 ) -> Sequence[int]:
     """Segment and draw; returns the number of superpixels of every view."""
-    from gsmerge.preview import draw_borders, draw_heat, draw_means, view_pictures
+    from gsmerge.photos import scene_pictures
+    from gsmerge.preview import draw_borders, draw_heat, draw_means
     from gsmerge.segment import saliency
     from gsmerge.segment import segment as segment_images
 
-    images = view_pictures(scene)
+    images = scene_pictures(scene)
     groups = segment_images(images, options)
     paths = iter(pictures)
     for image, labels in zip(images, groups.labels, strict=True):

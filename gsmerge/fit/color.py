@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from gsmerge.fit.holdout import holdout_psnr, training_weights
+from gsmerge.fit.holdout import exposure_gains, holdout_psnr, training_weights
 from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
 from gsmerge.photos import Photos
@@ -55,9 +55,7 @@ def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
     splats: Splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
-        plan = plan_view(
-            splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
-        )
+        plan = plan_view(splats, **photos.camera(view))
         return view_weights(plan), composite(plan)[0]
 
     views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
@@ -180,21 +178,17 @@ def _normal(system: _System, x: np.ndarray) -> np.ndarray:
 def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: FitOptions) -> _System:
     """Weights ``base`` times Huber weights of the present residuals; exposure gains with geometric mean one."""
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        image = _image(system, view, x)
-        photo, weight = system.photos[view], base[view][..., None]
-        error = np.sqrt(((photo - image) ** 2).mean(-1))
-        robust = base[view] * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
-        calm = weight * (error < 2 * options.huber)[..., None]
-        ratio = (calm * photo * image).sum((0, 1)) / np.maximum((calm * image * image).sum((0, 1)), 1e-9)
-        return robust, np.clip(ratio, 1 / options.max_gain, options.max_gain)
+    views = range(len(system.photos))
+    images = parallel_map(partial(_image, system, offsets=x), views)
 
-    weights, gains = zip(*parallel_map(one_view, range(len(system.photos))), strict=True)
-    factors = np.stack(gains)
-    factors /= np.exp(np.log(factors).mean(0))
-    if np.abs(np.log(factors)).max() < np.log(options.min_gain):
-        factors[:] = 1
-    return replace(system, weights=list(weights), gains=factors)
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        error = np.sqrt(((system.photos[view] - images[view]) ** 2).mean(-1))
+        robust = base[view] * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
+        return robust, base[view] * (error < 2 * options.huber)
+
+    weights, calm = zip(*parallel_map(one_view, views), strict=True)
+    gains = exposure_gains(images, system.photos, calm, options.min_gain, options.max_gain)
+    return replace(system, weights=list(weights), gains=gains)
 
 
 def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> torch.Tensor:

@@ -28,8 +28,6 @@ from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
 GROWTH = 0.5  # part of the run after which Gaussians are added
-GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
-START = 0.57  # share of the Gaussians that a run which grows begins with
 FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.1
 PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
@@ -64,10 +62,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
         opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
-    drawn = plan_differentiable(
-        state.splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height,
-        eps2d=photos.eps2d, opacities=opacities,
-    )  # fmt: skip
+    drawn = plan_differentiable(state.splats, **photos.camera(view), opacities=opacities)
     colors = state.view_colors()
     image, transmittance = composite(drawn, colors, background)
     gradient = image_gradient(image, photos.images[view], weight, plan.options.dssim)
@@ -101,9 +96,7 @@ def holdout_score(state: State, plan: Plan) -> float:
     photos, colors = plan.photos[1], state.view_colors()
 
     def one_view(view: int) -> np.ndarray:
-        drawn = plan_view(
-            state.splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
-        )
+        drawn = plan_view(state.splats, **photos.camera(view))
         return composite(drawn, colors)[0]
 
     images = parallel_map(one_view, range(len(photos)))
@@ -134,7 +127,7 @@ def fit_full(
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
     before = after = holdout_score(state, plan)
     queue: list[int] = []
-    grows = options.fit_steps >= GROW_STEPS
+    grows = options.grows
     step, steps, started, error, judged = 0, options.fit_steps, time.perf_counter(), 0.0, False
     while step < steps:
         part = step / steps

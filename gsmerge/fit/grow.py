@@ -20,9 +20,7 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
     """``[n]`` sum over all photos of every Gaussian's blending weight times the absolute error of the pixel."""
 
     def one_view(view: int) -> np.ndarray:
-        plan = plan_view(
-            state.splats, photos.viewmats[view], photos.Ks[view], photos.width, photos.height, eps2d=photos.eps2d
-        )
+        plan = plan_view(state.splats, **photos.camera(view))
         image, _ = composite(plan, state.view_colors())
         return splat_adjoint(plan, np.abs(image - photos.images[view]).mean(-1, keepdims=True))[:, 0]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gsmerge.photos import Photos
@@ -42,7 +44,7 @@ def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndar
     """
     views = range(len(photos))
     shown = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
-    gains = exposure_gains(shown, photos, weights, min_gain)
+    gains = exposure_gains(shown, photos.images, weights, min_gain)
 
     def one_view(view: int) -> tuple[float, float]:
         error = ((shown[view] * gains[view] - photos.images[view]) ** 2).sum(-1)
@@ -54,7 +56,11 @@ def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndar
 
 
 def exposure_gains(
-    images: list[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float, max_gain: float = 2.0
+    images: Sequence[np.ndarray],
+    photos: np.ndarray,
+    weights: Sequence[np.ndarray],
+    min_gain: float,
+    max_gain: float = 2.0,
 ) -> np.ndarray:
     """``[v,3]`` float32 factors that bring renders to the photos' exposure, with geometric mean one.
 
@@ -64,7 +70,7 @@ def exposure_gains(
     def one_view(view: int) -> np.ndarray:
         image, weight = images[view], weights[view][..., None]
         with_photo, with_image = (
-            (weight * other * image).sum((0, 1), dtype=np.float64) for other in (photos.images[view], image)
+            (weight * other * image).sum((0, 1), dtype=np.float64) for other in (photos[view], image)
         )
         return np.clip(with_photo / np.maximum(with_image, 1e-9), 1 / max_gain, max_gain)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 Fit = Literal["none", "color", "full"]
+GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,11 @@ class FitOptions:
     max_gain: float = 2.0
     holdout: float = 0.05
     prune: float = 1 / 255
+
+    @property
+    def grows(self) -> bool:
+        """Whether the fit begins with fewer Gaussians than are asked for, and adds the rest on the way."""
+        return self.fit == "full" and self.fit_steps >= GROW_STEPS
 
     def __post_init__(self) -> None:
         if isinstance(self.rates, dict):  # as CompactOptions.to_dict() and JSON have it

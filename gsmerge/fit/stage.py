@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from gsmerge.fit.color import draw, fit_colors, seen
-from gsmerge.fit.full import GROW_STEPS, START, Progress, fit_full
+from gsmerge.fit.full import Progress, fit_full
 from gsmerge.fit.grow import grow_to
 from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
 from gsmerge.fit.state import gaussians_of, start_state
 from gsmerge.photos import Photos
 from gsmerge.types import Gaussians
+
+START = 0.57  # share of the Gaussians that a run which grows begins with
 
 
 def fit(
@@ -44,7 +46,7 @@ def fit(
         fitted, report = fit_full(kept, photos, options, count, seed, progress)
         if report.accepted:
             return fitted, report
-        if start_share(options) < 1:  # the stages before left room for a growth that did not happen
+        if options.grows:  # the stages before left room for a growth that did not happen
             state = grow_to(start_state(kept), photos[1], count)
             grown = gaussians_of(state.x, state.splats.shN)
             fitted, report = fit_colors(grown, draw(grown, photos[1]), photos[1], options, seed)
@@ -55,4 +57,4 @@ def fit(
 
 def start_share(options: FitOptions) -> float:
     """Share of the Gaussians asked for that the stages before the fit should leave for it to begin with."""
-    return START if options.fit == "full" and options.fit_steps >= GROW_STEPS else 1.0
+    return START if options.grows else 1.0
