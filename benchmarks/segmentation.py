@@ -78,8 +78,8 @@ def cpu_ms(methods: list[Method], image: np.ndarray, count: int, repeats: int) -
     return [1e3 * t * SIDE**2 / (image.shape[0] * image.shape[1]) for t in best]
 
 
-def ours(name: str, preset: str) -> Method:
-    return lambda image, count: superpixels(image, count, name, preset=preset).numpy()
+def ours(name: str, effort: str) -> Method:
+    return lambda image, count: superpixels(image, count, name, effort=effort).numpy()
 
 
 def main() -> None:
@@ -90,23 +90,23 @@ def main() -> None:
     cv2.setNumThreads(1)
     pictures, others = photos(), sketches()
     print(
-        f"{'density':>7} {'method':8} {'preset':8} {'proxy':>6} {'splat':>6} {'ms':>7} {'/bass-st':>8} {'/sketch':>8}"
+        f"{'density':>7} {'method':8} {'effort':8} {'proxy':>6} {'splat':>6} {'ms':>7} {'/bass-st':>8} {'/sketch':>8}"
     )
     for density in options.density or DENSITIES:
         reference = None
-        for name, preset in RUNS:
-            methods = [ours(name, preset), *([others[name, preset]] if (name, preset) in others else [])]
+        for name, effort in RUNS:
+            methods = [ours(name, effort), *([others[name, effort]] if (name, effort) in others else [])]
             rows = []
             for image in pictures.values():
                 count = count_at(image, density)
-                labels = superpixels(image, count, name, preset=preset).numpy()
+                labels = superpixels(image, count, name, effort=effort).numpy()
                 times = cpu_ms(methods, image, count, options.repeats)
                 rows.append((proxy_psnr(image, labels), splat_psnr(image, labels), *times))
             proxy, splat, ms, *sketch_ms = np.mean(rows, 0)
             reference = ms if reference is None else reference
             ratio = f"{ms / sketch_ms[0]:8.2f}" if sketch_ms else f"{'-':>8}"
             print(
-                f"{density:7d} {name:8} {preset:8} {proxy:6.2f} {splat:6.2f} {ms:7.1f} {ms / reference:8.2f} {ratio}",
+                f"{density:7d} {name:8} {effort:8} {proxy:6.2f} {splat:6.2f} {ms:7.1f} {ms / reference:8.2f} {ratio}",
                 flush=True,
             )
 

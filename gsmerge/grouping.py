@@ -1,16 +1,19 @@
-"""scene -> groups: how many superpixels each view gets, by density, budget or the scene's own knee."""
+"""scene -> groups: how many superpixels each view gets, by density, or cut to a number of Gaussians."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmerge.allocate import auto_count, count_for_bytes, cut_tree, parse_budget, parse_bytes, pixel_depths, region_tree
+from torch import Tensor
+
+from gsmerge.allocate import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.errors import UsageError
 from gsmerge.fit import start_share
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_pictures
 from gsmerge.robust import MIN_VIEWS
 from gsmerge.segment import count_for, segment
+from gsmerge.targets import exact_count, most_allowed
 from gsmerge.types import Groups, PixelScene
 
 
@@ -33,47 +36,92 @@ class Grouping:
     exact: bool
 
 
-def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
-    """Superpixels of every view.
-
-    Without a budget every view gets the same number. With one, or with ``k="auto"``, the superpixels of all views are
-    merged in the order of the distortion that it adds until the number is met: a wall ends up with few, a fern
-    with many.
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """The views of a scene and what is known of the number of Gaussians before any superpixel is chosen.
 
     Args:
-        scene: The canonical scene.
-        options: All settings.
+        pictures: ``[v,h,w,3]`` what superpixels are cut from.
+        robust: Whether the merge is chosen by the photos.
+        share: Part of the Gaussians that the stages before the fit leave for it to begin with.
+        usual: Gaussians that density and K ask for.
+        most: Gaussians that budget, size and preset allow.
+        exact: Gaussians that a budget or a size asks for; None without either.
+    """
+
+    pictures: Tensor
+    robust: bool
+    share: float
+    usual: int
+    most: int
+    exact: int | None
+
+    @property
+    def least(self) -> int:
+        """Fewest Gaussians that a scene can be cut to: one for each view."""
+        return len(self.pictures)
+
+
+def scene_canvas(scene: PixelScene, options: CompactOptions) -> Canvas:
+    """Pictures of the views and limits of the number of Gaussians.
 
     Raises:
         UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
     """
-    views, pixels = len(scene), scene.pixels_per_view
-    pictures = scene_pictures(scene)
-    robust = uses_robust(scene, options)
-    behind = options.backing.backing if robust and views >= MIN_VIEWS else 0.0
-    share = start_share(options.fit) if scene.images is not None else 1.0
+    pixels, degree = scene.pixels_per_view, scene.gaussians.sh_degree
     asked = count_for(options.segment, scene.cameras.height, scene.cameras.width)
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
-    wanted, auto = target_count(scene, options), options.decode.k == "auto"
-    if wanted is None and not auto:
-        count = max(1, int(asked * share))
-        coarse = min(round(behind * count), count - 1)
-        groups = segment(pictures, options.segment, count - coarse)
-        total = asked * views * options.decode.count
-    else:
-        leaves = min(max(asked, -(-(wanted or 0) // views)), pixels)
-        fine = segment(pictures, options.segment, leaves)
-        tree = region_tree(pictures, pixel_depths(scene), fine, scene.valid, options.allocate)
-        knee = auto_count(tree, options.allocate) if auto else len(tree)
-        total = min(knee, wanted) if wanted is not None and auto else wanted if wanted is not None else knee
-        if total < views:
-            raise UsageError(f"budget: expected at least {views}, one for each view, got {total}")
-        begun = max(views, int(total * share))
-        coarse = int(behind * begun / views)
-        groups = cut_tree(tree, max(views, begun - coarse * views))
-    coarse_groups = segment(pictures, options.segment, coarse) if coarse else None
-    return Grouping(groups, coarse_groups, robust, total, exact=wanted is not None or auto)
+    num_input = len(scene.gaussians)
+    most = most_allowed(options.target, num_input, degree)
+    if most < len(scene):
+        raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
+    share = start_share(options.fit) if scene.images is not None else 1.0
+    usual = asked * len(scene) * options.decode.count
+    exact = exact_count(options.target, num_input, degree)
+    return Canvas(scene_pictures(scene), uses_robust(scene, options), share, usual, most, exact)
+
+
+def group_scene(canvas: Canvas, options: CompactOptions) -> Grouping:
+    """The same number of superpixels for every view, as density or ``superpixels`` say."""
+    views = len(canvas.pictures)
+    each = max(1, int(canvas.usual // options.decode.count // views * canvas.share))
+    coarse = min(round(_behind(canvas, options) * each), each - 1)
+    groups = segment(canvas.pictures, options.segment, each - coarse)
+    return Grouping(groups, _coarse(canvas, options, coarse), canvas.robust, canvas.usual, exact=False)
+
+
+def scene_tree(scene: PixelScene, canvas: Canvas, options: CompactOptions, count: int) -> RegionTree:
+    """All ways to cut the scene into fewer superpixels, those of all views merged where that costs least.
+
+    A wall ends up with few, a fern with many.
+
+    Args:
+        scene: The canonical scene.
+        canvas: Its pictures.
+        options: All settings.
+        count: Most Gaussians that it will be cut to.
+    """
+    views, each = len(scene), canvas.usual // options.decode.count // len(scene)
+    leaves = min(max(each, -(-count // views)), scene.pixels_per_view)
+    fine = segment(canvas.pictures, options.segment, leaves)
+    return region_tree(canvas.pictures, pixel_depths(scene), fine, scene.valid, options.allocate)
+
+
+def cut_scene(scene: PixelScene, canvas: Canvas, tree: RegionTree, options: CompactOptions, count: int) -> Grouping:
+    """The superpixels that become exactly ``count`` Gaussians; from a finer tree where this one does not reach."""
+    views = len(canvas.pictures)
+    begun = max(views, int(count * canvas.share))
+    if begun > len(tree):
+        tree = scene_tree(scene, canvas, options, count)
+    coarse = int(_behind(canvas, options) * begun / views)
+    groups = cut_tree(tree, max(views, begun - coarse * views))
+    return Grouping(groups, _coarse(canvas, options, coarse), canvas.robust, count, exact=True)
+
+
+def knee_count(tree: RegionTree, canvas: Canvas, options: CompactOptions) -> int:
+    """The knee of the scene's own curve of distortion, at most what is allowed."""
+    return max(canvas.least, min(auto_count(tree, options.allocate), canvas.most))
 
 
 def uses_robust(scene: PixelScene, options: CompactOptions) -> bool:
@@ -82,11 +130,10 @@ def uses_robust(scene: PixelScene, options: CompactOptions) -> bool:
     return scene.images is not None and (options.fit.fit != "full" if asked is None else asked)
 
 
-def target_count(scene: PixelScene, options: CompactOptions) -> int | None:
-    """The number of Gaussians that a budget or a file size asks for, the smaller of the two; None without either."""
-    num_input, wanted = len(scene.gaussians), []
-    if options.budget is not None:
-        wanted.append(parse_budget(options.budget, num_input))
-    if options.max_bytes is not None:
-        wanted.append(count_for_bytes(parse_bytes(options.max_bytes), scene.gaussians.sh_degree))
-    return min(*wanted, num_input) if wanted else None
+def _behind(canvas: Canvas, options: CompactOptions) -> float:
+    """Share of the superpixels that the backing layer takes."""
+    return options.backing.backing if canvas.robust and len(canvas.pictures) >= MIN_VIEWS else 0.0
+
+
+def _coarse(canvas: Canvas, options: CompactOptions, count: int) -> Groups | None:
+    return segment(canvas.pictures, options.segment, count) if count else None

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gsmerge.allocate import AllocateOptions, parse_budget, parse_bytes
+from gsmerge.allocate import AllocateOptions
 from gsmerge.backing import BackingOptions
 from gsmerge.decode import DecodeOptions
 from gsmerge.encode import EncodeOptions
@@ -15,6 +14,7 @@ from gsmerge.fit import FitOptions
 from gsmerge.match import MatchOptions
 from gsmerge.robust import RobustOptions
 from gsmerge.segment import SegmentOptions
+from gsmerge.targets import TargetOptions
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,9 @@ class CompactOptions:
         match: Merging across views.
         decode: Gaussians per group.
         fit: Fit to the photos.
-        budget: Gaussians in the result: a number, or a share of the input as "2%". Met, and never exceeded.
-        max_bytes: Largest size of the result as a ``.ply``: bytes, or as "5MB".
+        target: What decides the number of Gaussians.
         seed: Everything random hangs on it; runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
-
-    Raises:
-        ValueError: If the budget or the size cannot be read.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -47,16 +43,9 @@ class CompactOptions:
     match: MatchOptions = field(default_factory=MatchOptions)
     decode: DecodeOptions = field(default_factory=DecodeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
-    budget: int | str | None = None
-    max_bytes: int | str | None = None
+    target: TargetOptions = field(default_factory=TargetOptions)
     seed: int = 0
     threads: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.budget is not None:
-            parse_budget(self.budget, sys.maxsize)
-        if self.max_bytes is not None:
-            parse_bytes(self.max_bytes)
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""
@@ -69,18 +58,21 @@ class CompactOptions:
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
         """The options with some settings changed, by flat name (``k=2, density=0.01``).
 
+        A name that several stages share, such as ``effort``, is changed in all of them.
+
         Raises:
             ValueError: If a name is unknown.
         """
         changes: dict[str, Any] = {}
-        left = dict(settings)
         for f in fields(self):
             value = getattr(self, f.name)
             if is_dataclass(value) and not isinstance(value, type):
-                own = {g.name: left.pop(g.name) for g in fields(value) if g.name in left}
-                changes[f.name] = replace(value, **own)
-            elif f.name in left:
-                changes[f.name] = left.pop(f.name)
-        if left:
-            raise ValueError(f"unknown setting {sorted(left)[0]!r}; known: {', '.join(sorted(self.to_dict()))}")
+                changes[f.name] = replace(
+                    value, **{g.name: settings[g.name] for g in fields(value) if g.name in settings}
+                )
+            elif f.name in settings:
+                changes[f.name] = settings[f.name]
+        unknown = sorted(settings.keys() - self.to_dict().keys())
+        if unknown:
+            raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(self.to_dict()))}")
         return replace(self, **changes)

@@ -1,40 +1,32 @@
-"""The whole story: scene -> groups -> feature gaussians -> merged -> decoded -> fitted."""
+"""The whole story: scene -> groups -> feature gaussians -> merged -> decoded -> fitted, and how many of them."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from gsmerge.allocate import split_counts
-from gsmerge.backing import encode_backing
-from gsmerge.canonical import canonicalise
-from gsmerge.decode import decode
-from gsmerge.encode import encode
-from gsmerge.fit import fit
-from gsmerge.grouping import Grouping, group_scene
-from gsmerge.match import match
-from gsmerge.memory import peak_memory, release_memory
-from gsmerge.merge import merge
+from gsmerge.allocate import RegionTree
+from gsmerge.build import Source, build
+from gsmerge.canonical import Frame, canonicalise
+from gsmerge.curve import measure_curve
+from gsmerge.errors import UsageError
+from gsmerge.grouping import Canvas, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
+from gsmerge.journal import STAGES, Journal, Progress
+from gsmerge.memory import peak_memory
 from gsmerge.metrics import psnr
-from gsmerge.moments import Members, scene_members
+from gsmerge.moments import scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
-from gsmerge.robust import choose_merge, close_holes
+from gsmerge.targets import AUTO_RUNGS, MOST, RUNGS, count_within, curve_knee, level_counts, rungs, search_count
 from gsmerge.threads import parallel_map, use_threads
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+from gsmerge.types import Gaussians, PixelScene
 
-Progress = Callable[[str, int, int], None]
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 NEAR = 0.01  # near plane, in canonical units
-RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
-STAGES = ("prepare", "segment", "encode", "robust", "match", "decode", "fit", "score")
 
 
 @dataclass(frozen=True)
@@ -47,10 +39,11 @@ class CompactReport:
         seconds: Wall time of each stage.
         psnr_before: Mean PSNR (dB) of the input views rendered from the input; None without photos.
         psnr_after: The same from the result.
-        choices: What the stages decided (merge, scores, clusters, fit).
+        choices: What the stages decided (count, curve, merge, scores, clusters, fit).
         notes: Things worth telling, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
+        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
     """
 
     num_input: int
@@ -62,38 +55,35 @@ class CompactReport:
     notes: list[str]
     options: dict[str, Any]
     peak_memory_bytes: int
+    unmet: str | None = None
 
 
 @dataclass(frozen=True)
 class CompactResult:
-    """The compact Gaussians, in the scene's own world frame, and the report."""
+    """The compact Gaussians, in the scene's own world frame, and the report.
+
+    Args:
+        gaussians: The Gaussians.
+        report: What was done.
+        coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+    """
 
     gaussians: Gaussians
     report: CompactReport
+    coarser: tuple[CompactResult, ...] = ()
 
 
-@dataclass
-class _Run:
-    """Clock and notebook of one run."""
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """A run under way: the scene as given, what Gaussians are built from, and what is known of their number."""
 
-    progress: Progress | None
-    seconds: dict[str, float] = field(default_factory=dict)
-    choices: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    def fit_progress(self, step: int, steps: int, photos: float, held_out: float) -> None:
-        if self.progress:
-            self.progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        if self.progress:
-            self.progress(name, STAGES.index(name), len(STAGES))
-        start = time.perf_counter()
-        yield
-        if name in RELEASED:
-            release_memory()
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+    scene: PixelScene
+    frame: Frame
+    source: Source
+    options: CompactOptions
+    canvas: Canvas
+    tree: RegionTree | None
+    before: float | None
 
 
 def compact(
@@ -105,98 +95,113 @@ def compact(
         scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
-            the fit with ("fit: ...", step, steps).
+            the longer ones with ("fit: ...", step, steps).
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, density=0.01)``.
 
     Returns:
-        The Gaussians and a report.
+        The Gaussians and a report; further levels of detail if they were asked for.
 
     Raises:
-        ValueError: If a setting is unknown or out of range.
+        ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
     options = (options or CompactOptions()).with_settings(settings)
-    run = _Run(progress)
+    journal = Journal(progress)
     with use_threads(options.threads), torch.no_grad():
-        with run.stage("prepare"):
-            canonical, frame = canonicalise(scene)
-            members = scene_members(canonical)
-        with run.stage("segment"):
-            grouping = group_scene(canonical, options)
-        features = _merged_features(canonical, members, grouping, options, run)
-        with run.stage("decode"):
-            children = _filled(features, members, grouping, options)
-            gaussians = decode(features, members, options.decode, children, options.encode.rule)
-        del features, members
-        if canonical.images is not None:
-            with run.stage("fit"):
-                gaussians = _fitted(gaussians, canonical, grouping, options, run)
-        del canonical
-        gaussians = frame.leave(gaussians)
-        before = after = None
-        if scene.images is not None:
-            with run.stage("score"):
-                photos, near = scene_photos(scene), NEAR * frame.unit
-                before, after = input_psnr(scene.gaussians, photos, near), input_psnr(gaussians, photos, near)
+        work = _begun(scene, options, journal)
+        if options.target.target_psnr is not None:
+            result = _searched(work, options.target.target_psnr, journal)
+        else:
+            result = _built(work, _decided(work, journal), journal)
+        counts = level_counts(len(result.gaussians), options.target.levels, work.canvas.least)
+        coarser = tuple(_built(work, count, Journal(progress)) for count in counts)
     if progress:
         progress("done", len(STAGES), len(STAGES))
-    counts = len(scene.gaussians), len(gaussians)
+    return replace(result, coarser=coarser)
+
+
+def _begun(scene: PixelScene, options: CompactOptions, journal: Journal) -> _Work:
+    """The scene in its own frame, how good it is as it came, and its superpixels if they are to be cut to a number."""
+    target = options.target
+    if scene.images is None and target.searches:
+        raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
+    with journal.stage("prepare"):
+        canonical, frame = canonicalise(scene)
+        canvas = scene_canvas(canonical, options)
+        source = Source(canonical, scene_members(canonical))
+    before = None
+    if scene.images is not None:
+        with journal.stage("input"):
+            before = input_psnr(scene.gaussians, scene_photos(scene), NEAR * frame.unit)
+    plain = not target.searches and options.decode.k != "auto" and canvas.exact is None and canvas.usual <= canvas.most
+    tree = None
+    if not plain or target.levels > 1:
+        with journal.stage("segment"):
+            tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
+    return _Work(scene, frame, source, options, canvas, tree, before)
+
+
+def _decided(work: _Work, journal: Journal) -> int | None:
+    """The number of Gaussians, as the options and the scene's own curve have it; None: as density and K say."""
+    canvas, options, drop = work.canvas, work.options, work.options.target.max_drop
+    if drop is None and options.decode.k != "auto":
+        return canvas.exact if canvas.exact is not None else canvas.most if canvas.usual > canvas.most else None
+    assert work.tree is not None
+    if work.scene.images is None:
+        return knee_count(work.tree, canvas, options)
+    with journal.stage("curve"):
+        counts = rungs(AUTO_RUNGS if drop is None else RUNGS, canvas.usual, canvas.least, canvas.most)
+        points = measure_curve(work.source, canvas, work.tree, options, counts, journal)
+    count = curve_knee(points) if drop is None else count_within(points, drop)
+    journal.choices["curve"] = [asdict(point) for point in points]
+    return count
+
+
+def _searched(work: _Work, target: float, journal: Journal) -> CompactResult:
+    """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do."""
+    results: dict[int, CompactResult] = {}
+
+    def run(count: int) -> float:
+        own = Journal(journal.progress)
+        results[count] = _built(work, count, own)
+        return results[count].report.psnr_after or 0.0
+
+    most = min(work.canvas.most, MOST * work.canvas.usual)
+    search = search_count(run, target, min(work.canvas.usual, most), work.canvas.least, most)
+    result = results[search.count]
+    seconds = journal.seconds | {
+        name: sum(r.report.seconds.get(name, 0.0) for r in results.values()) + journal.seconds.get(name, 0.0)
+        for name in result.report.seconds
+    }
+    unmet = None
+    if not search.met:
+        unmet = (
+            f"target psnr: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
+            f" with {len(result.gaussians)} Gaussians"
+        )
+    choices = result.report.choices | {"search": asdict(search)}
+    return replace(result, report=replace(result.report, choices=choices, seconds=seconds, unmet=unmet))
+
+
+def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
+    """One result: cut to a number of Gaussians, or as density and K say, built, scored."""
+    options, canvas = work.options, work.canvas
+    with journal.stage("segment"):
+        if count is None:
+            grouping = group_scene(canvas, options)
+        else:
+            assert work.tree is not None
+            grouping = cut_scene(work.source.scene, canvas, work.tree, options, count)
+    gaussians = work.frame.leave(build(work.source, grouping, options, journal))
+    after = None
+    if work.scene.images is not None:
+        with journal.stage("score"):
+            after = input_psnr(gaussians, scene_photos(work.scene), NEAR * work.frame.unit)
+    counts = len(work.scene.gaussians), len(gaussians)
+    settings = options.to_dict() | {"fit_steps": options.fit.steps}
     report = CompactReport(
-        *counts, run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak_memory()
+        *counts, journal.seconds, work.before, after, journal.choices, journal.notes, settings, peak_memory()
     )
     return CompactResult(gaussians, report)
-
-
-def _merged_features(
-    scene: PixelScene, members: Members, grouping: Grouping, options: CompactOptions, run: _Run
-) -> FeatureGaussians:
-    """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
-    with run.stage("encode"):
-        features = encode(scene, members, grouping.groups, options.encode)
-    if not grouping.robust:
-        with run.stage("match"):
-            return _matched(features, options, run)
-    with run.stage("robust"):
-        coarse = grouping.coarse
-        backing = encode_backing(scene, members, coarse, options.backing) if coarse is not None else None
-        photos = scene_photos(scene, 2)
-        features, choice = choose_merge(features, backing, photos, options.robust)
-        run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
-    with run.stage("match"):
-        features, choice = close_holes(_matched(features, options, run), backing, photos, options.robust)
-        run.choices["closed"] = choice.name
-        return features
-
-
-def _filled(
-    features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
-) -> np.ndarray | None:
-    """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
-    if not grouping.exact or options.fit.grows:
-        return None
-    return split_counts(features, members, max(0, grouping.wanted - len(features)))
-
-
-def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> FeatureGaussians:
-    """Merged across views."""
-    matches = match(features, options.match)
-    run.choices["groups"], run.choices["clusters"] = len(features), matches.count
-    return merge(features, matches)
-
-
-def _fitted(
-    gaussians: Gaussians, scene: PixelScene, grouping: Grouping, options: CompactOptions, run: _Run
-) -> Gaussians:
-    """Gaussians that no photo shows left out, the rest fitted to the photos."""
-    photos = scene_photos(scene), scene_photos(scene, 2)
-    run.choices["begun_with"] = len(gaussians)
-    # where nothing grows to the number asked for, nothing may fall below it either
-    settings = replace(options.fit, prune=0.0) if grouping.exact and not options.fit.grows else options.fit
-    gaussians, report = fit(gaussians, photos, settings, grouping.wanted, options.seed, run.fit_progress)
-    if report:
-        run.choices["fit"] = asdict(report)
-        if not report.accepted:
-            run.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
-    return gaussians
 
 
 def input_psnr(gaussians: Gaussians, photos: Photos, near: float) -> float:

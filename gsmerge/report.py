@@ -54,6 +54,7 @@ def report_document(
     output_path: Path,
     seconds_before: Mapping[str, float],
     seconds_after: Mapping[str, float],
+    coarser: Sequence[tuple[Path, Any]] = (),
     recognised: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
     hashed: bool = True,
@@ -66,15 +67,17 @@ def report_document(
         output_path: The ``.ply`` that was written.
         seconds_before: Wall time by name of what came before the report's stages (imports, reading).
         seconds_after: The same for what came after them (writing).
+        coarser: File and :class:`gsmerge.CompactReport` of further levels of detail.
         recognised: What is known of the input beside path, bytes and count (layout, views, ...).
         notes: What the reader had to say; the report's own notes follow.
         hashed: Also hash the input, which takes time on large files.
 
     Returns:
-        ``schema_version`` 1: tool, input, output, ratio, options, seed, choices, seconds, psnr, memory, notes.
+        ``schema_version`` 1: tool, input, output, levels, ratio, options, seed, choices, seconds, psnr, memory, notes,
+        and ``unmet``: why a target is not met, or null.
         Keys are only ever added within one schema version.
     """
-    numbers = asdict(report) if is_dataclass(report) and not isinstance(report, type) else dict(report)
+    numbers = _numbers(report)
     stages = {**seconds_before, **numbers["seconds"], **seconds_after}
     return {
         **document_head(),
@@ -85,11 +88,8 @@ def report_document(
             "num_gaussians": numbers["num_input"],
             **(recognised or {}),
         },
-        "output": {
-            "path": os.fspath(output_path),
-            "bytes": output_path.stat().st_size,
-            "num_gaussians": numbers["num_output"],
-        },
+        "output": _written(output_path, numbers),
+        "levels": [_level(path, _numbers(level)) for path, level in coarser],
         "ratio": numbers["num_output"] / max(numbers["num_input"], 1),
         "options": numbers["options"],
         "seed": numbers["options"]["seed"],
@@ -99,6 +99,26 @@ def report_document(
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
+        "unmet": numbers["unmet"],
+    }
+
+
+def _numbers(report: Any) -> dict[str, Any]:
+    return asdict(report) if is_dataclass(report) and not isinstance(report, type) else dict(report)
+
+
+def _written(path: Path, numbers: Mapping[str, Any]) -> dict[str, Any]:
+    return {"path": os.fspath(path), "bytes": path.stat().st_size, "num_gaussians": numbers["num_output"]}
+
+
+def _level(path: Path, numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """What the report says of a further level of detail."""
+    return {
+        **_written(path, numbers),
+        "psnr_input_views": numbers["psnr_after"],
+        "seconds": round(sum(numbers["seconds"].values()), 4),
+        "choices": numbers["choices"],
+        "notes": numbers["notes"],
     }
 
 
@@ -117,8 +137,32 @@ def _finite(value: Any) -> Any:
     return value
 
 
+def summary_lines(document: Mapping[str, Any]) -> list[str]:
+    """What ``compact`` ends with: a line for the result, one for each further level, and the curve if measured."""
+    levels = [
+        f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
+        + (f"; input views {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
+        + f"; {level['seconds']:.1f} s"
+        for level in document["levels"]
+    ]
+    return [summary_line(document), *levels, *curve_lines(document["choices"].get("curve", []))]
+
+
+def curve_lines(points: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The scene's curve as a small table: what short fits reach on parts of the photos that they left out."""
+    if not points:
+        return []
+    perceptual = points[0]["lpips"] is not None
+    head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}" + ("  LPIPS (AlexNet)" if perceptual else "")
+    rows = [
+        f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}" + (f"  {p['lpips']:5.3f}" if perceptual else "")
+        for p in points
+    ]
+    return ["after short fits, on parts of the photos that they left out:", head, *rows]
+
+
 def summary_line(document: Mapping[str, Any]) -> str:
-    """The one line that ``compact`` ends with: counts, ratio, bytes, PSNR, seconds per stage."""
+    """The line of the result: counts, ratio, bytes, PSNR, seconds per stage."""
     before, after = document["input"], document["output"]
     psnr = document["psnr_input_views"]
     quality = (
@@ -152,6 +196,7 @@ def plan_document(
     per_view: int,
     photos: bool,
     threads: int,
+    fit_steps: int,
     wanted: int | None = None,
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
@@ -165,6 +210,7 @@ def plan_document(
         per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
+        fit_steps: Steps of the full fit.
         wanted: Gaussians that a budget or a file size asks for; None without either.
         notes: What the reader had to say.
 
@@ -178,7 +224,7 @@ def plan_document(
     robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
     work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
     work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
-    steps = options["fit_steps"] if fit == "full" else 0
+    steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
     children = 1 if options["k"] == "auto" else options["k"]
     at_most = per_view * views * children if wanted is None else wanted

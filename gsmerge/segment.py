@@ -24,8 +24,8 @@ from gsmerge.threads import parallel_map
 from gsmerge.types import Groups
 
 METHODS = ("rdseg", "bass", "bass-st", "slic")
-# Preset -> (rectangles per superpixel, sweeps before merging).
-PRESETS = {"fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
+# Effort -> (rectangles per superpixel, sweeps before merging).
+EFFORTS = {"fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
 NUM_SWEEPS = 2
 BLOCK = 32  # side of the squares that the cutting starts from, pixels
 PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
@@ -40,7 +40,7 @@ class SegmentOptions:
         superpixels: Superpixels of each view; None to take ``density`` of its pixels.
         density: Superpixels per pixel, in (0, 1].
         method: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
-        preset: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
+        effort: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
         compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
             [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
 
@@ -51,7 +51,7 @@ class SegmentOptions:
     superpixels: int | None = None
     density: float = 0.044
     method: str = "rdseg"
-    preset: str = "default"
+    effort: str = "default"
     compactness: float = 1e-5
 
     def __post_init__(self) -> None:
@@ -59,14 +59,14 @@ class SegmentOptions:
             raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
         if not 0 < self.density <= 1:
             raise ValueError(f"density: expected a number in (0, 1], got {self.density}")
-        _check_method(self.method, self.preset, self.compactness)
+        _check_method(self.method, self.effort, self.compactness)
 
 
-def _check_method(method: str, preset: str, compactness: float) -> None:
+def _check_method(method: str, effort: str, compactness: float) -> None:
     if method not in METHODS:
         raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
-    if preset not in PRESETS:
-        raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
+    if effort not in EFFORTS:
+        raise ValueError(f"effort: expected one of {', '.join(EFFORTS)}, got {effort!r}")
     if not 0 <= compactness <= 1:
         raise ValueError(f"compactness: expected a number in [0, 1], got {compactness}")
 
@@ -95,7 +95,7 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -
     wanted = count_for(options, height, width) if count is None else count
 
     def one_view(image: Tensor) -> Tensor:
-        return superpixels(image, wanted, options.method, preset=options.preset, compactness=options.compactness)
+        return superpixels(image, wanted, options.method, effort=options.effort, compactness=options.compactness)
 
     labels = parallel_map(one_view, images.unbind(0))
     stacked = torch.stack(labels) if labels else torch.empty((0, height, width), dtype=torch.int32)
@@ -107,7 +107,7 @@ def superpixels(
     count: int,
     method: str = "rdseg",
     *,
-    preset: str = "default",
+    effort: str = "default",
     compactness: float = 1e-5,
 ) -> Tensor:
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
@@ -116,7 +116,7 @@ def superpixels(
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
         count: Superpixels wanted, 1 to h·w.
         method: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
-        preset: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
+        effort: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the two BASS methods).
 
     Returns:
@@ -129,7 +129,7 @@ def superpixels(
         >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
         [[0, 0], [0, 0]]
     """
-    _check_method(method, preset, compactness)
+    _check_method(method, effort, compactness)
     pixels = _as_pixels(image)
     height, width, _ = pixels.shape
     if count < 1:
@@ -139,7 +139,7 @@ def superpixels(
             f"count: expected at most {height * width} superpixels ({width} x {height} pixels), got {count}"
         )
     if method == "rdseg":
-        labels = _rdseg(pixels, count, preset, compactness)
+        labels = _rdseg(pixels, count, effort, compactness)
     elif method == "slic":
         labels = _slic(pixels, count, compactness)
     else:
@@ -187,9 +187,9 @@ def _every_pixel(height: int, width: int) -> np.ndarray:
     return pad_labels(np.arange(height * width, dtype=np.int32).reshape(height, width))
 
 
-def _rdseg(pixels: np.ndarray, count: int, preset: str, compactness: float) -> np.ndarray:
+def _rdseg(pixels: np.ndarray, count: int, effort: str, compactness: float) -> np.ndarray:
     """Over-split, merge to the exact number, move border pixels; padded labels."""
-    rectangles_each, num_first_sweeps = PRESETS[preset]
+    rectangles_each, num_first_sweeps = EFFORTS[effort]
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
     wanted = int(rectangles_each * count)

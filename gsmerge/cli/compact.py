@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
-from gsmerge.cli.paths import check_output, default_output, input_files
+from gsmerge.cli.paths import check_output, default_output, input_files, level_output
 from gsmerge.cli.settings import superpixels_per_view, told_as_usage
+from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
     from gsmerge.io import SceneFiles, SceneLoad
@@ -29,15 +30,19 @@ def compact(
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
     method: opt.MethodOption = None,
-    preset: opt.PresetOption = None,
+    effort: opt.EffortOption = None,
     k: opt.KOption = None,
+    budget: opt.BudgetOption = None,
+    max_bytes: opt.MaxBytesOption = None,
+    preset: opt.PresetOption = None,
+    max_drop: opt.MaxDropOption = None,
+    target_psnr: opt.TargetPsnrOption = None,
+    levels: opt.LevelsOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
     fit: opt.FitOption = None,
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
-    budget: opt.BudgetOption = None,
-    max_bytes: opt.MaxBytesOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -55,18 +60,21 @@ def compact(
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
     inputs = input_files(files)
-    check_output(out, inputs, overwrite=overwrite)
+    outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
+    for path in outputs:
+        check_output(path, inputs, overwrite=overwrite)
     if report is not None:
-        check_output(report, (*inputs, out), overwrite=overwrite)
+        check_output(report, (*inputs, *outputs), overwrite=overwrite)
     chosen: dict[str, Any] = {
         "k": k,
         "superpixels": superpixels,
         "density": density,
         "method": method,
-        "preset": preset,
+        "effort": effort,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
-    chosen |= {"budget": budget, "max_bytes": max_bytes, "seed": seed, "threads": threads}
+    chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
+    chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads}
     settings = _settings(chosen)
     if dry_run:
         _print_plan(files, settings, out, opacity=opacity.value, as_json=json)
@@ -76,6 +84,8 @@ def compact(
         hashed=json or report is not None,
     )  # fmt: skip
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
+    if document["unmet"]:
+        raise TargetError(document["unmet"])
 
 
 def _settings(chosen: Mapping[str, Any]) -> CompactOptions:
@@ -122,12 +132,17 @@ def _run(
             result = pipeline.compact(loaded.scene, settings, progress=moved)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
+    coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
+    for path, level in coarser:
+        with atomic_output(path, overwrite=overwrite) as temporary:
+            write_ply(temporary, level.gaussians, overwrite=True)
     return report_document(
         result.report,
         input_path=files.ply,
         output_path=out,
         seconds_before={"import": imported - start, "read": read - imported},
         seconds_after={"write": perf_counter() - compacted},
+        coarser=[(path, level.report) for path, level in coarser],
         recognised=_recognised(loaded),
         notes=loaded.notes,
         hashed=hashed,
@@ -145,7 +160,7 @@ def _recognised(loaded: SceneLoad) -> dict[str, Any]:
 def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, quiet: bool, overwrite: bool) -> None:
     """The report where it was asked for: file, stdout, or one line."""
     from gsmerge.io import atomic_output
-    from gsmerge.report import summary_line, to_json
+    from gsmerge.report import summary_lines, to_json
 
     say_notes(document["notes"], quiet=quiet or as_json)
     if report is not None:
@@ -154,7 +169,7 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        print(summary_line(document))
+        print("\n".join(summary_lines(document)))
 
 
 def _print_plan(
@@ -174,6 +189,7 @@ def _print_plan(
         per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height),
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
+        fit_steps=settings.fit.steps,
         wanted=_wanted(scene, settings),
         notes=loaded.notes,
     )
@@ -185,7 +201,10 @@ def _print_plan(
 
 def _wanted(scene: PixelScene, settings: CompactOptions) -> int | None:
     """Gaussians that a budget or a file size asks for, refused as wrong usage where that cannot be."""
-    from gsmerge.grouping import target_count
+    from gsmerge.grouping import scene_canvas
 
     with told_as_usage():
-        return target_count(scene, settings)
+        canvas = scene_canvas(scene, settings)
+    if canvas.exact is None and canvas.usual <= canvas.most:
+        return None
+    return canvas.exact or canvas.most

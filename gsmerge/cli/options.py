@@ -12,7 +12,13 @@ from typing import Annotated
 
 import typer
 
-INPUT, SEGMENTATION, MERGING, OUTPUT = "Input", "Superpixels", "Merging and colours", "Output and behaviour"
+INPUT, SEGMENTATION, COUNT, MERGING, OUTPUT = (
+    "Input",
+    "Superpixels",
+    "How many Gaussians",
+    "Merging and colours",
+    "Output and behaviour",
+)
 
 
 class Method(str, Enum):
@@ -24,12 +30,20 @@ class Method(str, Enum):
     slic = "slic"
 
 
-class Preset(str, Enum):
-    """Presets of the default superpixel method."""
+class Effort(str, Enum):
+    """How much work to put in."""
 
     fast = "fast"
     default = "default"
     best = "best"
+
+
+class Preset(str, Enum):
+    """Devices and the most Gaussians that they draw fluidly."""
+
+    quest3 = "quest3"
+    mobile = "mobile"
+    desktop = "desktop"
 
 
 class Match(str, Enum):
@@ -104,9 +118,11 @@ MethodOption = Annotated[
     Method | None,
     typer.Option(help="Superpixel method.", show_default="rdseg", rich_help_panel=SEGMENTATION),
 ]
-PresetOption = Annotated[
-    Preset | None,
-    typer.Option(help="Effort of rdseg.", show_default="default", rich_help_panel=SEGMENTATION),
+EffortOption = Annotated[
+    Effort | None,
+    typer.Option(
+        help="How much work to put into superpixels and fit.", show_default="default", rich_help_panel=SEGMENTATION
+    ),
 ]
 
 
@@ -127,19 +143,45 @@ KOption = Annotated[
         metavar="[1-8|auto]",
         help="Gaussians per superpixel: finer with more. auto: as many as the scene needs.",
         show_default="1",
-        rich_help_panel=MERGING,
+        rich_help_panel=COUNT,
     ),
 ]
 BudgetOption = Annotated[
     str | None,
-    typer.Option(help='Gaussians in the result, such as 40000 or "2%"; met exactly.', rich_help_panel=MERGING),
+    typer.Option(help='Gaussians in the result, such as 40000 or "2%"; met exactly.', rich_help_panel=COUNT),
 ]
 MaxBytesOption = Annotated[
-    str | None, typer.Option(help="Largest size of the result, such as 5MB.", rich_help_panel=MERGING)
+    str | None, typer.Option(help="Largest size of the result, such as 5MB.", rich_help_panel=COUNT)
+]
+PresetOption = Annotated[
+    Preset | None,
+    typer.Option(help="At most as many Gaussians as this device draws fluidly.", rich_help_panel=COUNT),
+]
+MaxDropOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0, help="Fewest Gaussians within so many dB of the best that the scene reaches.", rich_help_panel=COUNT
+    ),
+]
+TargetPsnrOption = Annotated[
+    float | None,
+    typer.Option(min=0.0, help="Fewest Gaussians that render the input images at so many dB.", rich_help_panel=COUNT),
+]
+LevelsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=8,
+        help="Levels of detail, each in a file of its own, with a quarter of the Gaussians of the one before.",
+        show_default="1",
+        rich_help_panel=COUNT,
+    ),
 ]
 FitStepsOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Steps of the full fit: more takes longer.", show_default="200", rich_help_panel=MERGING),
+    typer.Option(
+        min=1, help="Steps of the full fit: more takes longer.", show_default="by effort", rich_help_panel=MERGING
+    ),
 ]
 TimeBudgetOption = Annotated[
     float | None, typer.Option(min=0.0, help="Seconds that the full fit may take.", rich_help_panel=MERGING)

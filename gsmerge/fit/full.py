@@ -48,7 +48,7 @@ class Plan:
 def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int) -> Plan:
     """Held-out blocks, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
-    few = len(photos[0]) <= FEW_VIEWS and options.fit_steps >= MANY_STEPS
+    few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     dropout = options.dropout if options.dropout is not None else DROPOUT if few else 0.0
     return Plan(photos, (full, reduced(full, photos[1])), options, dropout)
 
@@ -128,7 +128,7 @@ def fit_full(
     before = after = holdout_score(state, plan)
     queue: list[int] = []
     grows = options.grows
-    step, steps, started, error, judged = 0, options.fit_steps, time.perf_counter(), 0.0, False
+    step, steps, started, error, judged = 0, options.steps, time.perf_counter(), 0.0, False
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:

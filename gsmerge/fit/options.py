@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 Fit = Literal["none", "color", "full"]
+STEPS = {"fast": 30, "default": 200, "best": 500}  # of the full fit, by effort
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -46,7 +47,8 @@ class FitOptions:
 
     Args:
         fit: ``"full"``: all parameters; ``"color"``: the base colours; ``"none"``: nothing.
-        fit_steps: Steps of the full fit, one view each.
+        effort: ``"fast"``, ``"default"`` or ``"best"``: what ``fit_steps`` are unless given.
+        fit_steps: Steps of the full fit, one view each; None: by effort.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
@@ -68,7 +70,8 @@ class FitOptions:
     """
 
     fit: Fit = "full"
-    fit_steps: int = 200
+    effort: str = "default"
+    fit_steps: int | None = None
     time_budget: float | None = None
     dropout: float | None = None
     coarse: float = 0.7
@@ -83,18 +86,26 @@ class FitOptions:
     prune: float = 1 / 255
 
     @property
+    def steps(self) -> int:
+        """Steps of the full fit."""
+        return STEPS[self.effort] if self.fit_steps is None else self.fit_steps
+
+    @property
     def grows(self) -> bool:
         """Whether the fit begins with fewer Gaussians than are asked for, and adds the rest on the way."""
-        return self.fit == "full" and self.fit_steps >= GROW_STEPS
+        return self.fit == "full" and self.steps >= GROW_STEPS
 
     def __post_init__(self) -> None:
         if isinstance(self.rates, dict):  # as CompactOptions.to_dict() and JSON have it
             object.__setattr__(self, "rates", Rates(**self.rates))
         if self.fit not in ("none", "color", "full"):
             raise ValueError(f'fit: expected "none", "color" or "full", got "{self.fit}"')
-        for name in ("fit_steps", "iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.effort not in STEPS:
+            raise ValueError(f"effort: expected one of {', '.join(STEPS)}, got {self.effort!r}")
+        if self.steps < 1:
+            raise ValueError(f"fit_steps: expected at least 1, got {self.steps}")
+        if self.iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
         if not self.pull >= 0:
             raise ValueError(f"pull: expected at least 0, got {self.pull}")
         if not 0 < self.holdout < 1:

@@ -77,9 +77,11 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
 def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
-    assert set(told) == {"k", "density", "method", "preset", "robust", "match", "fit", "fit_steps", "seed"}
+    assert set(told) == {"k", "density", "method", "effort", "robust", "match", "fit", "fit_steps", "seed", "levels"}
     assert library["robust"] is None
-    real = {name: "unless --fit full" if name == "robust" else str(library[name]) for name in told}
+    assert library["fit_steps"] is None
+    worded = {"robust": "unless --fit full", "fit_steps": "by effort"}
+    real = {name: worded.get(name, str(library[name])) for name in told}
     assert told == real
 
 

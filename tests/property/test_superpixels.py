@@ -49,12 +49,12 @@ def counts_of(num_pixels: int) -> list[int]:
 
 
 @pytest.mark.parametrize("picture", PICTURES)
-@pytest.mark.parametrize(("method", "preset"), [*METHODS, ("slic", "default")])
-def test_exact_count_in_one_piece_each(picture: str, method: str, preset: str) -> None:
+@pytest.mark.parametrize(("method", "effort"), [*METHODS, ("slic", "default")])
+def test_exact_count_in_one_piece_each(picture: str, method: str, effort: str) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for count in counts_of(height * width):
-        labels = superpixels(image, count, method, preset=preset)
+        labels = superpixels(image, count, method, effort=effort)
         assert_partition(labels, height, width, count)
 
 
@@ -81,11 +81,11 @@ def test_any_size(height: int, width: int, share: float, colours: int, kind: tup
     """Few colours make ties; sizes down to one pixel."""
     image = np.random.default_rng(seed).integers(0, colours, (height, width, 3)) / max(colours - 1, 1)
     count = 1 + int(share * (height * width - 1))
-    assert_partition(superpixels(image, count, kind[0], preset=kind[1]), height, width, count)
+    assert_partition(superpixels(image, count, kind[0], effort=kind[1]), height, width, count)
 
 
-@pytest.mark.parametrize(("method", "preset"), [*METHODS, ("slic", "default")])
-def test_a_run_repeats(method: str, preset: str) -> None:
+@pytest.mark.parametrize(("method", "effort"), [*METHODS, ("slic", "default")])
+def test_a_run_repeats(method: str, effort: str) -> None:
     image = PICTURES["noise"]
-    first = superpixels(image, 80, method, preset=preset)
-    assert torch.equal(first, superpixels(image.copy(), 80, method, preset=preset))
+    first = superpixels(image, 80, method, effort=effort)
+    assert torch.equal(first, superpixels(image.copy(), 80, method, effort=effort))

@@ -78,6 +78,6 @@ def test_presets_trade_time_for_quality() -> None:
     image = photos()["china"]
     count = count_at(image, 12_000)
     scores = [
-        proxy_psnr(image, superpixels(image, count, preset=preset).numpy()) for preset in ("fast", "default", "best")
+        proxy_psnr(image, superpixels(image, count, effort=effort).numpy()) for effort in ("fast", "default", "best")
     ]
     assert scores == sorted(scores)

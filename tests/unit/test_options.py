@@ -14,8 +14,15 @@ def test_flat_names_are_unique() -> None:
     options = CompactOptions()
     names = [f.name for stage in STAGES for f in fields(getattr(options, stage))]
     names += [f.name for f in fields(options) if f.name not in STAGES]
-    assert len(names) == len(set(names))
-    assert sorted(options.to_dict()) == sorted(names)
+    assert {name for name in names if names.count(name) > 1} == {"effort"}  # shared on purpose
+    assert sorted(options.to_dict()) == sorted(set(names))
+
+
+def test_a_shared_name_reaches_every_stage_that_has_it() -> None:
+    options = CompactOptions().with_settings({"effort": "fast"})
+    assert options.segment.effort == options.fit.effort == "fast"
+    assert options.fit.steps < CompactOptions().fit.steps
+    assert options.with_settings({"fit_steps": 77}).fit.steps == 77
 
 
 def test_settings_reach_their_stage() -> None:
@@ -62,7 +69,7 @@ def test_every_setting_is_documented(stage: str) -> None:
     "setting",
     [
         {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5}, {"method": "voronoi"},
-        {"preset": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
+        {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
         {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
         {"min_opacity": -1.0}, {"rounds": -1}, {"tolerance": 0.0}, {"overlap": float("nan")}, {"boost": 0.0},

@@ -80,6 +80,7 @@ def plan(*, photos: bool = True, views: int = 12, wanted: int | None = None, **s
         per_view=800,
         photos=photos,
         threads=2,
+        fit_steps=options.fit.steps,
         wanted=wanted,
     )
 

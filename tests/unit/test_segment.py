@@ -75,7 +75,7 @@ def test_image_is_checked(image: np.ndarray, message: str) -> None:
     ("options", "message"),
     [
         ({"method": "watershed"}, "method: expected one of rdseg, bass, bass-st, slic, got 'watershed'"),
-        ({"preset": "slow"}, "preset: expected one of fast, default, best, got 'slow'"),
+        ({"effort": "slow"}, "effort: expected one of fast, default, best, got 'slow'"),
         ({"compactness": -1.0}, r"compactness: expected a number in \[0, 1\], got -1.0"),
         ({"compactness": float("nan")}, "compactness: expected a number"),
     ],

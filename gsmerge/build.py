@@ -1,0 +1,110 @@
+"""groups -> fitted gaussians: the stages between a choice of superpixels and the finished Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from gsmerge.allocate import split_counts
+from gsmerge.backing import encode_backing
+from gsmerge.decode import decode
+from gsmerge.encode import encode
+from gsmerge.fit import fit
+from gsmerge.grouping import Grouping
+from gsmerge.journal import Journal
+from gsmerge.match import match
+from gsmerge.merge import merge
+from gsmerge.moments import Members
+from gsmerge.options import CompactOptions
+from gsmerge.photos import scene_photos
+from gsmerge.robust import choose_merge, close_holes
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What Gaussians are built from.
+
+    Args:
+        scene: The canonical scene.
+        members: Its Gaussians as members of groups.
+    """
+
+    scene: PixelScene
+    members: Members
+
+
+def build(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Gaussians:
+    """The Gaussians of some superpixels: encoded, merged across views, decoded, fitted to the photos.
+
+    Args:
+        source: Scene and members.
+        grouping: Superpixels, and the number of Gaussians that they are to become.
+        options: All settings.
+        journal: Told what is done.
+
+    Returns:
+        Canonical Gaussians.
+    """
+    features = _merged_features(source, grouping, options, journal)
+    with journal.stage("decode"):
+        children = _filled(features, source.members, grouping, options)
+        gaussians = decode(features, source.members, options.decode, children, options.encode.rule)
+    del features
+    if source.scene.images is None:
+        return gaussians
+    with journal.stage("fit"):
+        return _fitted(gaussians, source.scene, grouping, options, journal)
+
+
+def _merged_features(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> FeatureGaussians:
+    """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
+    scene, members = source.scene, source.members
+    with journal.stage("encode"):
+        features = encode(scene, members, grouping.groups, options.encode)
+    if not grouping.robust:
+        with journal.stage("match"):
+            return _matched(features, options, journal)
+    with journal.stage("robust"):
+        coarse = grouping.coarse
+        backing = encode_backing(scene, members, coarse, options.backing) if coarse is not None else None
+        photos = scene_photos(scene, 2)
+        features, choice = choose_merge(features, backing, photos, options.robust)
+        journal.choices["merge"], journal.choices["merge_scores"] = choice.name, choice.scores
+    with journal.stage("match"):
+        features, choice = close_holes(_matched(features, options, journal), backing, photos, options.robust)
+        journal.choices["closed"] = choice.name
+        return features
+
+
+def _filled(
+    features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
+) -> np.ndarray | None:
+    """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
+    if not grouping.exact or options.fit.grows:
+        return None
+    return split_counts(features, members, max(0, grouping.wanted - len(features)))
+
+
+def _matched(features: FeatureGaussians, options: CompactOptions, journal: Journal) -> FeatureGaussians:
+    """Merged across views."""
+    matches = match(features, options.match)
+    journal.choices["groups"], journal.choices["clusters"] = len(features), matches.count
+    return merge(features, matches)
+
+
+def _fitted(
+    gaussians: Gaussians, scene: PixelScene, grouping: Grouping, options: CompactOptions, journal: Journal
+) -> Gaussians:
+    """Gaussians that no photo shows left out, the rest fitted to the photos."""
+    photos = scene_photos(scene), scene_photos(scene, 2)
+    journal.choices["begun_with"] = len(gaussians)
+    # where nothing grows to the number asked for, nothing may fall below it either
+    settings = replace(options.fit, prune=0.0) if grouping.exact and not options.fit.grows else options.fit
+    gaussians, report = fit(gaussians, photos, settings, grouping.wanted, options.seed, journal.fit_progress)
+    if report:
+        journal.choices["fit"] = asdict(report)
+        if not report.accepted:
+            journal.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+    return gaussians

@@ -1,0 +1,100 @@
+"""Quality targets, devices and levels of detail, from the command line and from Python."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import scenes
+
+from gsmerge import PixelScene, compact, read_ply
+from gsmerge.errors import UsageError
+
+from .conftest import Run
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01)
+
+
+def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "chain.ply"
+    told = run("compact", made_scene, "-o", out, "--levels", 3, "--fit-steps", 20, "--superpixels", 300, "--json")
+    assert told.code == 0, told.err
+    document = json.loads(told.out)
+    paths = [out, tmp_path / "chain.level1.ply", tmp_path / "chain.level2.ply"]
+    counts = [len(read_ply(path).gaussians) for path in paths]
+    assert counts[1:] == [counts[0] // 4, counts[0] // 16]
+    assert [level["num_gaussians"] for level in document["levels"]] == counts[1:]
+    assert [level["path"] for level in document["levels"]] == [str(path) for path in paths[1:]]
+    assert all(level["choices"]["fit"]["method"] == "full" for level in document["levels"])
+    psnrs = [document["psnr_input_views"]["after"], *(level["psnr_input_views"] for level in document["levels"])]
+    assert psnrs == sorted(psnrs, reverse=True)
+
+
+def test_no_level_replaces_a_file(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "chain.level2.ply").write_text("mine")
+    told = run("compact", made_scene, "-o", tmp_path / "chain.ply", "--levels", 3)
+    assert told.code == 2
+    assert "chain.level2.ply: exists already" in told.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.level2.ply"]
+
+
+def test_the_finest_level_is_the_result_without_levels(scene: PixelScene) -> None:
+    alone, chain = compact(scene, fit_steps=12), compact(scene, fit_steps=12, levels=2)
+    assert scenes.identical(alone.gaussians, chain.gaussians)
+    assert len(chain.coarser) == 1
+    assert alone.coarser == ()
+
+
+def test_target_psnr_is_met_with_few(scene: PixelScene) -> None:
+    usual = compact(scene, fit_steps=20)
+    assert usual.report.psnr_after is not None
+    wanted = usual.report.psnr_after - 1
+    found = compact(scene, fit_steps=20, target_psnr=wanted)
+    assert found.report.unmet is None
+    assert found.report.psnr_after is not None
+    assert found.report.psnr_after >= wanted
+    assert len(found.gaussians) < len(usual.gaussians)
+    assert found.report.choices["search"]["met"]
+
+
+def test_a_target_out_of_reach_ends_with_4(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "best.ply"
+    told = run("compact", made_scene, "-o", out, "--target-psnr", 90, "--fit-steps", 8, "--max-bytes", "20KB")
+    assert told.code == 4
+    assert "target psnr: 90 dB was asked for, the input views reach" in told.err
+    assert len(read_ply(out).gaussians) > 0
+    assert out.stat().st_size <= 20_000
+    assert str(out) in told.out
+
+
+def test_max_drop_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
+    few, many = (compact(scene, fit_steps=12, max_drop=drop) for drop in (3.0, 0.0))
+    assert len(few.gaussians) < len(many.gaussians)
+    curve = many.report.choices["curve"]
+    assert [point["count"] for point in curve] == sorted(point["count"] for point in curve)
+    assert all(0 < point["psnr"] < 60 and 0 < point["ssim"] <= 1 for point in curve)
+
+
+def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    told = run("compact", made_scene, "-o", tmp_path / "a.ply", "--k", "auto", "--fit-steps", 12)
+    assert told.code == 0, told.err
+    lines = told.out.splitlines()
+    assert "PSNR" in lines[2]
+    assert len(lines) == 7
+
+
+def test_a_device_is_a_limit(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert scenes.identical(compact(scene, fit="none", preset="quest3").gaussians, compact(scene, fit="none").gaussians)
+    monkeypatch.setitem(__import__("gsmerge.allocate").allocate.PRESETS, "quest3", 200)
+    assert len(compact(scene, fit_steps=12, preset="quest3").gaussians) == 200
+
+
+@pytest.mark.parametrize("settings", [{"max_drop": 0.2}, {"target_psnr": 30.0}])
+def test_quality_needs_photos(scene: PixelScene, settings: dict[str, float]) -> None:
+    with pytest.raises(UsageError, match="needs photos"):
+        compact(replace(scene, images=None), **settings)
