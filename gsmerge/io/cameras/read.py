@@ -11,13 +11,17 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
 from gsmerge.io.cameras.da3 import read_da3
 from gsmerge.io.cameras.inria import read_inria
+from gsmerge.io.cameras.long_lrm import read_long_lrm
+from gsmerge.io.cameras.trajectory import is_trajectory, read_trajectory
 from gsmerge.io.cameras.transforms import read_transforms
+from gsmerge.io.cameras.world_mirror import read_world_mirror
 
 # Where cameras lie beside a scene, the first that exists wins; a COLMAP model right in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
     "transforms.json",
     "cameras.json",
+    "camera_params.json",
     "sparse/0",
     "sparse",
     "colmap/sparse/0",
@@ -25,6 +29,7 @@ CAMERA_PLACES = (
     "exports/npz/results.npz",
     "exports/mini_npz/results.npz",
     "results.npz",
+    "camera_poses.txt",
     "0",
     ".",
 )
@@ -42,8 +47,9 @@ def find_cameras(folder: Path) -> Path | None:
 def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
-    ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``, and
-    ``results.npz`` of Depth Anything 3. Poses become world-to-camera with OpenCV axes.
+    ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,
+    ``results.npz`` of Depth Anything 3, ``camera_params.json`` of WorldMirror, the dataset file of Long-LRM, and text
+    files with one pose per line. Poses become world-to-camera with OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
@@ -62,6 +68,8 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
     if path.is_dir():
         return read_colmap(path)
     if path.suffix in (".bin", ".txt"):
+        if is_trajectory(path):
+            return read_trajectory(path)
         if not is_colmap(path.parent):
             raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
         return read_colmap(path.parent)
@@ -80,10 +88,15 @@ def _read_json(path: Path) -> CameraFile:
     except ValueError as error:
         raise SceneError(path, f"expected JSON, found something else ({error})") from error
     if isinstance(data, dict) and "frames" in data:
+        frames = data["frames"]
+        if isinstance(frames, list) and frames and all(isinstance(f, dict) and "w2c" in f for f in frames):
+            return read_long_lrm(path, data)
         return read_transforms(path, data)
     if isinstance(data, list) and data and all(isinstance(entry, dict) for entry in data):
         if "transform_matrix" in data[0]:
             return read_transforms(path, data)
         if "position" in data[0] or "rotation" in data[0]:
             return read_inria(path, data)
+    if isinstance(data, dict) and {"extrinsics", "intrinsics"} <= data.keys():
+        return read_world_mirror(path, data)
     raise SceneError(path, "expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither")

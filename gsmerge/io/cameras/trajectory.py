@@ -1,0 +1,66 @@
+"""Text files with one pose per line, as KITTI and the streaming mode of Depth Anything 3 write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, CameraFile, make_camera_file
+
+INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
+MAX_VIEWS = 1_000_000
+
+
+def read_trajectory(path: Path) -> CameraFile:
+    """Cameras of a text file with 12 or 16 numbers a line: camera-to-world, OpenCV axes, row by row.
+
+    Beside it lies ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or
+    one for each. The images have the size.
+
+    Raises:
+        SceneError: If a line has another number of numbers, or there are no intrinsics.
+    """
+    rows = _rows(path, (12, 16))
+    poses = [row.reshape(-1, 4) for row in rows]
+    beside = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
+    if beside is None:
+        raise SceneError(path, f"expected the intrinsics beside it in {INTRINSICS[0]}, found none", "write fx fy cx cy")
+    values = _rows(beside, (4,))
+    if len(values) not in (1, len(poses)):
+        raise SceneError(beside, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
+    Ks = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in values]
+    Ks = Ks * len(poses) if len(Ks) == 1 else Ks
+    names = [f"{view:06d}" for view in range(len(poses))]
+    return make_camera_file(path, "pose list", C2W_OPENCV, poses, Ks, [(0, 0)] * len(poses), names)
+
+
+def is_trajectory(path: Path) -> bool:
+    """Whether the first line holds 12 or 16 numbers."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            first = file.readline(4096).replace(",", " ").split()
+        return len(np.array(first, np.float64)) in (12, 16)
+    except (OSError, ValueError):
+        return False
+
+
+def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
+    rows = []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        raise SceneError(path, f"cannot be read as text ({error})") from error
+    for number, line in enumerate(lines[: MAX_VIEWS + 1], 1):
+        if not line.strip():
+            continue
+        try:
+            row = np.array(line.replace(",", " ").split(), np.float64)
+        except ValueError as error:
+            raise SceneError(path, f"line {number}: expected numbers ({error})") from error
+        if len(row) not in lengths:
+            wanted = " or ".join(map(str, lengths))
+            raise SceneError(path, f"line {number}: expected {wanted} numbers, found {len(row)}")
+        rows.append(row)
+    return rows
