@@ -41,6 +41,7 @@ def compact(
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
     fit: opt.FitOption = None,
+    device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
     output: opt.OutputOption = None,
@@ -67,6 +68,7 @@ def compact(
         check_output(report, (*inputs, *outputs), overwrite=overwrite)
     chosen: dict[str, Any] = {
         "k": k,
+        "device": device,
         "superpixels": superpixels,
         "density": density,
         "method": method,

@@ -62,6 +62,14 @@ class Fit(str, Enum):
     none = "none"
 
 
+class Device(str, Enum):
+    """Where the full fit runs."""
+
+    cpu = "cpu"
+    cuda = "cuda"
+    auto = "auto"
+
+
 class Opacity(str, Enum):
     """How the file stores opacity."""
 
@@ -185,6 +193,14 @@ FitStepsOption = Annotated[
 ]
 TimeBudgetOption = Annotated[
     float | None, typer.Option(min=0.0, help="Seconds that the full fit may take.", rich_help_panel=MERGING)
+]
+DeviceOption = Annotated[
+    Device | None,
+    typer.Option(
+        help="Where the full fit runs; cuda needs gsmerge[cuda]. auto: a GPU where there is one.",
+        show_default="cpu",
+        rich_help_panel=MERGING,
+    ),
 ]
 RobustOption = Annotated[
     bool | None,

@@ -85,6 +85,22 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     return float(error.sum(dtype=np.float64) / max(3 * weight.sum(), 1))
 
 
+@dataclass(frozen=True)
+class Engine:
+    """What a run steps with.
+
+    Args:
+        step: One step on one view, as :func:`fit_step`, which may leave the state's arrays behind.
+        settle: Brings the state's arrays up to date, before anything else looks at them.
+    """
+
+    step: Callable[[State, Plan, int, int, float, np.random.Generator], float]
+    settle: Callable[[State], None]
+
+
+KERNELS = Engine(fit_step, lambda state: None)
+
+
 def step_sizes(rates: Rates, progress: float) -> np.ndarray:
     """Step of each of the fourteen columns at a point of the run, decaying geometrically."""
     columns = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
@@ -110,6 +126,7 @@ def fit_full(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
+    engine: Engine = KERNELS,
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
@@ -123,6 +140,7 @@ def fit_full(
         count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
         seed: Order of the views, backgrounds, dropout, held-out blocks.
         progress: Told after every step.
+        engine: What it steps with.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
     before = after = holdout_score(state, plan)
@@ -132,19 +150,22 @@ def fit_full(
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
+            engine.settle(state)
             state = grow_to(state, photos[1], count)
         if part >= options.coarse and not judged:
+            engine.settle(state)
             after, judged = holdout_score(state, plan), True
             if after <= before:
                 break
         if not queue:
             queue = rng.permutation(len(photos[0])).tolist()
-        error += (fit_step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
+        error += (engine.step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
         step += 1
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, plan)
         if progress:
             progress(step, steps, -10 * np.log10(max(error, 1e-12)), after)
+    engine.settle(state)
     after = after if judged else holdout_score(state, plan)
     if after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
 STEPS = {"fast": 30, "default": 200, "best": 500}  # of the full fit, by effort
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
@@ -64,9 +65,11 @@ class FitOptions:
         max_gain: Largest exposure factor that is believed.
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         prune: Leave out Gaussians that contribute less than this to every pixel of every photo that they lie in.
+        device: Where the full fit's steps run: ``"cpu"``; ``"cuda"``, through gsplat, whose sums have no fixed order,
+            so that runs differ in the last bits; ``"auto"``: CUDA where it can be used, resolved at once.
 
     Raises:
-        ValueError: If a setting is unknown or out of range.
+        ValueError: If a setting is unknown or out of range, or CUDA is asked for and cannot be used.
     """
 
     fit: Fit = "full"
@@ -84,6 +87,7 @@ class FitOptions:
     max_gain: float = 2.0
     holdout: float = 0.05
     prune: float = 1 / 255
+    device: Device = "cpu"
 
     @property
     def steps(self) -> int:
@@ -122,3 +126,9 @@ class FitOptions:
             raise ValueError(f"dropout: expected a number from 0 to below 1, got {self.dropout}")
         if self.time_budget is not None and not self.time_budget > 0:
             raise ValueError(f"time_budget: expected more than 0 seconds, got {self.time_budget}")
+        if self.device not in ("cpu", "cuda", "auto"):
+            raise ValueError(f'device: expected "cpu", "cuda" or "auto", got "{self.device}"')
+        if self.device != "cpu":
+            from gsmerge.render.cuda import usable_device
+
+            object.__setattr__(self, "device", usable_device(self.device))

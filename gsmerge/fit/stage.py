@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gsmerge.fit.color import draw, fit_colors, seen
+from gsmerge.fit.device import engine_for
 from gsmerge.fit.full import Progress, fit_full
 from gsmerge.fit.grow import grow_to
 from gsmerge.fit.options import FitOptions
@@ -43,7 +44,7 @@ def fit(
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, count, seed, progress)
+        fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device))
         if report.accepted:
             return fitted, report
         if options.grows:  # the stages before left room for a growth that did not happen

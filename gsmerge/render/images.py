@@ -72,6 +72,19 @@ def draw_views(
     )
 
 
+def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device:
+    """The device of all tensors.
+
+    Raises:
+        ValueError: If there are several.
+    """
+    devices = {tensor.device for tensor in (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)}
+    if len(devices) > 1:
+        named = " and ".join(sorted(map(str, devices)))
+        raise ValueError(f"expected Gaussians and cameras on one device, got {named}; move them with .to(device)")
+    return devices.pop()
+
+
 def render(
     gaussians: Gaussians,
     cameras: Cameras,
@@ -83,6 +96,9 @@ def render(
     with_depths: bool = False,
 ) -> Rendering:
     """Render Gaussians into every camera.
+
+    CUDA tensors are rendered by gsplat (``pip install "gsmerge[cuda]"``), and the results are on their device; all
+    others on the CPU. How the two differ: :mod:`gsmerge.render.cuda`.
 
     Images and alphas are differentiable with respect to every tensor of the Gaussians and the view matrices, where
     autograd is on and one of them asks for it; depths and intrinsics are not. No gradient passes where alpha is
@@ -101,9 +117,16 @@ def render(
         Images, alphas and, if asked for, depths.
 
     Raises:
-        ValueError: If the background or the depth range makes no sense.
+        ValueError: If the background or the depth range makes no sense, or the tensors are on several devices.
+        GsmergeError: If CUDA tensors are given and gsplat is not installed.
     """
-    under = background_color(background)
+    under = background_color(background.detach().cpu() if isinstance(background, Tensor) else background)
+    if one_device(gaussians, cameras).type == "cuda":
+        from gsmerge.render.cuda import render_cuda
+
+        return render_cuda(
+            gaussians, cameras, under, antialiased=antialiased, near=near, far=far, with_depths=with_depths
+        )
     inputs = (*vars(gaussians).values(), cameras.viewmats)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         from gsmerge.render.autograd import render_differentiable  # compiled only for those who train

@@ -18,6 +18,7 @@ from gsmerge.types import Gaussians
 Array = NDArray[Any]
 
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
+EPS2D = 0.3  # dilation of the footprints, pixels squared
 MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are kept in 16 bits
 
 
@@ -210,6 +211,16 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
 
 
+def check_range(near: float, far: float, eps2d: float) -> None:
+    """Refuse a depth range or a dilation that makes no sense.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    if not (0 < near < far and eps2d >= 0):
+        raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
+
+
 def plan_view(
     splats: Splats,
     viewmat: ArrayLike,
@@ -217,7 +228,7 @@ def plan_view(
     width: int,
     height: int,
     *,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     antialiased: bool = False,
     near: float = 0.01,
     far: float = 1e10,
@@ -247,8 +258,7 @@ def plan_view(
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)
-    if not (0 < near < far and eps2d >= 0):
-        raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
+    check_range(near, far, eps2d)
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
     keep = np.empty(0, np.uint8) if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
     if opacities.shape != (len(splats),) or len(keep) not in (0, len(splats)):

@@ -60,3 +60,15 @@ def test_failures_while_writing_leave_nothing(scene_copy: Path, run: Run, monkey
     assert "scene.compact.ply" in outcome.err
     assert "No space left" in outcome.err
     assert listing(scene_copy) == before
+
+
+def test_a_gpu_that_is_not_there_is_wrong_usage(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Told before any work; ``auto`` takes the CPU, and says so in the report."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    outcome = run("compact", scene_copy, "--device", "cuda")
+    assert outcome.code == 2
+    assert outcome.err.count("\n") == 1
+    assert 'device: expected "cpu" or a CUDA device that can be used, got "cuda", but torch finds no' in outcome.err
+    plan = run("compact", scene_copy, "--device", "auto", "--dry-run", "--json")
+    assert plan.code == 0
+    assert '"device": "cpu"' in plan.out

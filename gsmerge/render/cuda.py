@@ -1,0 +1,173 @@
+"""Rendering of CUDA tensors, by gsplat (the extra ``gsmerge[cuda]``).
+
+gsplat's conventions are the CPU's: linear scales, opacities in [0, 1], quaternions wxyz of any length, world-to-camera
+matrices, pixel centres at +0.5, 0.3 px dilation, directions clamped 15 % outside the image, contributions below 1/255
+cut, a pixel stops before its transmittance would reach 1e-4. What differs:
+
+- Alpha is clamped at 0.999 by gsplat 1.5 and at 0.99 by its later sources and by the CPU. A pixel in the middle of an
+  opaque Gaussian differs by up to 0.009 of the contrast with what lies behind it; one that less than a tenth of the
+  light reaches may also stop before that Gaussian.
+- Gaussians that lie exactly on the near or far plane are drawn.
+- gsplat bounds a footprint by its opacity as the CPU does, but in whole pixels; the cut at 1/255 decides in both. Its
+  exponential is the fast one of the GPU, so a weight next to the cut may fall on the other side.
+- The determinant of a footprint is a difference of products, so needles far below a pixel lose digits.
+- Gradients of view matrices agree along rigid motions. Off them they differ where colours depend on the direction: the
+  eye is taken from the inverse of the matrix, and on the CPU from its transpose.
+- Sums of gradients have no fixed order, so runs differ in the last bits.
+
+gsplat is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsmerge.errors import GsmergeError
+from gsmerge.render.images import Rendering
+from gsmerge.render.plan import EPS2D, Array, check_range
+from gsmerge.types import Cameras, Gaussians
+
+INSTALL = 'pip install "gsmerge[cuda]"'
+
+
+def cuda_problem() -> str | None:
+    """What keeps CUDA devices from being used, as a clause; None where nothing does."""
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device"
+    if find_spec("gsplat") is None:
+        return f"gsplat is not installed; {INSTALL}"
+    return None
+
+
+def usable_device(wanted: str) -> str:
+    """The device that ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA where it can be used) means on this machine.
+
+    Raises:
+        ValueError: If ``"cuda"`` is wanted and cannot be used.
+    """
+    problem = None if wanted == "cpu" else cuda_problem()
+    if wanted == "cuda" and problem:
+        raise ValueError(f'device: expected "cpu" or a CUDA device that can be used, got "cuda", but {problem}')
+    return "cpu" if wanted == "cpu" or problem else "cuda"
+
+
+def _gsplat() -> Any:
+    try:
+        import gsplat
+    except ImportError as error:
+        raise GsmergeError(f"CUDA tensors are rendered by gsplat, which cannot be imported; {INSTALL}") from error
+    return gsplat
+
+
+def rasterize(
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor],
+    colors: Tensor,
+    cameras: tuple[Tensor, Tensor, int, int],
+    background: Tensor,
+    *,
+    sh_degree: int | None = None,
+    eps2d: float = EPS2D,
+    antialiased: bool = False,
+    near: float = 0.01,
+    far: float = 1e10,
+    with_depths: bool = False,
+) -> Rendering:
+    """One call of gsplat's ``rasterization``.
+
+    Args:
+        gaussians: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``.
+        colors: ``[n,3]``, taken as they are, or with ``sh_degree`` ``[n,k,3]`` spherical harmonics.
+        cameras: World-to-camera matrices ``[c,4,4]``, intrinsics ``[c,3,3]``, width and height.
+        background: ``[3]``.
+        sh_degree: Degree of the spherical harmonics; None: ``colors`` are colours.
+        eps2d: Dilation of the footprints, pixels squared.
+        antialiased: Lower the opacity by what the dilation adds to the footprint.
+        near: Nearest depth drawn.
+        far: Farthest depth drawn.
+        with_depths: Also the mean depth.
+
+    Returns:
+        Images, alphas and depths, on the device of the tensors; differentiable but for the depths.
+
+    Raises:
+        GsmergeError: If gsplat is not installed.
+    """
+    means, quats, scales, opacities = (tensor.float() for tensor in gaussians)
+    viewmats, Ks, width, height = cameras
+    backgrounds = background.to(means).expand(len(viewmats), 3).contiguous()
+    if len(means) == 0 or len(viewmats) == 0:  # nothing that a kernel could be launched for
+        return _empty((*gaussians, colors, viewmats), backgrounds, (height, width), with_depths)
+    # a zero quaternion is no rotation, as on the CPU; gsplat would divide by its length
+    identity = torch.eye(4, device=quats.device)[0]
+    quats = torch.where((quats * quats).sum(1, keepdim=True) > 1e-30, quats, identity)
+    images, alphas, _ = _gsplat().rasterization(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        colors=colors.float(),
+        viewmats=viewmats.float(),
+        Ks=Ks.float(),
+        width=width,
+        height=height,
+        near_plane=near,
+        far_plane=far,
+        eps2d=eps2d,
+        sh_degree=sh_degree,
+        packed=False,
+        backgrounds=backgrounds,
+        render_mode="RGB+ED" if with_depths else "RGB",
+        rasterize_mode="antialiased" if antialiased else "classic",
+    )
+    return Rendering(images[..., :3], alphas, images[..., 3:].detach() if with_depths else None)
+
+
+def _empty(tensors: tuple[Tensor, ...], backgrounds: Tensor, size: tuple[int, int], with_depths: bool) -> Rendering:
+    """Background alone, still a function of the tensors for autograd."""
+    nothing = sum((tensor.float().sum() * 0 for tensor in tensors), torch.zeros((), device=backgrounds.device))
+    images = backgrounds[:, None, None].expand(-1, *size, 3) + nothing
+    alphas = torch.zeros_like(images[..., :1]) + nothing
+    return Rendering(images, alphas, torch.zeros_like(alphas) if with_depths else None)
+
+
+def render_cuda(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Array,
+    *,
+    antialiased: bool,
+    near: float,
+    far: float,
+    with_depths: bool,
+) -> Rendering:
+    """:func:`gsmerge.render` by gsplat; same arguments, but for the checked ``[3]`` background.
+
+    Positions are taken relative to the cameras' own centre in float64 first, so that scenes in geographic coordinates
+    keep their detail.
+    """
+    check_range(near, far, EPS2D)
+    viewmats = cameras.viewmats.double()
+    origin = cameras.centres.detach().double().sum(0) / max(len(cameras), 1)
+    shifts = viewmats[:, :3, 3:] + viewmats[:, :3, :3] @ origin[:, None]
+    local = torch.cat([torch.cat([viewmats[:, :3, :3], shifts], 2), viewmats[:, 3:]], 1)
+    return rasterize(
+        (gaussians.means.double() - origin, gaussians.quats, gaussians.scales, gaussians.opacities),
+        torch.cat([gaussians.sh0, gaussians.shN], 1),
+        (local, cameras.Ks, cameras.width, cameras.height),
+        torch.from_numpy(background),
+        sh_degree=gaussians.sh_degree,
+        antialiased=antialiased,
+        near=near,
+        far=far,
+        with_depths=with_depths,
+    )
+
+
+def harmonic_colors(means: Tensor, harmonics: Tensor, eye: Tensor) -> Tensor:
+    """``[n,3]`` colours of spherical harmonics ``[n,k,3]`` seen from ``eye``, not below 0."""
+    degree = round(harmonics.shape[1] ** 0.5) - 1
+    return (_gsplat().spherical_harmonics(degree, means - eye, harmonics) + 0.5).clamp_min(0)

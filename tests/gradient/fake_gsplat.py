@@ -1,0 +1,109 @@
+"""gsplat's interface over the slow float64 renderer: strict about what it is given, on any device.
+
+The signature and the checks are those of ``gsplat.rasterization`` 1.5, and its kernels' demands (float32, one device)
+are added. Alpha is clamped at 0.99, as by the sources after 1.5.3 and by the CPU.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from reference_gradients import NAMES  # which makes the renderer's folder known
+from renderer import harmonics, render_reference
+from torch import Tensor
+
+assert NAMES
+CALLS: list[dict[str, Any]] = []
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    CALLS.append(dict(locals()))
+    n, c = len(means), len(viewmats)
+    assert n > 0, "its kernels take the last of a cumulative sum"
+    assert c > 0
+    assert backgrounds is not None
+    assert (means.shape, quats.shape, scales.shape, opacities.shape) == ((n, 3), (n, 4), (n, 3), (n,))
+    assert (viewmats.shape, Ks.shape, backgrounds.shape) == ((c, 4, 4), (c, 3, 3), (c, 3))
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds)
+    assert all(tensor.dtype == torch.float32 for tensor in tensors)
+    assert len({tensor.device for tensor in tensors}) == 1
+    assert backgrounds.is_contiguous()
+    assert ((opacities >= 0) & (opacities <= 1)).all(), "not logits"
+    assert (scales > 0).all(), "not logarithms"
+    assert (quats.norm(dim=1) > 0).all(), "it divides by their length"
+    assert torch.equal(viewmats[:, 3], torch.tensor([0.0, 0, 0, 1]).expand(c, 4))
+    assert render_mode in ("RGB", "RGB+ED")
+    assert rasterize_mode in ("classic", "antialiased")
+    assert (radius_clip, packed, camera_model, covars, tile_size) == (0.0, False, "pinhole", None, 16)
+    if sh_degree is None:
+        assert colors.shape == (n, 3)
+    else:
+        assert colors.shape == (n, (sh_degree + 1) ** 2, 3)
+    doubles = [tensor.double() for tensor in (means, quats, scales, opacities)]
+    images, alphas = [], []
+    for viewmat, K, background in zip(viewmats.double(), Ks.double(), backgrounds.double(), strict=True):
+        eye = torch.inverse(viewmat)[:3, 3]
+        seen = colors.double()
+        if sh_degree is not None:
+            seen = (spherical_harmonics(sh_degree, means.double() - eye, seen) + 0.5).clamp_min(0)
+        drawn = render_reference(
+            *doubles, seen, viewmat, K, width, height, antialiased=rasterize_mode == "antialiased",
+            near=near_plane, far=far_plane, eps2d=eps2d,
+        )  # fmt: skip
+        image = drawn.image + drawn.transmittance[..., None] * background
+        images.append(torch.cat([image, drawn.depth[..., None]], -1) if render_mode == "RGB+ED" else image)
+        alphas.append(1 - drawn.transmittance[..., None])
+    return torch.stack(images).float(), torch.stack(alphas).float(), {}
+
+
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    """Without the half that makes a colour of it."""
+    assert masks is None
+    assert dirs.shape == (len(coeffs), 3)
+    assert (degrees_to_use + 1) ** 2 <= coeffs.shape[1]
+    assert dirs.dtype == coeffs.dtype
+    basis = harmonics(torch.nn.functional.normalize(dirs, dim=-1))[:, : coeffs.shape[1]]
+    return torch.einsum("nk,nkc->nc", basis, coeffs)
+
+
+@pytest.fixture
+def fake_gsplat(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """``import gsplat`` finds the functions above; gives their calls."""
+    module = ModuleType("gsplat")
+    module.__spec__ = ModuleSpec("gsplat", None)
+    module.rasterization, module.spherical_harmonics = rasterization, spherical_harmonics  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+    CALLS.clear()
+    return CALLS

@@ -1,0 +1,322 @@
+"""CUDA tensors go to gsplat: its adapter on the CPU with a stand-in, and both backends on a GPU where there is one."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fake_gsplat import fake_gsplat  # noqa: F401 - a fixture
+from reference_gradients import BACKGROUND, NAMES, assert_close, leaves, pixel_gradients, random_gaussians
+from reference_gradients import turned_cameras as cameras_of
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from gsmerge import Cameras, Gaussians, render
+from gsmerge.errors import GsmergeError
+from gsmerge.fit import FitOptions
+from gsmerge.render import Rendering
+from gsmerge.render import cuda as adapter
+from gsmerge.render.colored import draw_colored, seen_colors
+from gsmerge.render.cuda import harmonic_colors, rasterize, render_cuda, usable_device
+
+Calls = list[dict[str, Any]]
+DEFAULTS: dict[str, Any] = {"antialiased": False, "near": 0.01, "far": 1e10, "with_depths": False}
+gpu = pytest.mark.skipif(
+    not torch.cuda.is_available() or find_spec("gsplat") is None, reason="needs a CUDA device and gsplat"
+)
+
+
+def by_adapter(gaussians: Gaussians, cameras: Cameras, background: Any = BACKGROUND, **options: Any) -> Rendering:
+    return render_cuda(gaussians, cameras, np.array(background, np.float32), **{**DEFAULTS, **options})
+
+
+def psnr(one: Tensor, other: Tensor) -> float:
+    return float(-10 * (one.double() - other.double()).square().mean().clamp_min(1e-20).log10())
+
+
+def assert_same(found: Rendering, wanted: Rendering, least: float = 80.0) -> None:
+    """Images and alphas to ``least`` dB, mean depths to a thousandth in 99 % of what was drawn."""
+    assert (found.images.shape, found.alphas.shape) == (wanted.images.shape, wanted.alphas.shape)
+    assert found.images.dtype == found.alphas.dtype == torch.float32
+    assert psnr(found.images, wanted.images) >= least
+    assert psnr(found.alphas, wanted.alphas) >= least
+    assert (found.depths is None) == (wanted.depths is None)
+    if found.depths is not None and wanted.depths is not None:
+        assert found.depths.shape == wanted.depths.shape
+        solid = wanted.alphas > 0.1
+        close = torch.isclose(found.depths[solid], wanted.depths[solid], rtol=1e-3)
+        assert close.double().mean() > 0.99  # but where a weight falls on the other side of the cut
+
+
+# the adapter, with a stand-in for gsplat
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_images_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(40, degree, degree), cameras_of()
+    assert_same(by_adapter(gaussians, cameras), render(gaussians, cameras, BACKGROUND))
+    assert len(fake_gsplat) == 1  # all views at once
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"antialiased": True}, {"near": 2.9}, {"far": 3.1}, {"with_depths": True}, {"near": 2.0, "with_depths": True}],
+    ids=str,
+)
+def test_options_mean_the_same(options: dict[str, Any], fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(40, 1), cameras_of()
+    wanted = render(gaussians, cameras, BACKGROUND, **options)
+    assert_same(by_adapter(gaussians, cameras, **options), wanted)
+    if not options.get("with_depths"):
+        assert psnr(wanted.images, render(gaussians, cameras, BACKGROUND).images) < 60  # the option matters here
+
+
+def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(9, 2), cameras_of(3)
+    by_adapter(gaussians, cameras, antialiased=True, near=0.5, far=7.0, with_depths=True)
+    by_adapter(gaussians, cameras)
+    first, second = fake_gsplat
+    assert (first["width"], first["height"], first["sh_degree"]) == (cameras.width, cameras.height, 2)
+    assert (first["near_plane"], first["far_plane"], first["eps2d"]) == (0.5, 7.0, 0.3)
+    assert (first["render_mode"], first["rasterize_mode"]) == ("RGB+ED", "antialiased")
+    assert (second["render_mode"], second["rasterize_mode"]) == ("RGB", "classic")
+    assert torch.equal(first["colors"], torch.cat([gaussians.sh0, gaussians.shN], 1))
+    assert torch.equal(first["quats"], gaussians.quats)
+    assert torch.equal(first["scales"], gaussians.scales)
+    assert torch.equal(first["opacities"], gaussians.opacities)
+    assert torch.equal(first["Ks"], cameras.Ks.float())
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(40, degree, 1), cameras_of()
+    found, wanted = (gradients(draw, gaussians, cameras) for draw in (by_adapter, on_cpu))
+    assert_close(found, [one.double() for one in wanted])
+    assert all(float(one.norm()) > 0 for one in wanted if one.numel())
+
+
+def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  # noqa: F811
+    """The adapter moves the scene in float64, and its gradients come back to where it was."""
+    near, cameras = random_gaussians(30), cameras_of()
+    place = torch.tensor([4.2e6, -1.7e5, 4.8e6], dtype=torch.float64)
+    viewmats = cameras.viewmats.clone()
+    viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ place
+    far, there = replace(near, means=near.means.double() + place), replace(cameras, viewmats=viewmats)
+    assert_same(by_adapter(far, there), by_adapter(near, cameras), least=60)
+    assert_same(by_adapter(far, there), render(far, there, BACKGROUND), least=60)
+    found, wanted = (gradients(draw, far, there) for draw in (by_adapter, on_cpu))
+    assert_close(found, [one.double() for one in wanted], most=1e-2)
+
+
+def test_depths_have_no_gradient(fake_gsplat: Calls) -> None:  # noqa: F811
+    *tensors, viewmats = leaves(random_gaussians(9), cameras_of())
+    drawn = by_adapter(Gaussians(*tensors), replace(cameras_of(), viewmats=viewmats), with_depths=True)
+    assert drawn.depths is not None
+    assert drawn.images.requires_grad
+    assert not drawn.depths.requires_grad
+
+
+def test_zero_quaternions_are_no_rotation(fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(12), cameras_of()
+    gaussians = replace(gaussians, quats=gaussians.quats * (torch.arange(12) % 3 > 0)[:, None])
+    assert_same(by_adapter(gaussians, cameras), render(gaussians, cameras, BACKGROUND))
+
+
+@pytest.mark.parametrize("with_depths", [False, True])
+def test_nothing_to_draw(with_depths: bool, fake_gsplat: Calls) -> None:  # noqa: F811
+    """Background, still differentiable, and gsplat is not asked."""
+    gaussians, cameras = random_gaussians(9, 1), cameras_of()
+    for some, seen in ((gaussians[:0], cameras), (gaussians, cameras[:0])):
+        found, wanted = (draw(some, seen, with_depths=with_depths) for draw in (by_adapter, on_cpu))
+        for name in ("images", "alphas"):
+            assert torch.equal(getattr(found, name), getattr(wanted, name))
+        assert (found.depths is None) == (not with_depths)
+    assert all((one == 0).all() for one in gradients(by_adapter, gaussians[:0], cameras))
+    assert fake_gsplat == []
+
+
+@pytest.mark.parametrize("options", [{"near": 0.0}, {"near": 3.0, "far": 2.0}], ids=str)
+def test_depth_range_is_checked(options: dict[str, Any], fake_gsplat: Calls) -> None:  # noqa: F811
+    with pytest.raises(ValueError, match="0 < near < far"):
+        by_adapter(random_gaussians(3), cameras_of(), **options)
+
+
+def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F811
+    """What the fit draws: colours of any sign, a dilation of its own, against the kernels and their gradients."""
+    gaussians, cameras = random_gaussians(40), cameras_of(1)
+    colors = torch.randn(40, 3, generator=torch.Generator().manual_seed(3))
+    viewmat, K = cameras.viewmats[0], cameras.Ks[0]
+    camera = {"viewmat": viewmat.numpy(), "K": K.numpy(), "width": 37, "height": 21, "eps2d": 0.075}
+    background = np.array(BACKGROUND, np.float32)
+    grad_image, _ = pixel_gradients(cameras)
+    found = []
+    for fast in (True, False):
+        tensors = [t.clone().requires_grad_() for t in (*list(vars(gaussians).values())[:4], colors)]
+        shape = (tensors[0], tensors[1], tensors[2], tensors[3])
+        if fast:
+            image = draw_colored(shape, tensors[4], camera, background)
+        else:
+            views = viewmat[None], K[None], 37, 21
+            image = rasterize(shape, tensors[4], views, torch.from_numpy(background), eps2d=0.075).images[0]
+        (image * grad_image[0]).sum().backward()
+        found.append((image.detach(), [tensor.grad for tensor in tensors]))
+    assert psnr(found[0][0], found[1][0]) > 80
+    assert_close(found[0][1], [one.double() for one in found[1][1]])
+    assert fake_gsplat[0]["eps2d"] == 0.075
+    assert fake_gsplat[0]["sh_degree"] is None
+
+
+@pytest.mark.parametrize("degree", [1, 4])
+def test_seen_colours(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(20, degree), cameras_of(1)
+    harmonics = torch.cat([gaussians.sh0, gaussians.shN], 1)
+    found = harmonic_colors(gaussians.means, harmonics, cameras.centres[0].float())
+    wanted = seen_colors(gaussians.means, gaussians.sh0, gaussians.shN, cameras.viewmats[0].numpy())
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+    assert (wanted == 0).any()
+
+
+# who draws
+
+
+def test_cuda_tensors_go_to_gsplat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By their device alone; these have no memory behind them."""
+    asked = []
+    monkeypatch.setattr(adapter, "render_cuda", lambda *args, **options: asked.append((args, options)))
+    with FakeTensorMode():
+        gaussians = Gaussians(
+            *(torch.empty(4, *size, device="cuda") for size in ((3,), (4,), (3,), (), (1, 3), (0, 3)))
+        )
+        cameras = Cameras(torch.empty(1, 4, 4, device="cuda"), torch.empty(1, 3, 3, device="cuda"), 8, 6)
+        render(gaussians, cameras, 0.5, near=0.2, antialiased=True)
+    ((args, options),) = asked
+    assert args[:2] == (gaussians, cameras)
+    assert args[2].tolist() == [0.5] * 3
+    assert options == {"antialiased": True, "near": 0.2, "far": 1e10, "with_depths": False}
+
+
+@pytest.mark.parametrize("with_depths", [False, True])
+def test_gsplat_gets_tensors_of_the_device_alone(with_depths: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With tensors that have a device and no memory: mixing devices would fail."""
+    module = ModuleType("gsplat")
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+
+    def rasterization(**given: Any) -> tuple[Tensor, Tensor, None]:
+        assert all(value.is_meta for value in given.values() if isinstance(value, Tensor))
+        size = len(given["viewmats"]), given["height"], given["width"]
+        channels = 4 if given["render_mode"] == "RGB+ED" else 3
+        return torch.empty(*size, channels, device="meta"), torch.empty(*size, 1, device="meta"), None
+
+    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
+        assert dirs.is_meta
+        return coeffs[:, degree]
+
+    module.rasterization, module.spherical_harmonics = rasterization, spherical_harmonics  # type: ignore[attr-defined]
+    gaussians, cameras = random_gaussians(4, 1).to("meta"), cameras_of().to("meta")
+    for some in (gaussians, gaussians[:0]):
+        drawn = by_adapter(some, cameras, with_depths=with_depths)
+        assert (drawn.images.shape, drawn.alphas.shape) == ((2, 21, 37, 3), (2, 21, 37, 1))
+        assert drawn.images.is_meta
+        assert drawn.depths is None or (drawn.depths.is_meta and drawn.depths.shape == (2, 21, 37, 1))
+    harmonics = torch.cat([gaussians.sh0, gaussians.shN], 1)
+    assert harmonic_colors(gaussians.means, harmonics, gaussians.means[0]).is_meta
+    colors = seen_colors(gaussians.means, gaussians.sh0, gaussians.shN, np.eye(4))
+    camera = {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 6, "eps2d": 0.1}
+    shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    image = draw_colored(shape, colors, camera, np.zeros(3, np.float32))
+    assert image.is_meta
+    assert image.shape == (6, 8, 3)
+
+
+def test_devices_must_agree() -> None:
+    gaussians, cameras = random_gaussians(3), cameras_of()
+    with pytest.raises(ValueError, match=r"one device, got cpu and meta; move them with \.to\(device\)"):
+        render(gaussians, cameras.to("meta"))
+    with pytest.raises(ValueError, match="one device"):
+        render(replace(gaussians, sh0=gaussians.sh0.to("meta")), cameras)
+
+
+def test_without_gsplat_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(GsmergeError, match=r'gsplat.*; pip install "gsmerge\[cuda\]"$'):
+        by_adapter(random_gaussians(3), cameras_of())
+
+
+def test_device_is_resolved(monkeypatch: pytest.MonkeyPatch, fake_gsplat: Calls) -> None:  # noqa: F811
+    assert usable_device("cpu") == FitOptions().device == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [usable_device(name) for name in ("cuda", "auto")] == ["cuda", "cuda"]
+    assert FitOptions(device="auto").device == "cuda"
+    monkeypatch.delitem(sys.modules, "gsplat")
+    monkeypatch.setattr(adapter, "find_spec", lambda name: None)
+    assert usable_device("auto") == "cpu"
+    with pytest.raises(ValueError, match=r'got "cuda", but gsplat is not installed; pip install "gsmerge\[cuda\]"$'):
+        usable_device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert FitOptions(device="auto").device == "cpu"
+    with pytest.raises(ValueError, match='got "cuda", but torch finds no CUDA device'):
+        FitOptions(device="cuda")
+    with pytest.raises(ValueError, match='device: expected "cpu", "cuda" or "auto", got "gpu"'):
+        FitOptions(device="gpu")  # type: ignore[arg-type]
+
+
+# both backends, on a GPU
+
+
+@gpu
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_draws_the_cpu_s_images(degree: int, antialiased: bool) -> None:
+    """60 dB leaves room for weights that fall on the other side of the cut, 1/255, in 6 % of the pixels."""
+    gaussians, cameras = random_gaussians(300, degree), cameras_of(3)
+    options = {"antialiased": antialiased, "with_depths": True}
+    found = render(gaussians.to("cuda"), cameras.to("cuda"), BACKGROUND, **options)
+    assert found.images.is_cuda
+    found = Rendering(*(part.cpu() for part in vars(found).values()))
+    assert_same(found, render(gaussians, cameras, BACKGROUND, **options), least=60)
+
+
+@gpu
+def test_opaque_ones_differ_by_the_clamp_alone() -> None:
+    """0.999 or 0.99: 0.009 of a contrast of 1 in every pixel is 40.9 dB; the slow renderer with both gives 55 here."""
+    gaussians, cameras = random_gaussians(300), cameras_of(3)
+    colors = torch.rand(300, 1, 3, generator=torch.Generator().manual_seed(0))
+    gaussians = replace(gaussians, opacities=torch.ones(300), sh0=(colors - 0.5) / 0.28209479177387814)
+    found, wanted = render(gaussians.to("cuda"), cameras.to("cuda")), render(gaussians, cameras)
+    assert psnr(found.images.cpu(), wanted.images) >= 40
+
+
+@gpu
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gsplat_has_the_cpu_s_gradients(degree: int) -> None:
+    gaussians, cameras = random_gaussians(300, degree), cameras_of(3)
+    wanted = gradients(on_cpu, gaussians, cameras)
+    found = gradients(on_cpu, gaussians.to("cuda"), cameras.to("cuda"))
+    assert_close([one.cpu() for one in found], [one.double() for one in wanted], most=1e-2)
+
+
+def on_cpu(gaussians: Gaussians, cameras: Cameras, **options: Any) -> Rendering:
+    return render(gaussians, cameras, BACKGROUND, **options)
+
+
+def gradients(draw: Any, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
+    """Of images and alphas times fixed numbers, in the order of NAMES, of the view matrices along rigid motions."""
+    *tensors, viewmats = leaves(gaussians, cameras)
+    drawn = draw(Gaussians(*tensors), replace(cameras, viewmats=viewmats))
+    grads = [one.to(drawn.images) for one in pixel_gradients(cameras)]
+    ((drawn.images * grads[0]).sum() + (drawn.alphas * grads[1]).sum()).backward()
+    assert len(tensors) + 1 == len(NAMES)
+    found = [torch.zeros_like(one) if one.grad is None else one.grad for one in (*tensors, viewmats)]
+    return [*found[:-1], rigid(found[-1], cameras)]
+
+
+def rigid(gradient: Tensor, cameras: Cameras) -> Tensor:
+    """``[c,3,4]`` part of a view matrix's gradient along turns (as a skew matrix) and shifts."""
+    turn = gradient[:, :3, :3] @ cameras.viewmats[:, :3, :3].transpose(1, 2)
+    return torch.cat([turn - turn.transpose(1, 2), gradient[:, :3, 3:]], 2)
