@@ -31,7 +31,7 @@ class CompactOptions:
         decode: Gaussians per group.
         fit: Fit to the photos.
         target: What decides the number of Gaussians.
-        seed: Everything random hangs on it; runs with one seed are bit-identical.
+        seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
     """
 
