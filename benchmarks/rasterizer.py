@@ -5,7 +5,8 @@
 S1: 100 k Gaussians of 1.4 px, 476 x 476. S2: 1 M of 1.2 px, 640 x 480. S3: 20 k of 7 px, 476 x 476.
 
 The raster's backward pass ends with 9 sums per Gaussian; ``projection`` takes them to means, quaternions, scales and
-opacities, ``colours`` those of the colours to the spherical harmonics and the means.
+opacities, ``colours`` those of the colours to the spherical harmonics and the means, in the memory of the last ones as
+in a training loop.
 
 Milliseconds are process CPU time on one thread, best of the repeats, kernels warm; ours and the sketch's runs take
 turns. ``dB`` is the PSNR against float64 renders. Scenes, renders and sketch are looked for in ``GSMERGE_SHARED``
@@ -36,7 +37,7 @@ from gsmerge.kernels.raster_backward import SUMS, blend_backward, gather_slots  
 from gsmerge.metrics import psnr  # noqa: E402
 from gsmerge.render import composite, contributions, plan_view, prepare, splat_adjoint  # noqa: E402
 from gsmerge.render.blend import view_colors  # noqa: E402
-from gsmerge.render.gradient import color_gradients, gradients_of, plan_differentiable  # noqa: E402
+from gsmerge.render.gradient import color_gradients, gradients_of  # noqa: E402
 from gsmerge.threads import available_threads, use_threads  # noqa: E402
 from gsmerge.types import Gaussians  # noqa: E402
 
@@ -77,8 +78,9 @@ class Clock:
         return result
 
 
-def walk_back(plan: Any, image: Any, transmittance: Any, gradient: Any, colors: Any, slots: Any) -> None:
-    """The raster's part of :func:`gradients_of`."""
+def walk_back(plan: Any, image: Any, transmittance: Any, gradient: Any, colors: Any) -> None:
+    """The raster's part of :func:`gradients_of`, its own memory included."""
+    slots = np.empty((len(plan.members), SUMS), np.float32)
     tiles, none = len(plan.offsets) - 1, np.empty((0, 0), np.float32)
     blend_backward(
         plan.footprints, colors, plan.members, plan.offsets, plan.columns, 0, tiles,
@@ -104,14 +106,16 @@ def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int
         image, _ = clock("composite", lambda plan=plan: composite(plan))
         clock("adjoint", lambda plan=plan: splat_adjoint(plan, gradient))
         clock("contributions", lambda plan=plan: contributions(plan))
-    plan = plan_differentiable(splats, *view)
     (image, left), colors = composite(plan), view_colors(plan)
-    slots, none = np.empty((len(plan.members), SUMS), np.float32), np.empty((0, 0), np.float32)
+    none, shade = np.empty((0, 0), np.float32), None
     for _ in range(repeats + 1):
         clock("sketch backward", lambda: raster.sums(gradient))
-        clock("raster backward", lambda: walk_back(plan, image, left, gradient, colors, slots))
+        clock("raster backward", lambda: walk_back(plan, image, left, gradient, colors))
         wanted = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, none, False))
-        clock("color gradients", lambda wanted=wanted: color_gradients(plan, wanted.colors, colors))
+        shade = clock(
+            "color gradients",
+            lambda wanted=wanted, shade=shade: color_gradients(plan, wanted.colors, colors, used=shade),
+        )
     return clock.best, image
 
 

@@ -32,6 +32,7 @@ class Held:
         state: The state that they came from.
         x: ``[n,14]`` parameters, see :class:`gsmerge.fit.state.State`, as are the following.
         x0: Where each began.
+        shares: ``[n,1]`` share of the box.
         m: First moment.
         v: Second moment.
         units: ``[n,1]`` size of each Gaussian.
@@ -41,6 +42,7 @@ class Held:
     state: State
     x: Tensor
     x0: Tensor
+    shares: Tensor
     m: Tensor
     v: Tensor
     units: Tensor
@@ -61,7 +63,7 @@ def start_gpu(device: torch.device) -> None:
     K = np.array([[8.0, 0, 4], [0, 8.0, 4], [0, 0, 1]])
     camera = {"viewmat": np.eye(4), "K": K, "width": 8, "height": 8, "eps2d": 0.3}
     with torch.enable_grad():
-        image = draw_colored((one[0], one[1], one[2], one[3]), one[4], camera, np.zeros(3, np.float32))
+        image, _ = draw_colored((one[0], one[1], one[2], one[3]), one[4], camera, np.zeros(3, np.float32))
         image.sum().backward()
 
 
@@ -87,7 +89,7 @@ def upload(state: State, device: torch.device) -> Held:
     def tensor(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(device, copy=True)
 
-    arrays = (state.x, state.x0, state.m, state.v, state.units[:, None], state.splats.shN)
+    arrays = (state.x, state.x0, state.shares[:, None], state.m, state.v, state.units[:, None], state.splats.shN)
     return Held(state, *(tensor(array) for array in arrays))
 
 
@@ -120,12 +122,14 @@ def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rn
             tensor.detach().contiguous().requires_grad_()
             for tensor in (means, quats, scales, drawn, view_colors(held, means, camera["viewmat"]))
         ]
-        image = draw_colored((leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], camera, background)
+        image, reached = draw_colored((leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], camera, background)
         loss = image_loss(image, photo, weight, plan.options.dssim)
         wanted = torch.autograd.grad(loss, leaves)
     with torch.no_grad():
-        slope = (opacities * (1 - opacities))[:, None]
-        rows = (wanted[0] * held.units, wanted[2] * scales, wanted[1], wanted[3][:, None] * slope, wanted[4])
+        slope, each = (opacities * (1 - opacities))[:, None], reached[:, None] / max(len(held.x), 1)
+        fade = wanted[3][:, None] + plan.options.opacity_pull * each
+        shrink = wanted[2] + plan.options.size_pull * each / held.units
+        rows = (wanted[0] * held.units, shrink * scales, wanted[1], fade * slope, wanted[4])
         adam_step(held, torch.cat(rows, 1), plan.options.rates, progress, step)
         return mean_error(image, photo, weight)
 
@@ -184,10 +188,11 @@ def confine(held: Held, x: Tensor, rates: Rates) -> None:
     """New parameters, brought into the box about the start."""
     x0 = held.x0
     offset = x[:, :SIZE] - x0[:, :SIZE]
-    far, reach = offset.norm(dim=1, keepdim=True), rates.reach_mean * held.units
+    far, reach = offset.norm(dim=1, keepdim=True), held.shares * rates.reach_mean * held.units
     x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])
     sizes, logits, colors = x0[:, SIZE:QUAT], x0[:, LOGIT], x0[:, COLOR:]
-    x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - rates.reach_size, sizes + rates.reach_size)
+    grown = held.shares * rates.reach_size
+    x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown)
     logit = x[:, LOGIT].clamp(logits - rates.reach_logit, logits + rates.reach_logit)
     x[:, LOGIT] = logit.clamp(float(MIN_LOGIT), float(MAX_LOGIT))
     x[:, COLOR:] = x[:, COLOR:].clamp(colors.clamp_max(-0.05), colors.clamp_min(1.05))

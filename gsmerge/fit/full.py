@@ -21,8 +21,8 @@ from gsmerge.fit.report import FitReport
 from gsmerge.fit.state import State, gaussians_of, start_state
 from gsmerge.kernels import optimise as kernels
 from gsmerge.photos import Photos
-from gsmerge.render import composite, plan_view
-from gsmerge.render.gradient import plan_differentiable, plan_gradients
+from gsmerge.render import composite, plan_view, splat_adjoint
+from gsmerge.render.gradient import plan_gradients
 from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
@@ -62,12 +62,14 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
         opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
-    drawn = plan_differentiable(state.splats, **photos.camera(view), opacities=opacities)
+    drawn = plan_view(state.splats, **photos.camera(view), opacities=opacities)
     colors = state.view_colors()
     image, transmittance = composite(drawn, colors, background)
     gradient = image_gradient(image, photos.images[view], weight, plan.options.dssim)
     g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
-    rates, s = plan.options.rates, state.splats
+    rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
+    g.opacities[:] += np.float32(plan.options.opacity_pull / count)
+    g.scales[:] += np.float32(plan.options.size_pull / count) / state.units[g.ids, None]
     steps = step_sizes(rates, progress)
     limits = np.array([rates.reach_mean, rates.reach_size, rates.reach_logit], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
@@ -75,7 +77,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     def update(first: int) -> None:
         last = min(first + ROWS, len(state.x))
         kernels.adam(
-            state.x, state.x0, state.m, state.v, state.units, g.ids,
+            state.x, state.x0, state.m, state.v, state.units, state.shares, g.ids,
             g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, step,
             first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
         )  # fmt: skip
@@ -105,6 +107,22 @@ def step_sizes(rates: Rates, progress: float) -> np.ndarray:
     """Step of each of the fourteen columns at a point of the run, decaying geometrically."""
     columns = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
     return (np.array(columns) * rates.decay**progress).astype(np.float32)
+
+
+def box_shares(state: State, photos: Photos, alone: float) -> np.ndarray:
+    """``[n]`` float32 share of the box that each Gaussian may use: ``alone`` to 1, by how many photos show it.
+
+    The number of photos is the effective one, (sum w)^2 / sum w^2 of its blending weights w in them.
+    """
+
+    everywhere = np.ones((photos.height, photos.width, 1), np.float32)
+
+    def one_view(view: int) -> np.ndarray:
+        return splat_adjoint(plan_view(state.splats, **photos.camera(view)), everywhere)[:, 0]
+
+    weights = np.stack(parallel_map(one_view, range(len(photos)))).astype(np.float64)
+    photos_each = weights.sum(0) ** 2 / np.maximum((weights**2).sum(0), 1e-12)
+    return np.clip(photos_each - 1, alone, 1).astype(np.float32)
 
 
 def holdout_score(state: State, plan: Plan) -> float:
@@ -143,6 +161,7 @@ def fit_full(
         engine: What it steps with.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
+    state.shares[:] = box_shares(state, photos[1], options.rates.reach_alone)
     before = after = holdout_score(state, plan)
     queue: list[int] = []
     grows = options.grows

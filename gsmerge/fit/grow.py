@@ -39,7 +39,8 @@ def grow(state: State, photos: Photos, count: int) -> State:
     """Halve the Gaussians with the largest error masses across their longest axis, until there are ``count``.
 
     Each is halved at most once, so the number at most doubles, and what no photo shows is left alone. The halves
-    start with their parent's momentum; the old ones come first and in order, the second halves after them.
+    start with their parent's momentum and its share of the box; the old ones come first and in order, the second
+    halves after them.
 
     Args:
         state: n Gaussians under optimisation.
@@ -69,5 +70,5 @@ def grow(state: State, photos: Photos, count: int) -> State:
     old = np.ones(len(x), bool)
     old[picked] = old[len(state.x) :] = False
     grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
-    grown.m[:], grown.v[:] = state.m[source], state.v[source]
+    grown.m[:], grown.v[:], grown.shares[:] = state.m[source], state.v[source], state.shares[source]
     return grown

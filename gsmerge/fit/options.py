@@ -27,6 +27,8 @@ class Rates:
         reach_mean: Farthest that a mean may go from its start, in units of the Gaussian's size.
         reach_size: Largest change of a log scale.
         reach_logit: Largest change of an opacity's logit.
+        reach_alone: Share of the reach of mean and size that a Gaussian has which one photo alone shows: that photo
+            says what it looks like, not where it is. From two photos on the reach is whole.
     """
 
     mean: float = 0.1
@@ -40,6 +42,7 @@ class Rates:
     reach_mean: float = 2.0
     reach_size: float = 2.5
     reach_logit: float = 4.0
+    reach_alone: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,10 @@ class FitOptions:
             more, where the photos alone would be learnt by heart, otherwise 0.
         coarse: Share of the steps that look at half-size photos.
         dssim: Share of structural similarity in the loss, the rest is L1.
+        opacity_pull: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
+            the photos do not need fades, instead of standing in front of other views.
+        size_pull: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
+            a step takes a third less time.
         rates: Steps and limits of the full fit.
         iterations: Conjugate-gradient steps of the colour fit.
         pull: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
@@ -79,6 +86,8 @@ class FitOptions:
     dropout: float | None = None
     coarse: float = 0.7
     dssim: float = 0.2
+    opacity_pull: float = 0.03
+    size_pull: float = 0.01
     rates: Rates = field(default_factory=Rates)
     iterations: int = 6
     pull: float = 0.03
@@ -110,8 +119,9 @@ class FitOptions:
             raise ValueError(f"fit_steps: expected at least 1, got {self.steps}")
         if self.iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
-        if not self.pull >= 0:
-            raise ValueError(f"pull: expected at least 0, got {self.pull}")
+        for name in ("pull", "opacity_pull", "size_pull"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
         for name in ("coarse", "dssim", "prune"):

@@ -22,6 +22,7 @@ class State:
         m: First moment.
         v: Second moment.
         units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales when it began.
+        shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
         splats: Means, quaternions, scales and opacities as the rasterizer takes them.
         colors: ``[n,3]`` base colours.
     """
@@ -31,6 +32,7 @@ class State:
     m: np.ndarray
     v: np.ndarray
     units: np.ndarray
+    shares: np.ndarray
     splats: Splats
     colors: np.ndarray
 
@@ -68,7 +70,7 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
         origin=np.zeros(3),
     )
     units = np.exp((sizes[:, 1] + sizes[:, 2]) / 2)
-    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, splats, colors)
+    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, np.ones_like(units), splats, colors)
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:

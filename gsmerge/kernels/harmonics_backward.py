@@ -6,12 +6,16 @@ import numpy as np
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
+from gsmerge.kernels.lanes import LANES
+from gsmerge.kernels.prefetch import prefetch_row
+from gsmerge.kernels.triples import TRIPLES, spread_triples, turn, weigh_triples
 
 BLOCK = 128
 # Planes of a block. In: direction 0-2 (any length), dots 4 on: per higher harmonic its coefficients times the colour's
 # gradient. Out, in their place: gradient of the mean, values of the harmonics.
-P = tuple(np.uint64(BLOCK * plane) for plane in range(28 + 3))
-X, Y, Z, INVERSE, DOTS, UNIT = 0, 1, 2, 3, 3, 28  # plane DOTS + k belongs to harmonic k >= 1
+PLANES = 4 + 2 * LANES + 6
+P = tuple(np.uint64(BLOCK * plane) for plane in range(PLANES))
+X, Y, Z, INVERSE, DOTS, UNIT, RED = 0, 1, 2, 3, 3, PLANES - 6, PLANES - 3  # plane DOTS + k belongs to harmonic k >= 1
 
 
 @kernel
@@ -133,6 +137,39 @@ def _across(block):
 
 
 @kernel
+def _passed(colors, grad_colors, i):
+    """A colour's gradient, without the channels that are cut at 0."""
+    zero = f4(0.0)
+    # loaded before they are chosen from: no branch
+    red, green, blue = grad_colors[i, 0], grad_colors[i, 1], grad_colors[i, 2]
+    return (
+        red if colors[i, 0] > zero else zero,
+        green if colors[i, 1] > zero else zero,
+        blue if colors[i, 2] > zero else zero,
+    )
+
+
+@kernel
+def _harmonics_backward(block, rows, num):
+    """Replace the rows of dots by those of the harmonics' values, and the directions by the gradients of the means."""
+    for group in range(0, num, LANES):
+        for lane in range(0, BLOCK, LANES):
+            turn(rows, group * BLOCK + lane * LANES, LANES, block, (DOTS + 1 + group) * BLOCK + lane, BLOCK)
+    if num >= 3:
+        _first_degree(block)
+    if num >= 8:
+        _second_degree(block)
+    if num >= 15:
+        _third_degree(block)
+    if num >= 24:
+        _fourth_degree(block)
+    _across(block)
+    for group in range(0, num, LANES):
+        for lane in range(0, BLOCK, LANES):
+            turn(block, (DOTS + 1 + group) * BLOCK + lane, BLOCK, rows, group * BLOCK + lane * LANES, LANES)
+
+
+@kernel
 def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors, grad_sh0, grad_shN, grad_means):
     """Gradients of a range of the listed Gaussians through their colours seen from ``eye``.
 
@@ -149,45 +186,51 @@ def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors,
         grad_shN: ``[m,k-1,3]`` float32, written.
         grad_means: ``[m,3]`` float32, written.
     """
-    block = np.zeros(31 * BLOCK, np.float32)
     num = shN.shape[1]
+    size = 3 * num
+    coefficients, grad_coefficients = shN.reshape(-1), grad_shN.reshape(-1)
+    block, rows = np.zeros(PLANES * BLOCK, np.float32), np.zeros(2 * LANES * BLOCK, np.float32)
+    done = np.zeros(TRIPLES, np.float32)
+    # The last coefficients again, with space behind them: what is read beyond a row must exist.
+    beyond = max(0, coefficients.shape[0] - TRIPLES + 1)
+    end = np.zeros(2 * TRIPLES, np.float32)
+    for i in range(beyond, coefficients.shape[0]):
+        end[i - beyond] = coefficients[i]
+    c, seen = f4(0.28209479177387814), f4(1.0) if num > 0 else f4(0.0)
     for start in range(first, last, BLOCK):
-        size = min(BLOCK, last - start)
-        for lane in range(size):
-            j = np.uint64(lane)
-            i = np.uint64(start + lane)
+        count = min(BLOCK, last - start)
+        for lane in range(count):
+            i, j = np.uint64(start + lane), np.uint64(lane)
             k = np.uint64(ids[i])
-            red = grad_colors[i, 0] if colors[i, 0] > f4(0.0) else f4(0.0)
-            green = grad_colors[i, 1] if colors[i, 1] > f4(0.0) else f4(0.0)
-            blue = grad_colors[i, 2] if colors[i, 2] > f4(0.0) else f4(0.0)
-            c = f4(0.28209479177387814)
+            red, green, blue = _passed(colors, grad_colors, i)
+            block[j + P[RED]], block[j + P[RED + 1]], block[j + P[RED + 2]] = red, green, blue
             grad_sh0[i, 0, 0], grad_sh0[i, 0, 1], grad_sh0[i, 0, 2] = c * red, c * green, c * blue
             block[j], block[j + P[Y]] = means[k, 0] - eye[0], means[k, 1] - eye[1]
             block[j + P[Z]] = means[k, 2] - eye[2]
-            for q in range(num):
-                block[j + np.uint64((DOTS + 1 + q) * BLOCK)] = (
-                    red * shN[k, q, 0] + green * shN[k, q, 1] + blue * shN[k, q, 2]
-                )
-        if num >= 3:
-            _first_degree(block)
-        if num >= 8:
-            _second_degree(block)
-        if num >= 15:
-            _third_degree(block)
-        if num >= 24:
-            _fourth_degree(block)
+            for group in range(0, num, LANES):
+                at, to = int(k) * size + 3 * group, group * BLOCK + lane * LANES
+                if at < beyond:
+                    weigh_triples(coefficients, at, red, green, blue, rows, to)
+                else:
+                    weigh_triples(end, at - beyond, red, green, blue, rows, to)
         if num > 0:
-            _across(block)
-        for lane in range(size):
-            j = np.uint64(lane)
-            i = np.uint64(start + lane)
-            red = grad_colors[i, 0] if colors[i, 0] > f4(0.0) else f4(0.0)
-            green = grad_colors[i, 1] if colors[i, 1] > f4(0.0) else f4(0.0)
-            blue = grad_colors[i, 2] if colors[i, 2] > f4(0.0) else f4(0.0)
-            for q in range(num):
-                b = block[j + np.uint64((DOTS + 1 + q) * BLOCK)]
-                grad_shN[i, q, 0], grad_shN[i, q, 1], grad_shN[i, q, 2] = b * red, b * green, b * blue
-            seen = f4(1.0) if num > 0 else f4(0.0)
+            _harmonics_backward(block, rows, num)
+        for lane in range(count):
+            i, j = np.uint64(start + lane), np.uint64(lane)
+            # the next block's coefficients, while these are written
+            ahead = np.uint64(ids[min(start + lane + BLOCK, last - 1)]) * np.uint64(size)
+            for q in range(0, size, LANES):
+                prefetch_row(coefficients, ahead + np.uint64(q))
+            red, green, blue = block[j + P[RED]], block[j + P[RED + 1]], block[j + P[RED + 2]]
+            # What is written beyond a row is the next one's, which follows.
+            for group in range(0, num, LANES):
+                at, to = (start + lane) * size + 3 * group, group * BLOCK + lane * LANES
+                if at + TRIPLES <= last * size:
+                    spread_triples(rows, to, red, green, blue, grad_coefficients, at)
+                else:
+                    spread_triples(rows, to, red, green, blue, done, 0)
+                    for q in range(min(TRIPLES, size - 3 * group)):
+                        grad_coefficients[at + q] = done[q]
             grad_means[i, 0], grad_means[i, 1], grad_means[i, 2] = (
                 seen * block[j], seen * block[j + P[Y]], seen * block[j + P[Z]],
             )  # fmt: skip

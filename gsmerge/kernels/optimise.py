@@ -26,15 +26,16 @@ def _gather(row, row_x, unit, k, g_means, g_quats, g_scales, g_opacities, g_colo
 
 
 @kernel
-def _confine(x, x0, unit, limits):
+def _confine(x, x0, unit, share, limits):
     """Box trust region about the start, range of colours (no farther out than the start), unit quaternion."""
+    grown = share * limits[1]
     d0, d1, d2 = x[0] - x0[0], x[1] - x0[1], x[2] - x0[2]
-    far, reach = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), limits[0] * unit
+    far, reach = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), share * limits[0] * unit
     if far > reach:
         f = reach / far
         x[0], x[1], x[2] = x0[0] + f * d0, x0[1] + f * d1, x0[2] + f * d2
     for c in range(SIZE, SIZE + 3):
-        x[c] = min(x0[c] + limits[1], max(x0[c] - limits[1], x[c]))
+        x[c] = min(x0[c] + grown, max(x0[c] - grown, x[c]))
     logit = min(x0[LOGIT] + limits[2], max(x0[LOGIT] - limits[2], x[LOGIT]))
     x[LOGIT] = min(MAX_LOGIT, max(MIN_LOGIT, logit))
     for c in range(COLOR, COLOR + 3):
@@ -47,7 +48,7 @@ def _confine(x, x0, unit, limits):
 
 @kernel
 def adam(
-    x, x0, m, v, units, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
+    x, x0, m, v, units, shares, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
     first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
     """Adam on the rows ``first`` to ``last`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
@@ -56,6 +57,7 @@ def adam(
     scene. Dense: Gaussians without a gradient (``ids`` rising holds those that have one) coast on their momentum.
 
     Args:
+        shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
         limits: Of the mean (in sizes), log scale, logit.
         betas: Decay of the first and second moment.
@@ -86,7 +88,7 @@ def adam(
             v[i, c] = b2 * v[i, c] + (f4(1.0) - b2) * energy[c]
             move = rates[c] * m[i, c] * c1 / (np.sqrt(v[i, c] * c2) + f4(1e-15))
             x[i, c] -= move * unit if c < SIZE else move
-        _confine(x[i], x0[i], unit, limits)
+        _confine(x[i], x0[i], unit, shares[i], limits)
         for c in range(3):
             means[i, c], colors[i, c] = x[i, c], x[i, COLOR + c]
             scales[i, c] = np.exp(x[i, SIZE + c])

@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
-    """Start loading the cache line where ``array[row]`` begins (2D array); changes nothing.
+    """Start loading the cache line where ``array[row]`` begins; changes nothing.
 
     The lists of a tile point anywhere in the arrays of Gaussians. On scenes whose order has nothing to do with the
     image, asking for the next batch while one is blended takes a third off the time of blending.
@@ -25,7 +25,7 @@ def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
             context, builder, data.data,
             cgutils.unpack_tuple(builder, data.shape, kind.ndim),
             cgutils.unpack_tuple(builder, data.strides, kind.ndim),
-            kind.layout, [index, context.get_constant(types.intp, 0)], wraparound=False,
+            kind.layout, [index, *[context.get_constant(types.intp, 0)] * (kind.ndim - 1)], wraparound=False,
         )  # fmt: skip
         address, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
         shape = ir.FunctionType(ir.VoidType(), [address, flag, flag, flag])

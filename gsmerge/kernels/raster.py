@@ -67,6 +67,24 @@ def _gather(footprints, members, first, last, end, tile_x, tile_y, batch):
 
 
 @kernel
+def _gather_colors(colors, members, first, last, end, batch):
+    """Copy colours into the batch and call for the next batch's."""
+    for i in range(first, last):
+        k = np.uint64(members[i])
+        j = np.uint64(i - first)
+        batch[j, 8], batch[j, 9], batch[j, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
+    for i in range(last, min(end, last + BATCH)):
+        prefetch_row(colors, members[i])
+
+
+@kernel
+def _tile_box(tile, columns, height, width):
+    """First column and row of a tile, and its columns and rows inside the image."""
+    left, top = tile % columns * TILE, tile // columns * TILE
+    return left, top, min(TILE, width - left), min(TILE, height - top)
+
+
+@kernel
 def _open_tile(state, columns, lines):
     """All light passes, the other planes are zero; lanes outside the image have stopped."""
     for i in range(PLANE, state.shape[0]):
@@ -135,20 +153,14 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
     state = np.empty(4 * PLANE, np.float32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(first, last):
-        left, top = tile % columns * TILE, tile // columns * TILE
-        num_x, num_y = min(TILE, width - left), min(TILE, height - top)
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
         _open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
             _gather(footprints, members, start, stop, end, left, top, batch)
-            for i in range(start, stop):
-                k = np.uint64(members[i])
-                j = np.uint64(i - start)
-                batch[j, 8], batch[j, 9], batch[j, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
-            for i in range(stop, min(end, stop + BATCH)):
-                prefetch_row(colors, members[i])
+            _gather_colors(colors, members, start, stop, end, batch)
             _blend(state, batch, stop - start, y_low, y_high)
             start = stop
             y_low, y_high = _live_rows(state, y_low, y_high)
@@ -213,8 +225,7 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
     state = np.empty(6 * PLANE, np.float32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(first, last):
-        left, top = tile % columns * TILE, tile // columns * TILE
-        num_x, num_y = min(TILE, width - left), min(TILE, height - top)
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
         _open_tile(state, num_x, num_y)
         for y in range(num_y):
             for x in range(num_x):
@@ -289,9 +300,9 @@ def contributions(footprints, members, offsets, columns, height, width, totals):
     bits = state.view(np.int32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(offsets.shape[0] - 1):
-        left, top = tile % columns * TILE, tile // columns * TILE
-        _open_tile(state, min(TILE, width - left), min(TILE, height - top))
-        y_low, y_high = 0, min(TILE, height - top) - 1
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
+        _open_tile(state, num_x, num_y)
+        y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)

@@ -37,8 +37,10 @@ from gsmerge.kernels.raster import (
     P1,
     PLANE,
     _gather,
+    _gather_colors,
     _live_rows,
     _open_tile,
+    _tile_box,
 )
 
 # Numbers per Gaussian: the sums of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy, where x, y
@@ -156,20 +158,14 @@ def blend_backward(
     state = np.empty(STATE, np.float32)
     batch = np.empty((BATCH, 12), np.float32)
     for tile in range(first, last):
-        left, top = tile % columns * TILE, tile // columns * TILE
-        num_x, num_y = min(TILE, width - left), min(TILE, height - top)
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
         _open_back(state, left, top, num_x, num_y, image, transmittance, grad_image, grad_left)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
             _gather(footprints, members, start, stop, end, left, top, batch)
-            for i in range(start, stop):
-                k = np.uint64(members[i])
-                j = np.uint64(i - start)
-                batch[j, 8], batch[j, 9], batch[j, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
-            for i in range(stop, min(end, stop + BATCH)):
-                prefetch_row(colors, members[i])
+            _gather_colors(colors, members, start, stop, end, batch)
             for j in range(stop - start):
                 y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
                 _walk_back(state, batch, j, y0, y1, slots, start + j)

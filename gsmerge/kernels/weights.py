@@ -7,7 +7,7 @@ from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
 from gsmerge.kernels.project import LN_CUT, TILE
-from gsmerge.kernels.raster import BATCH, P1, PLANE, _gather, _live_rows, _open_tile, _weights
+from gsmerge.kernels.raster import BATCH, P1, PLANE, _gather, _live_rows, _open_tile, _tile_box, _weights
 
 LANES = 4  # channels of an image row: one vector register
 
@@ -49,8 +49,7 @@ def list_weights(footprints, members, offsets, columns, height, width):
     state, batch = np.empty(2 * PLANE, np.float32), np.empty((BATCH, 12), np.float32)
     count = 0
     for tile in range(offsets.shape[0] - 1):
-        left, top = tile % columns * TILE, tile // columns * TILE
-        num_x, num_y = min(TILE, width - left), min(TILE, height - top)
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
         _open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
@@ -93,9 +92,9 @@ def spread(starts, lanes, weights, members, offsets, columns, colors, image):
                 state[p, 1] += w * b
                 state[p, 2] += w * c
                 state[p, 3] += w * d
-        left, top = tile % columns * TILE, tile // columns * TILE
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
+        for y in range(num_y):
+            for x in range(num_x):
                 image[top + y, left + x] = state[y * TILE + x]
 
 
@@ -105,9 +104,9 @@ def collect(starts, lanes, weights, members, offsets, columns, image, sums):
     height, width = image.shape[:2]
     state = np.zeros((PLANE, LANES), np.float32)
     for tile in range(offsets.shape[0] - 1):
-        left, top = tile % columns * TILE, tile // columns * TILE
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
+        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
+        for y in range(num_y):
+            for x in range(num_x):
                 state[y * TILE + x] = image[top + y, left + x]
         for i in range(offsets[tile], offsets[tile + 1]):
             a, b, c, d = f4(0.0), f4(0.0), f4(0.0), f4(0.0)

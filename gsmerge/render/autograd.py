@@ -12,19 +12,25 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels.project_backward import add_rows
 from gsmerge.render.blend import view_colors
-from gsmerge.render.gradient import DifferentiablePlan, color_gradients, gradients_of, plan_differentiable
+from gsmerge.render.gradient import ColorGradients, color_gradients, gradients_of
 from gsmerge.render.images import Rendering, draw_views, prepare_views
-from gsmerge.render.plan import Array, ViewPlan
+from gsmerge.render.plan import Array, ViewPlan, plan_view
 from gsmerge.types import Cameras, Gaussians
 
 
 def _view_gradients(
-    plan: DifferentiablePlan, image: Array, transmittance: Array, grad_image: Array, grad_alpha: Array, pose: bool
-) -> tuple[list[Array], Array | None]:
-    """Gradients of one view's Gaussians, in the order of the fields, and of its view matrix."""
+    plan: ViewPlan,
+    image: Array,
+    transmittance: Array,
+    grad_image: Array,
+    grad_alpha: Array,
+    pose: bool,
+    used: ColorGradients | None,
+) -> tuple[list[Array], Array | None, ColorGradients]:
+    """Gradients of one view's Gaussians, in the order of the fields, of its view matrix, and those through colours."""
     colors = view_colors(plan)
     shape = gradients_of(plan, colors, image, transmittance, grad_image, -grad_alpha, pose)
-    shade = color_gradients(plan, shape.colors, colors)
+    shade = color_gradients(plan, shape.colors, colors, used=used)
     viewmat = shape.viewmat
     if viewmat is not None:
         # the eye is -R^T t, and moves against the means
@@ -32,7 +38,7 @@ def _view_gradients(
         viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
         viewmat[:3, 3] -= plan.viewmat[:3, :3] @ eye
     rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
-    return rows, viewmat
+    return rows, viewmat, shade
 
 
 class _Render(torch.autograd.Function):
@@ -44,12 +50,10 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         cameras = replace(cameras, viewmats=tensors[-1])
         splats, viewmats, Ks = prepare_views(Gaussians(*tensors[:-1]), cameras)
-        plans: dict[int, DifferentiablePlan] = {}
+        plans: dict[int, ViewPlan] = {}
 
         def plan_one(view: int) -> ViewPlan:
-            plans[view] = plan_differentiable(
-                splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options
-            )
+            plans[view] = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
             return plans[view]
 
         drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
@@ -68,12 +72,15 @@ class _Render(torch.autograd.Function):
         lefts = 1 - alphas[..., 0]
         totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]
         poses = np.zeros(tensors[-1].shape)
+        shade: ColorGradients | None = None
         for view, plan in sorted(ctx.plans.items()):
             image, left, grad_image, grad_alpha = (
                 np.ascontiguousarray(tensor.numpy())
                 for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
             )
-            rows, pose = _view_gradients(plan, image, left, grad_image, grad_alpha, ctx.needs_input_grad[-1])
+            rows, pose, shade = _view_gradients(
+                plan, image, left, grad_image, grad_alpha, ctx.needs_input_grad[-1], shade
+            )
             for total, row in zip(totals, rows, strict=True):
                 add_rows(plan.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
             if pose is not None:

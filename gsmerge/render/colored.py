@@ -15,8 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels import harmonics
 from gsmerge.render.blend import composite
-from gsmerge.render.gradient import plan_differentiable, plan_gradients
-from gsmerge.render.plan import Splats
+from gsmerge.render.gradient import plan_gradients
+from gsmerge.render.plan import Splats, plan_view
 
 Shape = tuple[Tensor, Tensor, Tensor, Tensor]  # means, quaternions, scales, opacities
 
@@ -25,18 +25,21 @@ class _Draw(torch.autograd.Function):
     """Image of tensors on the CPU, by the kernels."""
 
     @staticmethod
-    def forward(ctx: Any, camera: dict[str, Any], background: np.ndarray, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, camera: dict[str, Any], background: np.ndarray, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         means, quats, scales, opacities, colors = (tensor.detach().contiguous().numpy() for tensor in tensors)
         unused = np.zeros((len(colors), 0, 3), np.float32)
         splats = Splats(means, quats, scales, opacities, sh0=unused, shN=unused, origin=np.zeros(3))
-        plan = plan_differentiable(splats, **camera)
+        plan = plan_view(splats, **camera)
         image, transmittance = composite(plan, colors, background)
         ctx.plan, ctx.drawn = plan, {"image": image, "transmittance": transmittance, "colors": colors}
-        return torch.from_numpy(image)
+        reached = torch.zeros(len(means), dtype=torch.bool)
+        reached[torch.from_numpy(plan.ids).long()] = True
+        ctx.mark_non_differentiable(reached)
+        return torch.from_numpy(image), reached
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_image: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, grad_image: Tensor, _: Any) -> tuple[Any, ...]:
         found = plan_gradients(ctx.plan, grad_image.numpy(), **ctx.drawn)
 
         def spread(rows: np.ndarray) -> Tensor:
@@ -48,7 +51,7 @@ class _Draw(torch.autograd.Function):
         return None, None, *(spread(one) for one in rows)
 
 
-def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> Tensor:
+def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:
     """Image of one view, by the kernels or, where the tensors are not on the CPU, by gsplat.
 
     Args:
@@ -58,7 +61,8 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
         background: ``[3]`` float32.
 
     Returns:
-        ``[h,w,3]`` on the tensors' device, differentiable in all of them.
+        ``[h,w,3]`` on the tensors' device, differentiable in all of them, and ``[n]`` bool: which Gaussians have a
+        footprint in the view.
     """
     if colors.device.type == "cpu":
         return _Draw.apply(camera, background, *shape, colors)
@@ -66,7 +70,8 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
 
     matrices = (torch.from_numpy(camera[name])[None].to(colors) for name in ("viewmat", "K"))
     cameras = (*matrices, camera["width"], camera["height"])
-    return rasterize(shape, colors, cameras, torch.from_numpy(background), eps2d=camera["eps2d"]).images[0]
+    drawn, reached = rasterize(shape, colors, cameras, torch.from_numpy(background), eps2d=camera["eps2d"])
+    return drawn.images[0], reached[0]
 
 
 def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:

@@ -75,7 +75,7 @@ def rasterize(
     near: float = 0.01,
     far: float = 1e10,
     with_depths: bool = False,
-) -> Rendering:
+) -> tuple[Rendering, Tensor]:
     """One call of gsplat's ``rasterization``.
 
     Args:
@@ -91,7 +91,8 @@ def rasterize(
         with_depths: Also the mean depth.
 
     Returns:
-        Images, alphas and depths, on the device of the tensors; differentiable but for the depths.
+        Images, alphas and depths, on the device of the tensors; differentiable but for the depths. And ``[c,n]`` bool:
+        which Gaussians have a footprint in which view.
 
     Raises:
         GsmergeError: If gsplat is not installed.
@@ -100,11 +101,12 @@ def rasterize(
     viewmats, Ks, width, height = cameras
     backgrounds = background.to(means).expand(len(viewmats), 3).contiguous()
     if len(means) == 0 or len(viewmats) == 0:  # nothing that a kernel could be launched for
-        return _empty((*gaussians, colors, viewmats), backgrounds, (height, width), with_depths)
+        reached = torch.zeros(len(viewmats), len(means), dtype=torch.bool, device=means.device)
+        return _empty((*gaussians, colors, viewmats), backgrounds, (height, width), with_depths), reached
     # a zero quaternion is no rotation, as on the CPU; gsplat would divide by its length
     identity = torch.eye(4, device=quats.device)[0]
     quats = torch.where((quats * quats).sum(1, keepdim=True) > 1e-30, quats, identity)
-    images, alphas, _ = _gsplat().rasterization(
+    images, alphas, details = _gsplat().rasterization(
         means=means,
         quats=quats,
         scales=scales,
@@ -123,7 +125,9 @@ def rasterize(
         render_mode="RGB+ED" if with_depths else "RGB",
         rasterize_mode="antialiased" if antialiased else "classic",
     )
-    return Rendering(images[..., :3], alphas, images[..., 3:].detach() if with_depths else None)
+    radii = details["radii"]  # one per axis from gsplat 1.5 on
+    reached = (radii > 0).all(-1) if radii.ndim == 3 else radii > 0
+    return Rendering(images[..., :3], alphas, images[..., 3:].detach() if with_depths else None), reached
 
 
 def _empty(tensors: tuple[Tensor, ...], backgrounds: Tensor, size: tuple[int, int], with_depths: bool) -> Rendering:
@@ -154,7 +158,7 @@ def render_cuda(
     origin = cameras.centres.detach().double().sum(0) / max(len(cameras), 1)
     shifts = viewmats[:, :3, 3:] + viewmats[:, :3, :3] @ origin[:, None]
     local = torch.cat([torch.cat([viewmats[:, :3, :3], shifts], 2), viewmats[:, 3:]], 1)
-    return rasterize(
+    drawn, _ = rasterize(
         (gaussians.means.double() - origin, gaussians.quats, gaussians.scales, gaussians.opacities),
         torch.cat([gaussians.sh0, gaussians.shN], 1),
         (local, cameras.Ks, cameras.width, cameras.height),
@@ -165,6 +169,7 @@ def render_cuda(
         far=far,
         with_depths=with_depths,
     )
+    return drawn
 
 
 def harmonic_colors(means: Tensor, harmonics: Tensor, eye: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 For training loops, on arrays and without autograd::
 
-    plan = plan_differentiable(splats, viewmat, K, width, height)
+    plan = plan_view(splats, viewmat, K, width, height)
     image, transmittance = composite(plan, colors, background)
     wanted = plan_gradients(plan, grad_image, image=image, transmittance=transmittance, colors=colors)
     means[wanted.ids] -= rate * wanted.means
@@ -17,29 +17,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gsmerge.kernels import harmonics_backward, project_backward, raster_backward
 from gsmerge.render.blend import view_colors
-from gsmerge.render.plan import Array, Splats, ViewPlan, _camera, pieces, plan_view
+from gsmerge.render.plan import Array, ViewPlan, pieces
 from gsmerge.threads import parallel_map, use_threads
 
 WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
-
-
-@dataclass(frozen=True, eq=False)
-class DifferentiablePlan(ViewPlan):
-    """A plan that remembers what it was made with.
-
-    Args:
-        opacities: ``[n]`` float32, those that were drawn.
-        camera: The view's numbers in the order of :mod:`gsmerge.kernels.project`, float32.
-        viewmat: ``[4,4]`` float64, world to camera.
-    """
-
-    opacities: Array
-    camera: Array
-    viewmat: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,33 +66,6 @@ class ColorGradients:
     means: Array
 
 
-def plan_differentiable(
-    splats: Splats,
-    viewmat: ArrayLike,
-    K: ArrayLike,
-    width: int,
-    height: int,
-    *,
-    eps2d: float = 0.3,
-    antialiased: bool = False,
-    near: float = 0.01,
-    far: float = 1e10,
-    opacities: Array | None = None,
-    keep: Array | None = None,
-) -> DifferentiablePlan:
-    """:func:`gsmerge.render.plan_view`, with the same arguments, for :func:`plan_gradients`."""
-    plan = plan_view(
-        splats, viewmat, K, width, height,
-        eps2d=eps2d, antialiased=antialiased, near=near, far=far, opacities=opacities, keep=keep,
-    )  # fmt: skip
-    world = np.asarray(viewmat, np.float64)
-    local = world.copy()
-    local[:3, 3] += local[:3, :3] @ splats.origin
-    drawn = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
-    camera = _camera(local, np.asarray(K, np.float64), width, height, eps2d, antialiased)
-    return DifferentiablePlan(**vars(plan), opacities=drawn, camera=camera, viewmat=world)
-
-
 def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
@@ -134,7 +91,7 @@ def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
 
 
 def gradients_of(
-    plan: DifferentiablePlan,
+    plan: ViewPlan,
     colors: Array,
     image: Array,
     transmittance: Array,
@@ -178,7 +135,7 @@ def gradients_of(
 
 
 def plan_gradients(
-    plan: DifferentiablePlan,
+    plan: ViewPlan,
     grad_image: Array,
     grad_transmittance: Array | None = None,
     *,
@@ -190,7 +147,7 @@ def plan_gradients(
     """Gradients of a loss on the image that :func:`gsmerge.render.composite` made of a plan.
 
     Args:
-        plan: The view, from :func:`plan_differentiable`.
+        plan: The view, from :func:`gsmerge.render.plan_view`.
         grad_image: ``[h,w,3]`` gradient with respect to the image.
         grad_transmittance: ``[h,w]`` gradient with respect to the remaining transmittance; None for none. (The
             background's part is in the image's gradient already.)
@@ -215,7 +172,9 @@ def plan_gradients(
     return gradients_of(plan, drawn, image, transmittance, grad_image, left, with_viewmat)
 
 
-def color_gradients(plan: ViewPlan, grad_colors: Array, colors: Array | None = None) -> ColorGradients:
+def color_gradients(
+    plan: ViewPlan, grad_colors: Array, colors: Array | None = None, *, used: ColorGradients | None = None
+) -> ColorGradients:
     """Gradients of a loss on the colours that the spherical harmonics of a plan's Gaussians give in its view.
 
     Args:
@@ -223,6 +182,8 @@ def color_gradients(plan: ViewPlan, grad_colors: Array, colors: Array | None = N
         grad_colors: ``[m,3]``, such as :attr:`Gradients.colors`.
         colors: ``[m,3]`` float32, the colours themselves, where they are at hand. Where they are cut at 0 no gradient
             passes.
+        used: An earlier answer of as many coefficients that nobody needs any more: its memory is written again if it
+            is large enough. New memory costs a quarter of the time, and where pages are small several times all of it.
 
     Returns:
         The gradients; the one of the eye is minus the sum of those of the means.
@@ -233,8 +194,11 @@ def color_gradients(plan: ViewPlan, grad_colors: Array, colors: Array | None = N
     m, splats = len(plan.ids), plan.splats
     grad_colors = _expect("grad_colors", grad_colors, (m, 3))
     colors = view_colors(plan) if colors is None else _expect("colors", colors, (m, 3))
-    sh0, shN = np.empty((m, 1, 3), np.float32), np.empty((m, *splats.shN.shape[1:]), np.float32)
-    means = np.empty((m, 3), np.float32)
+    rest = splats.shN.shape[1:]
+    if used is not None and len(used.ids) >= m and used.shN.shape[1:] == rest:
+        sh0, shN, means = used.sh0[:m], used.shN[:m], used.means[:m]
+    else:
+        sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), rest, (3,)))
     with use_threads() as threads:
         parallel_map(
             lambda span: harmonics_backward.view_colors_backward(

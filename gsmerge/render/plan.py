@@ -60,6 +60,9 @@ class ViewPlan:
         members: ``[intersections]`` int32 rows of ``ids``, tile after tile, nearest first.
         offsets: ``[tiles+1]`` int64 starts of the tiles' lists.
         eye: ``[3]`` float32, the camera's centre less ``splats.origin``.
+        opacities: ``[n]`` float32, those that are drawn.
+        camera: The view's numbers in the order of :mod:`gsmerge.kernels.project`, float32.
+        viewmat: ``[4,4]`` float64, world to camera.
         width: Image width, pixels.
         height: Image height, pixels.
     """
@@ -71,6 +74,9 @@ class ViewPlan:
     members: Array
     offsets: Array
     eye: Array
+    opacities: Array
+    camera: Array
+    viewmat: Array
     width: int
     height: int
 
@@ -264,8 +270,9 @@ def plan_view(
     if opacities.shape != (len(splats),) or len(keep) not in (0, len(splats)):
         raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {len(keep)}")
 
-    viewmat[:3, 3] += viewmat[:3, :3] @ splats.origin
-    camera = _camera(viewmat, K, width, height, eps2d, antialiased)
+    local = viewmat.copy()
+    local[:3, 3] += local[:3, :3] @ splats.origin
+    camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
     columns, lines = -(-width // projection.TILE), -(-height // projection.TILE)
     with use_threads() as threads:
@@ -273,5 +280,7 @@ def plan_view(
         footprints, depths, boxes = _project(splats, opacities, ids, camera, threads)
         order = binning.depth_order(depths.view(np.uint32))
         members, offsets = _bin(order, boxes, lines, columns, threads)
-    eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
-    return ViewPlan(splats, ids, footprints, depths, members, offsets, eye, width, height)
+    eye = (-local[:3, :3].T @ local[:3, 3]).astype(np.float32)
+    return ViewPlan(
+        splats, ids, footprints, depths, members, offsets, eye, opacities, camera, viewmat, width, height
+    )  # fmt: skip

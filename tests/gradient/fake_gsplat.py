@@ -85,7 +85,9 @@ def rasterization(
         image = drawn.image + drawn.transmittance[..., None] * background
         images.append(torch.cat([image, drawn.depth[..., None]], -1) if render_mode == "RGB+ED" else image)
         alphas.append(1 - drawn.transmittance[..., None])
-    return torch.stack(images).float(), torch.stack(alphas).float(), {}
+    depths = torch.einsum("cij,nj->cni", viewmats[:, :3, :3], means)[..., 2] + viewmats[:, 2, 3:]
+    radii = (depths > near_plane).int()[..., None].expand(-1, -1, 2)
+    return torch.stack(images).float(), torch.stack(alphas).float(), {"radii": radii}
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:

@@ -14,12 +14,10 @@ from reference_gradients import BACKGROUND, HEIGHT, WIDTH, random_gaussians, tur
 from renderer import render_reference, view_colors
 
 from gsmerge import Gaussians
-from gsmerge.render import ViewPlan, composite, prepare
+from gsmerge.render import ViewPlan, composite, plan_view, prepare
 from gsmerge.render.gradient import (
-    DifferentiablePlan,
     Gradients,
     color_gradients,
-    plan_differentiable,
     plan_gradients,
 )
 from gsmerge.threads import use_threads
@@ -27,18 +25,16 @@ from gsmerge.threads import use_threads
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
-def plan_of(gaussians: Gaussians, **options: Any) -> DifferentiablePlan:
+def plan_of(gaussians: Gaussians, **options: Any) -> ViewPlan:
     cameras = turned_cameras(1)
-    return plan_differentiable(
-        prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options
-    )
+    return plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options)
 
 
 def normal(*shape: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 
-def gradients_of_plan(plan: DifferentiablePlan, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
+def gradients_of_plan(plan: ViewPlan, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
     image, transmittance = composite(plan, colors, BACKGROUND)
     return plan_gradients(
         plan, normal(HEIGHT, WIDTH, 3), grad_left,
@@ -90,6 +86,20 @@ def test_colours_of_every_degree(degree: int) -> None:
     for name, tensor in (("means", means), ("sh0", sh0), ("shN", shN)):
         wanted = np.zeros(tensor.shape) if tensor.grad is None else tensor.grad.numpy()
         assert_near(full(found, name, 150), wanted, 1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3, 4])
+@pytest.mark.parametrize(("number", "enough"), [(100, False), (200, True)])
+def test_used_memory_is_written_again(number: int, enough: bool, degree: int) -> None:
+    """Where it is large enough; the answer is the same."""
+    plan, other = plan_of(random_gaussians(150, degree, degree)), plan_of(random_gaussians(number, degree, 5))
+    assert (len(other.ids) > len(plan.ids)) == enough
+    used = color_gradients(other, normal(len(other.ids), 3))
+    wanted = color_gradients(plan, normal(len(plan.ids), 3))
+    found = color_gradients(plan, normal(len(plan.ids), 3), used=used)
+    for one, again in zip(vars(wanted).values(), vars(found).values(), strict=True):
+        np.testing.assert_array_equal(one, again)
+    assert np.shares_memory(found.sh0, used.sh0) == enough
 
 
 def test_opacities_in_place_of_the_gaussians_own() -> None:
@@ -147,7 +157,7 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
 
     def run(count: int) -> list[np.ndarray]:
         with use_threads(count):
-            plan = plan_differentiable(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
+            plan = plan_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
             assert len(plan.members) > 2000
             image, left = composite(plan)
             shape = plan_gradients(
@@ -219,7 +229,6 @@ def test_a_view_of_nothing() -> None:
 def test_what_is_planned_and_drawn_is_what_it_was() -> None:
     gaussians = random_gaussians(50, 1, 12)
     plan = plan_of(gaussians, near=2.0, far=4.0)
-    assert isinstance(plan, ViewPlan)
     assert ((plan.depths > 2) & (plan.depths < 4)).all()
     assert plan.opacities is plan.splats.opacities
 

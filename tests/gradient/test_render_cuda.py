@@ -160,10 +160,13 @@ def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F
         tensors = [t.clone().requires_grad_() for t in (*list(vars(gaussians).values())[:4], colors)]
         shape = (tensors[0], tensors[1], tensors[2], tensors[3])
         if fast:
-            image = draw_colored(shape, tensors[4], camera, background)
+            image, reached = draw_colored(shape, tensors[4], camera, background)
+            assert reached.shape == (len(colors),)
         else:
             views = viewmat[None], K[None], 37, 21
-            image = rasterize(shape, tensors[4], views, torch.from_numpy(background), eps2d=0.075).images[0]
+            drawn, reached = rasterize(shape, tensors[4], views, torch.from_numpy(background), eps2d=0.075)
+            image = drawn.images[0]
+            assert reached.shape == (1, len(tensors[4]))
         (image * grad_image[0]).sum().backward()
         found.append((image.detach(), [tensor.grad for tensor in tensors]))
     assert psnr(found[0][0], found[1][0]) > 80
@@ -207,11 +210,12 @@ def test_gsplat_gets_tensors_of_the_device_alone(with_depths: bool, monkeypatch:
     module = ModuleType("gsplat")
     monkeypatch.setitem(sys.modules, "gsplat", module)
 
-    def rasterization(**given: Any) -> tuple[Tensor, Tensor, None]:
+    def rasterization(**given: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         assert all(value.is_meta for value in given.values() if isinstance(value, Tensor))
         size = len(given["viewmats"]), given["height"], given["width"]
         channels = 4 if given["render_mode"] == "RGB+ED" else 3
-        return torch.empty(*size, channels, device="meta"), torch.empty(*size, 1, device="meta"), None
+        radii = torch.empty(len(given["viewmats"]), len(given["means"]), 2, device="meta")
+        return torch.empty(*size, channels, device="meta"), torch.empty(*size, 1, device="meta"), {"radii": radii}
 
     def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
         assert dirs.is_meta
@@ -229,8 +233,9 @@ def test_gsplat_gets_tensors_of_the_device_alone(with_depths: bool, monkeypatch:
     colors = seen_colors(gaussians.means, gaussians.sh0, gaussians.shN, np.eye(4))
     camera = {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 6, "eps2d": 0.1}
     shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-    image = draw_colored(shape, colors, camera, np.zeros(3, np.float32))
+    image, reached = draw_colored(shape, colors, camera, np.zeros(3, np.float32))
     assert image.is_meta
+    assert reached.is_meta
     assert image.shape == (6, 8, 3)
 
 

@@ -28,7 +28,9 @@ CPU = torch.device("cpu")
 gpu = pytest.mark.skipif(
     not torch.cuda.is_available() or find_spec("gsplat") is None, reason="needs a CUDA device and gsplat"
 )
-QUICK = FitOptions(fit_steps=8, holdout=0.2)
+PULLS = FitOptions(fit_steps=8, holdout=0.2)
+# Without the pulls: where they are the whole gradient, Adam turns its last bit into a full step.
+QUICK = replace(PULLS, opacity_pull=0.0, size_pull=0.0)
 
 
 def pair_of(scene: PixelScene) -> Pair:
@@ -84,6 +86,18 @@ def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[st
     (found, errors), (wanted, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
     assert_same_state(found, wanted)
     assert errors == pytest.approx(others, rel=1e-4)
+
+
+@pytest.mark.parametrize("pulls", [{"opacity_pull": 3.0}, {"size_pull": 3.0}, {}], ids=str)
+def test_pulls_are_the_kernels(start: Gaussians, photos: Pair, pulls: dict[str, float]) -> None:
+    """By the moments of one step, which are its gradient."""
+    one = replace(PULLS if not pulls else QUICK, fit_steps=1, **pulls)
+    (found, _), (wanted, _), (without, _) = (
+        run(start, photos, options, engine)
+        for options, engine in ((one, torch_engine(CPU)), (one, KERNELS), (replace(QUICK, fit_steps=1), KERNELS))
+    )
+    assert np.linalg.norm(found.m - wanted.m) <= 1e-4 * np.linalg.norm(wanted.m)
+    assert np.linalg.norm(without.m - wanted.m) > 1e-3 * np.linalg.norm(wanted.m)
 
 
 @pytest.mark.parametrize("degree", [1, 3])
@@ -184,7 +198,7 @@ def test_starting_draws_and_differentiates(monkeypatch: pytest.MonkeyPatch) -> N
     """Also where gradients are off, as they are within a run."""
     drawn: list[torch.Tensor] = []
     draw = module.draw_colored
-    monkeypatch.setattr(module, "draw_colored", lambda *args: drawn.append(draw(*args)) or drawn[-1])
+    monkeypatch.setattr(module, "draw_colored", lambda *args: drawn.append(draw(*args)[0]) or draw(*args))
     with torch.no_grad():
         start_gpu(CPU)
     assert drawn[0].requires_grad
@@ -197,8 +211,9 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
     monkeypatch.setattr(module, "mean_error", lambda image, photo, weight: str((image - photo).device))
     monkeypatch.setattr(torch.autograd, "grad", lambda loss, leaves: [torch.empty_like(leaf) for leaf in leaves])
 
-    def drawn(colors: torch.Tensor, camera: dict[str, Any]) -> torch.Tensor:
-        return colors.sum() * torch.ones(camera["height"], camera["width"], 3, device=colors.device)
+    def drawn(colors: torch.Tensor, camera: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
+        image = colors.sum() * torch.ones(camera["height"], camera["width"], 3, device=colors.device)
+        return image, torch.ones(len(colors), dtype=torch.bool, device=colors.device)
 
     plan = plan_run(photos, replace(QUICK, dropout=0.2), 0)
     held = module.upload(start_state(start), torch.device("meta"))

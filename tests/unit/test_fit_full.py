@@ -14,9 +14,10 @@ import torch
 from gsmerge import Gaussians, PixelScene
 from gsmerge.fit import FitOptions, Rates, start_share
 from gsmerge.fit import full as full_module
-from gsmerge.fit.full import affordable_steps, fit_full, holdout_score, plan_run, step_sizes
+from gsmerge.fit.full import affordable_steps, box_shares, fit_full, holdout_score, plan_run, step_sizes
 from gsmerge.fit.state import start_state
 from gsmerge.photos import Photos, scene_photos
+from gsmerge.render import plan_view, splat_adjoint
 from gsmerge.threads import use_threads
 
 Pair = tuple[Photos, Photos]
@@ -105,6 +106,37 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
     assert float((result.scales / start.scales).log().abs().max()) <= 0.1001
     logits = [g.opacities.double().logit() for g in (start, result)]
     assert float((logits[1] - logits[0]).abs().max()) <= 0.2001
+
+
+def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
+    state = start_state(truth)
+    shares = box_shares(state, photos[1], 0.3)
+    assert shares.dtype == np.float32
+    assert shares.min() >= np.float32(0.3)
+    assert shares.max() == 1
+    alone = Photos(*(getattr(photos[1], name)[:1] for name in ("images", "viewmats", "Ks")), eps2d=photos[1].eps2d)
+    np.testing.assert_array_equal(box_shares(state, alone, 0.3), np.full(len(truth), 0.3, np.float32))
+    twice = Photos(*(np.repeat(a, 2, 0) for a in (alone.images, alone.viewmats, alone.Ks)), eps2d=alone.eps2d)
+    shown = splat_adjoint(plan_view(state.splats, **alone.camera(0)), np.ones((alone.height, alone.width, 1)))[:, 0]
+    np.testing.assert_allclose(box_shares(state, twice, 0.3), np.where(shown > 0, 1, 0.3), atol=1e-6)
+
+
+def test_single_photo_moves_less(truth: Gaussians) -> None:
+    scene, _ = scenes.self_made(0, 1)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, pair_of(scene), QUICK)
+    assert report.accepted
+    rates = QUICK.rates
+    unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
+    assert ((result.means - start.means).norm(dim=1) <= 1.001 * rates.reach_alone * rates.reach_mean * unit).all()
+    assert float((result.scales / start.scales).log().abs().max()) <= 1.001 * rates.reach_alone * rates.reach_size
+
+
+@pytest.mark.parametrize(("name", "field"), [("opacity_pull", "opacities"), ("size_pull", "scales")])
+def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
+    start = scenes.spoil(truth)
+    free, pulled = (fit_full(start, photos, replace(QUICK, **{name: pull}))[0] for pull in (0.0, 0.05))
+    assert getattr(pulled, field).log().mean() < getattr(free, field).log().mean() - 0.02
 
 
 # counts

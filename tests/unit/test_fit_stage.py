@@ -114,7 +114,8 @@ def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
     "setting",
     [
         {"fit": "best"}, {"fit_steps": 0}, {"time_budget": 0.0}, {"time_budget": -1.0}, {"dropout": 1.0},
-        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
+        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0}, {"opacity_pull": -1.0},
+        {"size_pull": -1.0},
     ],
     ids=str,
 )  # fmt: skip
