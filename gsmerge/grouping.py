@@ -60,7 +60,7 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
         count = max(1, int(asked * share))
         coarse = min(round(behind * count), count - 1)
         groups = segment(pictures, options.segment, count - coarse)
-        total = asked * views * options.decode.count
+        total = max(views, asked * scene.num_gaussians // pixels) * options.decode.count
     else:
         leaves = min(max(asked, -(-(wanted or 0) // views)), pixels)
         fine = segment(pictures, options.segment, leaves)
@@ -84,7 +84,7 @@ def uses_robust(scene: PixelScene, options: CompactOptions) -> bool:
 
 def target_count(scene: PixelScene, options: CompactOptions) -> int | None:
     """The number of Gaussians that a budget or a file size asks for, the smaller of the two; None without either."""
-    num_input, wanted = len(scene.gaussians), []
+    num_input, wanted = scene.num_gaussians, []
     if options.budget is not None:
         wanted.append(parse_budget(options.budget, num_input))
     if options.max_bytes is not None:

@@ -177,5 +177,7 @@ def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
         load = align_scene(ply, files, camera_file)
     except SceneError as error:
         return found | {"alignment_problem": str(error)}
+    if load.problem is not None:
+        return found | {"alignment_problem": load.problem, "notes": load.notes}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
     return found | size | {"alignment": load.alignment, "notes": load.notes}

@@ -139,7 +139,7 @@ def compact(
                 before, after = input_psnr(scene.gaussians, photos, near), input_psnr(gaussians, photos, near)
     if progress:
         progress("done", len(STAGES), len(STAGES))
-    counts = len(scene.gaussians), len(gaussians)
+    counts = scene.num_gaussians, len(gaussians)
     report = CompactReport(
         *counts, run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak_memory()
     )

@@ -100,13 +100,14 @@ def _run(
 ) -> dict[str, Any]:
     """Read, compact and write; returns the report."""
     from gsmerge import pipeline
-    from gsmerge.io import align_scene, atomic_output, read_ply, write_ply
+    from gsmerge.io import atomic_output, load_files, write_ply
     from gsmerge.report import report_document
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
-        superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
+        loaded = load_files(files, opacity=opacity)
+        pixel_scene = loaded.pixel_scene()
+        superpixels_per_view(settings.segment, pixel_scene.cameras.width, pixel_scene.cameras.height)
         read = perf_counter()
         with (
             announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
@@ -119,7 +120,7 @@ def _run(
                 if progress is not None:
                     progress(stage, done, total)
 
-            result = pipeline.compact(loaded.scene, settings, progress=moved)
+            result = pipeline.compact(pixel_scene, settings, progress=moved)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
     return report_document(
@@ -160,12 +161,13 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 def _print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, as_json: bool
 ) -> None:
-    from gsmerge.io import align_scene, read_ply
+    from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
-    loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
-    scene, cameras = loaded.scene, loaded.scene.cameras
+    loaded = load_files(files, opacity=opacity)
+    scene = loaded.pixel_scene()
+    cameras = scene.cameras
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(scene), cameras.height, cameras.width),

@@ -41,7 +41,7 @@ def segment(
     debug: opt.DebugOption = False,
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
-    from gsmerge.io import align_scene, find_scene_files, read_ply
+    from gsmerge.io import find_scene_files, load_files
     from gsmerge.segment import SegmentOptions
     from gsmerge.threads import use_threads
 
@@ -51,8 +51,8 @@ def segment(
         options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
     files = find_scene_files(scene, cameras=cameras, images=images)
     check_folder(output, input_files(files), overwrite=overwrite)
-    loaded = align_scene(read_ply(files.ply, opacity=opacity.value), files)
-    pixel_scene = loaded.scene
+    loaded = load_files(files, opacity=opacity.value)
+    pixel_scene = loaded.pixel_scene()
     per_view = superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
     say_notes(loaded.notes, quiet=quiet or json)
     stems = picture_stems(pixel_scene.names)

@@ -58,6 +58,20 @@ def holds_images(path: Path) -> bool:
         return False
 
 
+def read_depths(path: Path) -> np.ndarray | None:
+    """The depth maps ``[c,h,w]`` beside the cameras; None where there are none."""
+    if path.suffix != ".npz" or not zipfile.is_zipfile(path):
+        return None
+    try:
+        with path.open("rb") as file, np.load(file) as stored:
+            depths = _first({name: stored[name] for name in _DEPTHS if name in stored.files}, _DEPTHS)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error
+    if depths is not None and depths.ndim == 4 and depths.shape[3] == 1:
+        depths = depths[..., 0]
+    return depths if depths is not None and depths.ndim == 3 else None
+
+
 def _load(path: Path) -> dict[str, np.ndarray]:
     """The arrays that matter; depth only for its shape, so the confidence is never decompressed."""
     wanted = {*_EXTRINSICS, *_INTRINSICS, *_IMAGES}
@@ -90,8 +104,8 @@ def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Intrinsics at the given size: these networks keep the principal point in the middle, which tells their size."""
     ratio_x, ratio_y = 2 * Ks[:, 0, 2] / width, 2 * Ks[:, 1, 2] / height
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
-    # the same ratio on both axes: another size; one that differs between them: a principal point off the middle
-    other_size = (np.abs(ratio_x / ratio_y - 1) < 0.03) & (np.abs(ratio_x - 1) > 0.01)
+    # the same ratio on both axes, clearly: another size; otherwise a principal point that is not in the middle
+    other_size = (np.abs(ratio_x / ratio_y - 1) < 0.03) & (np.abs(ratio_x - 1) > 0.1)
     scaled = Ks.copy()
     for i in range(len(Ks)):
         if normalised[i]:
