@@ -26,12 +26,14 @@ class Frame:
         scale: Positive.
         shift: ``[3]``.
         words: What it is, for people; empty where both frames are the same.
+        kind: "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was turned; "other".
     """
 
     rotation: np.ndarray
     scale: float
     shift: np.ndarray
     words: str = ""
+    kind: str = "same"
 
     def move_cameras(self, viewmats: np.ndarray) -> np.ndarray:
         """``[c,4,4]`` world-to-camera matrices, for the frame of the Gaussians."""
@@ -99,24 +101,22 @@ def candidate_frames(
         exporters do; any similarity, from the poses that the cameras must have.
     """
     if scale is not None:
-        yield Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}, as told")
+        yield Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}, as told", "scaled")
     else:
         yield SAME
     rays, centres = ray_directions(seen, viewmats, Ks)
-    for rotation, words in _known_rotations(viewmats):
+    for rotation, words, kind in _known_rotations(viewmats):
         turned = rays @ rotation.T, centres @ rotation.T
         if words:
-            yield Frame(rotation, scale or 1.0, np.zeros(3), words)
+            yield Frame(rotation, scale or 1.0, np.zeros(3), words, kind)
         if effort == 0:
             continue
         comma = f"{words}, " if words else ""
-        if scale is None:
-            frame = _similar(seen.points, *turned, rotation, shifted=False)
+        for shifted in (False, True):
+            frame = _similar(seen.points, *turned, rotation, shifted=shifted) if shifted or scale is None else None
             if frame is not None:
-                yield Frame(rotation, frame.scale, frame.shift, f"{comma}positions scaled by {frame.scale:.4g}")
-        frame = _similar(seen.points, *turned, rotation, shifted=True)
-        if frame is not None:
-            yield Frame(rotation, frame.scale, frame.shift, f"{comma}positions scaled by {frame.scale:.4g} and shifted")
+                said = f"{comma}positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
+                yield replace(frame, words=said, kind=kind or ("shifted" if shifted else "scaled"))
     if effort < 2:
         return
     free = _free_poses(seen, Ks)
@@ -127,17 +127,17 @@ def candidate_frames(
     if frame is not None:
         angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
         words = f"turned by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
-        yield replace(frame, words=words)
+        yield replace(frame, words=words, kind="other")
 
 
-def _known_rotations(viewmats: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:
-    yield np.eye(3), ""
+def _known_rotations(viewmats: np.ndarray) -> Iterator[tuple[np.ndarray, str, str]]:
+    yield np.eye(3), "", ""
     first, middle = viewmats[0, :3, :3], viewmats[len(viewmats) // 2, :3, :3]
     half = np.sqrt(0.5)
     upright = np.array([[half, half, 0], [-half, half, 0], [0, 0, 1]]) @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-    yield first, "turned into the first camera"
-    yield middle, "turned into the middle camera"
-    yield upright @ first, "turned upright from the first camera"
+    yield first, "turned into the first camera", "first"
+    yield middle, "turned into the middle camera", "middle"
+    yield upright @ first, "turned upright from the first camera", "upright"
 
 
 def _similar(

@@ -47,6 +47,8 @@ class PlyInfo:
         columns: All columns of the vertex element, in the file's order.
         extra_columns: Those that mean nothing here.
         extra_elements: Elements beside ``vertex``.
+        byte_columns: Columns stored as bytes.
+        comments: Of the header.
         sh_degree: 0 to 4.
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
         opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
@@ -64,6 +66,8 @@ class PlyInfo:
     columns: tuple[str, ...]
     extra_columns: tuple[str, ...]
     extra_elements: tuple[str, ...]
+    byte_columns: tuple[str, ...]
+    comments: tuple[str, ...]
     sh_degree: int
     opacity_encoding: str
     opacity_guessed: bool
@@ -125,7 +129,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
     done = parallel_map(lambda block: _convert(rows[block], {k: v[block] for k, v in out.items()}), blocks)
 
-    named = _named_encoding(opacity, data)
+    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
+    named = opacity if opacity != "auto" else "logit" if LOGIT_COMMENT in comments else None
     encoding = named or _likely_encoding(done)
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _set_aside(path, out)
@@ -141,6 +146,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         columns=names,
         extra_columns=extra,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+        byte_columns=tuple(name for name in names if rows.dtype[name].itemsize == 1),
+        comments=comments,
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
         opacity_guessed=named is None,
@@ -297,14 +304,6 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
         exact[length == 0] = (1, 0, 0, 0)
         out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
     return zero
-
-
-def _named_encoding(opacity: str, data: PlyData) -> str | None:
-    """The encoding that the caller or the file's own comment names."""
-    if opacity != "auto":
-        return opacity
-    comments = [*data.comments, *(c for e in data.elements for c in e.comments)]
-    return "logit" if LOGIT_COMMENT in comments else None
 
 
 def _likely_encoding(done: list[_Converted]) -> str:

@@ -163,7 +163,7 @@ def rough_frames(
 ) -> list[Frame]:
     """Frames worth a try before any pixel is known: the same, and the scale under which rows step by single pixels."""
     if scale is not None:
-        return [Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}, as told")]
+        return [Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}, as told", "scaled")]
     views = len(viewmats)
     windows = [
         (view, np.arange(middle - SHORT // 4, middle + SHORT // 4).clip(0, len(points) - 1))
@@ -180,7 +180,7 @@ def rough_frames(
     for width_of_search in (1.08, 1.02, 1.005):
         near = best * np.geomspace(1 / width_of_search, width_of_search, 9)
         best = float(near[int(np.argmin([cost(size) for size in near]))])
-    return [SAME, Frame(np.eye(3), best, np.zeros(3), f"positions scaled by {best:.4g}")]
+    return [SAME, Frame(np.eye(3), best, np.zeros(3), f"positions scaled by {best:.4g}", "scaled")]
 
 
 def _mean_unevenness(

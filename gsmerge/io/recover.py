@@ -173,7 +173,7 @@ def _refined(clues: Clues, found: Evidence) -> Evidence:
     """The winner measured again, and its frame solved again, on more Gaussians."""
     if found.layout.kind == "pruned":
         return found
-    return _best_frame(clues, found.layout, SAMPLES, 2 if "degrees" in found.frame.words else 1)
+    return _best_frame(clues, found.layout, SAMPLES, 2 if found.frame.kind == "other" else 1)
 
 
 def _cameras_agree(clues: Clues, best: Evidence) -> bool:

@@ -18,12 +18,14 @@ from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignmen
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
 from gsmerge.io.cameras.da3 import read_da3, read_depths
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
+from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.images import as_tensor, find_image, natural_key, read_images
 from gsmerge.io.loose import looks_like_a_grid, sight
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.reading import AUTO, Reading, make_reading
 from gsmerge.io.recover import Clues, Recovery, recover
+from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.types import Cameras, LooseScene, PixelScene
@@ -44,6 +46,7 @@ class SceneLoad:
         alignment: How well every view's Gaussians project into their own pixels; None for a loose scene.
         recovery: Which reading of the rows won, and by how much; None for a loose scene.
         problem: Why no pixels were found, in one sentence; None where they were.
+        dialects: The exporters that may have written the file, or the one that was told.
         notes: What was adapted or looks odd, one sentence each, without a full stop.
     """
 
@@ -54,6 +57,7 @@ class SceneLoad:
     alignment: Alignment | None
     recovery: Recovery | None
     problem: str | None
+    dialects: tuple[Dialect, ...]
     notes: tuple[str, ...]
 
     def pixel_scene(self) -> PixelScene:
@@ -114,7 +118,9 @@ def load_scene(
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO) -> SceneLoad:
     """:func:`load_scene` for files that are found already."""
-    return align_scene(read_ply(files.ply, opacity=opacity), files, reading=reading)
+    told = find_dialect(reading.dialect)
+    encoding = opacity if told is None or opacity != "auto" else told.opacity
+    return align_scene(read_ply(files.ply, opacity=encoding), files, reading=reading)
 
 
 def align_scene(
@@ -137,20 +143,36 @@ def align_scene(
     read = read_cameras(files.cameras) if camera_file is None else camera_file
     images = read_photos(files, read)
     cameras, notes = _fit_grid(ply.info, files, read, images)
+    told = find_dialect(reading.dialect)
+    order = told.order if told is not None and reading.order == "auto" else reading.order
     orders, depths = _labellings(read.names), partial(read_depths, Path(read.path))
-    clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, reading.order, reading.scene_scale)
+    clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, order, reading.scene_scale)
     recovery = recover(clues)
     if recovery is None:
-        return _loose(ply, files, read, clues, (*ply_notes(ply.info), *notes))
+        return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
     best = recovery.best
+    dialects = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
     moved = torch.from_numpy(best.frame.move_cameras(clues.viewmats))
     in_frame = cameras if best.frame is SAME else replace(cameras, viewmats=moved)
     scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, images, read.names)
+    scene, turned = _with_rotations(scene, reading, dialects)
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
-    notes += _layout_notes(recovery, clues) + _colour_notes(scene)
+    notes += _layout_notes(recovery, clues) + turned + _colour_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.valid)
-    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, (*ply_notes(ply.info), *notes))
+    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
+
+
+def _with_rotations(scene: PixelScene, reading: Reading, dialects: Sequence[Dialect]) -> tuple[PixelScene, list[str]]:
+    """Rotations as told, as the told exporter stores them, or as the surface says; and a note where that was it."""
+    if reading.quats != "auto":
+        return read_rotations(scene, reading.quats), []
+    if reading.dialect != "auto":
+        return read_rotations(scene, dialects[0].quats), []
+    if any(not dialect.check_rotations for dialect in dialects):
+        return scene, []
+    choice, words = likely_rotations(scene)
+    return read_rotations(scene, choice), [words] if words else []
 
 
 def _labellings(names: Sequence[str]) -> list[list[int]]:
@@ -172,7 +194,7 @@ def _layout_notes(recovery: Recovery, clues: Clues) -> list[str]:
 
 
 def _loose(
-    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, clues: Clues, notes: tuple[str, ...]
+    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, clues: Clues, reading: Reading, notes: tuple[str, ...]
 ) -> SceneLoad:
     """The scene without pixels, if the cameras see it.
 
@@ -192,14 +214,19 @@ def _loose(
         if _lacks_cameras(clues):
             raise SceneError(ply.info.path, problem, remedy)
     if clues.scale is not None:
-        told = Frame(np.eye(3), clues.scale, np.zeros(3))
-        cameras = replace(cameras, viewmats=torch.from_numpy(told.move_cameras(clues.viewmats)))
+        scaled = Frame(np.eye(3), clues.scale, np.zeros(3))
+        cameras = replace(cameras, viewmats=torch.from_numpy(scaled.move_cameras(clues.viewmats)))
     seen = sight(ply.gaussians, ply.valid, cameras, images)
     if not seen.ok:
         raise SceneError(ply.info.path, f"{problem}; {seen.words}", remedy)
-    scene = LooseScene(ply.gaussians[ply.valid], cameras, images, camera_file.names)
+    told = find_dialect(reading.dialect)
+    dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
+    gaussians = ply.gaussians[ply.valid]
+    if reading.quats == "xyzw":
+        gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
+    scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
-    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, (*notes, lost))
+    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, lost))
 
 
 def _lacks_cameras(clues: Clues) -> bool:
