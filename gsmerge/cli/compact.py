@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, default_output, input_files
-from gsmerge.cli.settings import superpixels_per_view, told_as_usage
+from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
 
 if TYPE_CHECKING:
-    from gsmerge.io import SceneFiles, SceneLoad
+    from gsmerge.io import Reading, SceneFiles, SceneLoad
     from gsmerge.io.ply import OpacityChoice
     from gsmerge.options import CompactOptions
     from gsmerge.types import PixelScene
@@ -26,6 +26,10 @@ def compact(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
     method: opt.MethodOption = None,
@@ -50,6 +54,7 @@ def compact(
 ) -> None:
     """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)
@@ -69,11 +74,11 @@ def compact(
     chosen |= {"budget": budget, "max_bytes": max_bytes, "seed": seed, "threads": threads}
     settings = _settings(chosen)
     if dry_run:
-        _print_plan(files, settings, out, opacity=opacity.value, as_json=json)
+        _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
     document = _run(
-        files, settings, out, opacity=opacity.value, overwrite=overwrite, quiet=quiet or json, start=start,
-        hashed=json or report is not None,
+        files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
+        start=start, hashed=json or report is not None,
     )  # fmt: skip
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
 
@@ -93,6 +98,7 @@ def _run(
     out: Path,
     *,
     opacity: OpacityChoice,
+    reading: Reading,
     overwrite: bool,
     quiet: bool,
     start: float,
@@ -105,7 +111,7 @@ def _run(
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        loaded = load_files(files, opacity=opacity)
+        loaded = load_files(files, opacity=opacity, reading=reading)
         pixel_scene = loaded.pixel_scene()
         superpixels_per_view(settings.segment, pixel_scene.cameras.width, pixel_scene.cameras.height)
         read = perf_counter()
@@ -138,8 +144,9 @@ def _run(
 def _recognised(loaded: SceneLoad) -> dict[str, Any]:
     """What the report says about the input."""
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
-    cameras = loaded.scene.cameras
-    views = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    cameras, recovery = loaded.scene.cameras, loaded.recovery
+    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    views |= {"dialects": [dialect.name for dialect in loaded.dialects], "rows": recovery and recovery.words}
     return views | {name: getattr(loaded.ply, name) for name in names}
 
 
@@ -159,13 +166,13 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 
 
 def _print_plan(
-    files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, as_json: bool
+    files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
     from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
-    loaded = load_files(files, opacity=opacity)
+    loaded = load_files(files, opacity=opacity, reading=reading)
     scene = loaded.pixel_scene()
     cameras = scene.cameras
     document = plan_document(
@@ -178,6 +185,7 @@ def _print_plan(
         threads=settings.threads or available_threads(),
         wanted=_wanted(scene, settings),
         notes=loaded.notes,
+        count=scene.num_gaussians,
     )
     if as_json:
         sys.stdout.write(to_json(document))

@@ -8,7 +8,7 @@ from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.ply_writer import write_ply
 from gsmerge.io.reading import AUTO, Reading
 from gsmerge.io.recover import Recovery
-from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, read_photos, read_scene
+from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, read_photos, read_scene, read_told
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "read_photos",
     "read_ply",
     "read_scene",
+    "read_told",
     "to_cameras",
     "write_ply",
 ]

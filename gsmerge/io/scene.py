@@ -118,9 +118,13 @@ def load_scene(
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO) -> SceneLoad:
     """:func:`load_scene` for files that are found already."""
+    return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
+
+
+def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlyScene:
+    """The file's rows, with opacities as told, or as the told exporter stores them."""
     told = find_dialect(reading.dialect)
-    encoding = opacity if told is None or opacity != "auto" else told.opacity
-    return align_scene(read_ply(files.ply, opacity=encoding), files, reading=reading)
+    return read_ply(path, opacity=opacity if told is None or opacity != "auto" else told.opacity)
 
 
 def align_scene(
