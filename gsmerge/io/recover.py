@@ -125,8 +125,6 @@ def recover(clues: Clues) -> Recovery | None:
         return None
     rest = [e for e in found[1:] if _differs(e.layout, found[0].layout)]
     best = _refined(clues, found[0])
-    if best.frame is not SAME and not _cameras_agree(clues, best):
-        return None
     runner_up = min(rest, key=lambda e: e.worst_px, default=None)
     shuffled = _shuffled_px(clues, best)
     floor = max(best.worst_px, 1e-3)
@@ -150,10 +148,14 @@ def _exact(clues: Clues) -> Iterator[Layout]:
 
 
 def _measured(clues: Clues, layout: Layout, effort: int) -> list[Evidence]:
-    """The layout under the best frame, for each order that the views may be in; the most effort tries all orders."""
+    """The layout under the best frame, for each order that the views may be in.
+
+    Any order at all is tried with the most effort, or where the file lacks views.
+    """
     out: dict[tuple[int, ...], Evidence] = {}
     labellings = [[labelling[view] for view in layout.views] for labelling in clues.labellings]
-    if effort == 2 and clues.scale is None:
+    some = len(set(layout.views)) < len(clues.cameras)
+    if (some or effort == 2) and clues.scale is None:
         labellings.append(_nearest_views(clues, layout) or [])
     for views in labellings:
         if views and tuple(views) not in out:
@@ -166,7 +168,10 @@ def _best_frame(clues: Clues, layout: Layout, samples: int, effort: int) -> Evid
     frames = candidate_frames(seen, clues.viewmats, clues.Ks, scale=clues.scale, effort=effort)
     tried = [_evidence(clues, layout, frame, seen, colors) for frame in frames]
     best = min(e.worst_px for e in tried)
-    return next(e for e in tried if e.worst_px <= max(_SIMPLER * best, best + _SIMPLER_PX))
+    found = next(e for e in tried if e.worst_px <= max(_SIMPLER * best, best + _SIMPLER_PX))
+    if found.ok and found.frame is not SAME and clues.scale is None:
+        return replace(found, ok=explains(found.frame, seen, clues.viewmats, clues.Ks))
+    return found
 
 
 def _refined(clues: Clues, found: Evidence) -> Evidence:
@@ -174,11 +179,6 @@ def _refined(clues: Clues, found: Evidence) -> Evidence:
     if found.layout.kind == "pruned":
         return found
     return _best_frame(clues, found.layout, SAMPLES, 2 if found.frame.kind == "other" else 1)
-
-
-def _cameras_agree(clues: Clues, best: Evidence) -> bool:
-    seen, _ = sightings(clues, thinned(best.layout, max(MIN_SAMPLES, SAMPLES // len(best.layout.views))))
-    return explains(best.frame, seen, clues.viewmats, clues.Ks)
 
 
 def sightings(clues: Clues, layout: Layout, *, colored: bool = True) -> tuple[Sightings, np.ndarray | None]:
@@ -255,7 +255,11 @@ def _pruned(clues: Clues) -> list[Evidence]:
 
 
 def _differs(one: Layout, other: Layout) -> bool:
-    return (one.kind, one.order, one.per_pixel, one.views) != (other.kind, other.order, other.per_pixel, other.views)
+    """Whether two layouts put rows to different pixels; looked at in some rows of each block."""
+    if one.views != other.views or [r.size for r in one.rows] != [r.size for r in other.rows]:
+        return True
+    a, b = thinned(one, 200), thinned(other, 200)
+    return not all(np.array_equal(x, y) for x, y in zip((*a.rows, *a.pixels), (*b.rows, *b.pixels), strict=True))
 
 
 def _shuffled_px(clues: Clues, best: Evidence) -> float:
