@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
 from gsmerge.io.cameras.da3 import read_da3, read_depths
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
+from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.images import as_tensor, find_image, natural_key, read_images
 from gsmerge.io.loose import looks_like_a_grid, sight
@@ -148,7 +149,8 @@ def align_scene(
     images = read_photos(files, read)
     cameras, notes = _fit_grid(ply.info, files, read, images)
     told = find_dialect(reading.dialect)
-    order = told.order if told is not None and reading.order == "auto" else reading.order
+    known = told.order if told is not None else read.order
+    order = known if reading.order == "auto" else reading.order
     orders, depths = _labellings(read.names), partial(read_depths, Path(read.path))
     clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, order, reading.scene_scale)
     recovery = recover(clues)
@@ -159,12 +161,26 @@ def align_scene(
     moved = torch.from_numpy(best.frame.move_cameras(clues.viewmats))
     in_frame = cameras if best.frame is SAME else replace(cameras, viewmats=moved)
     scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, images, read.names)
+    scene, filled = _filled(scene, recovery, depths)
     scene, turned = _with_rotations(scene, reading, dialects)
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
-    notes += _layout_notes(recovery, clues) + turned + _colour_notes(scene)
+    notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.valid)
     return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
+
+
+def _filled(
+    scene: PixelScene, recovery: Recovery, depths: Callable[[], np.ndarray | None]
+) -> tuple[PixelScene, list[str]]:
+    """Pixels that were dropped for being far, put back from the depth maps beside the cameras; and a note of it."""
+    layout = recovery.best.layout
+    maps = depths() if layout.kind == "box+depth" else None
+    if maps is None:
+        return scene, []
+    full = fill_from_depths(scene, maps[list(layout.views)])
+    count = int(full.valid.sum()) - int(scene.valid.sum())
+    return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] if count else []
 
 
 def _with_rotations(scene: PixelScene, reading: Reading, dialects: Sequence[Dialect]) -> tuple[PixelScene, list[str]]:

@@ -34,7 +34,7 @@ def read_da3(path: Path) -> CameraFile:
         )
     images, depths = _first(arrays, _IMAGES), _first(arrays, _DEPTHS)
     if images is not None:
-        images = _as_images(path, images, len(poses))
+        images = as_images(path, images, len(poses))
     grid = images if images is not None else depths
     Ks = Ks.astype(np.float64)
     if grid is not None and grid.ndim >= 3:
@@ -90,7 +90,8 @@ def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray 
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
+def as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
+    """``[c,h,w,3]`` uint8 from images in any of the usual forms."""
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
     if images.ndim != 4 or images.shape[0] != count or images.shape[3] != 3:

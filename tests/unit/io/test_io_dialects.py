@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from exports import (
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, make_tiny, write_npz
 
+from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_ply, read_scene
 from gsmerge.io.dialects import DIALECTS
 from gsmerge.types import LooseScene, PixelScene
@@ -30,10 +33,10 @@ def smooth() -> Tiny:
     return smooth_scene(48, 36)
 
 
-def home(scene: PixelScene, tiny: Tiny) -> float:
-    """Share of the valid pixels whose Gaussian is the one that was made for them, told by its opacity."""
+def home(scene: PixelScene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
+    """Share of the valid (or of the kept) pixels whose Gaussian is the one made for them, told by its opacity."""
     found, want = scene.gaussians.opacities, tiny.gaussians.opacities
-    valid = scene.valid.reshape(-1)
+    valid = scene.valid.reshape(-1) if kept is None else torch.from_numpy(kept)
     assert found.shape == want.shape
     return float(((found - want).abs() < 1e-5)[valid].double().mean())
 
@@ -81,9 +84,15 @@ def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=1e-3)
     assert [d.name for d in loaded.dialects] == ["da3"]
     scene = loaded.pixel_scene()
-    assert home(scene, tiny) == 1
-    assert int(scene.valid.sum()) == len(kept)
-    assert ties == bool(scene.valid[0, 4, 3:-3].all())  # the sky is kept
+    assert home(scene, tiny, kept) == 1
+    assert scene.num_gaussians == len(kept)
+    sky = np.isin(np.arange(4 * 96 + 3, 5 * 96 - 3), kept)
+    assert ties == bool(sky.all())
+    if not ties:  # what was dropped is put back where the depth maps have it
+        assert scene.valid.all()
+        error = (scene.gaussians.means - tiny.gaussians.means).norm(dim=1)
+        assert error.max() < 0.1
+        assert (scene.gaussians.sh0 - tiny.gaussians.sh0).abs().max() < 1e-4
 
 
 def test_depth_anything_every_other_view(tmp_path: Path) -> None:
@@ -287,3 +296,53 @@ def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object)
 def test_the_documented_dialects(root: Path) -> None:
     text = (root / "docs" / "dialects.md").read_text()
     assert [name for name in DIALECTS if f"| `{name}` |" not in text] == []
+
+
+def dump_script(root: Path) -> Any:
+    spec = importlib.util.spec_from_file_location("dump_views", root / "examples" / "04_dump_views.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def dump_of(tiny: Tiny, folder: Path, root: Path, **changes: Any) -> Path:
+    """``views.npz`` beside the Gaussians, written by the lines of the example."""
+    save_export(folder, tiny, export_rows(tiny), cameras=False)
+    values = {"c2w": tiny.c2w, "K": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images} | changes
+    dump_script(root).dump_views(str(folder / "views.npz"), **values)
+    return folder
+
+
+def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> None:
+    normalised = np.tile(smooth.K / np.array([[smooth.width], [smooth.height], [1.0]]), (3, 1, 1))
+    forms: dict[str, dict[str, Any]] = {
+        "plain": {},
+        "normalised": {"K": normalised},
+        "three rows": {"c2w": smooth.c2w[:, :3]},
+        "channels first": {"images": smooth.images.transpose(0, 3, 1, 2) / 255},
+        "order": {"order": "view-major"},
+    }
+    for name, changes in forms.items():
+        loaded = load_scene(dump_of(smooth, tmp_path / name, root, **changes))
+        scene = loaded.pixel_scene()
+        assert home(scene, smooth) == 1, name
+        assert loaded.cameras.source == "dump of a model"
+        assert np.allclose(scene.cameras.Ks, smooth.K)
+        assert np.array_equal((scene.images.numpy() * 255).round(), smooth.images)
+    assert isinstance(read_scene(dump_of(smooth, tmp_path / "none", root, order="none")), LooseScene)
+
+
+def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
+    with pytest.raises(SceneError, match="expected 'order' to be one of auto, view-major"):
+        read_scene(dump_of(smooth, tmp_path / "order", root, order="magic"))
+    with pytest.raises(SceneError, match=r"expected c2w \[v,4,4\] and K \[v,3,3\]"):
+        read_scene(dump_of(smooth, tmp_path / "K", root, K=smooth.K))
+    folder = dump_of(smooth, tmp_path / "no K", root)
+    np.savez(folder / "views.npz", c2w=smooth.c2w)
+    with pytest.raises(SceneError, match="missing arrays K, images"):
+        read_scene(folder)
+    np.savez(folder / "views.npz", c2w=np.array([{}], dtype=object), K=smooth.K, images=smooth.images)
+    with pytest.raises(SceneError, match="found a damaged one"):  # nothing is unpickled
+        read_scene(folder)
