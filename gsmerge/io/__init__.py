@@ -8,8 +8,9 @@ from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.ply_writer import write_ply
 from gsmerge.io.reading import AUTO, Reading
 from gsmerge.io.recover import Recovery
-from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, read_photos, read_scene, read_told
+from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, read_scene, read_told
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
+from gsmerge.io.views import read_photos
 
 __all__ = [
     "AUTO",

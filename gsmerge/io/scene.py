@@ -16,12 +16,12 @@ from torch import Tensor
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignment
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
-from gsmerge.io.cameras.da3 import read_da3, read_depths
-from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
+from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.frame import SAME, Frame
-from gsmerge.io.images import as_tensor, find_image, natural_key, read_images
+from gsmerge.io.images import natural_key
 from gsmerge.io.loose import looks_like_a_grid, sight
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.reading import AUTO, Reading, make_reading
@@ -29,6 +29,7 @@ from gsmerge.io.recover import Clues, Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
+from gsmerge.io.views import cameras_of, read_photos
 from gsmerge.types import Cameras, LooseScene, PixelScene
 
 _ASPECT_TOLERANCE = 0.04  # backbones round each side to a multiple of 14 by itself
@@ -142,10 +143,7 @@ def align_scene(
     Raises:
         SceneError: As :func:`read_scene`.
     """
-    if files.cameras is None:
-        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        raise SceneError(files.ply, f"no cameras found beside it (looked for {places})", "name them with --cameras")
-    read = read_cameras(files.cameras) if camera_file is None else camera_file
+    read = cameras_of(ply, files) if camera_file is None else camera_file
     images = read_photos(files, read)
     cameras, notes = _fit_grid(ply.info, files, read, images)
     told = find_dialect(reading.dialect)
@@ -165,6 +163,8 @@ def align_scene(
     scene, turned = _with_rotations(scene, reading, dialects)
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
+    if read.source == ESTIMATED:
+        notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
     notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.valid)
     return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
@@ -256,34 +256,6 @@ def _lacks_cameras(clues: Clues) -> bool:
         return False
     first = replace(clues, gaussians=clues.gaussians[:pixels], valid=clues.valid[:pixels], order="view-major")
     return recover(first) is not None
-
-
-def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
-    """The images of the cameras: from the folder, an ``.npz``, or where the camera file itself says.
-
-    Args:
-        files: Where the images are.
-        camera_file: The cameras.
-
-    Returns:
-        ``[c,h,w,3]`` float32 in [0, 1], in the order of the cameras; None if there are none.
-
-    Raises:
-        SceneError: As :func:`gsmerge.io.read_images`.
-    """
-    if files.images is None:
-        folder = Path(camera_file.path).parent
-        found = [find_image(folder, name) for name in camera_file.names]
-        paths = [f for f in found if f is not None]
-        return read_images(paths, camera_file.names) if len(paths) == len(found) else None
-    if files.images.suffix != ".npz":
-        return read_images(files.images, camera_file.names)
-    own = files.cameras is not None and files.cameras.resolve() == files.images.resolve()
-    stored = camera_file.images if own else read_da3(files.images).images
-    if stored is None or len(stored) != len(camera_file):
-        found_count = 0 if stored is None else len(stored)
-        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {found_count}")
-    return as_tensor(stored)
 
 
 def _fit_grid(

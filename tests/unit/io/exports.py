@@ -51,6 +51,17 @@ def smooth_scene(width: int, height: int) -> Smooth:
     return Smooth(c2w, tiny.K, width, height, np.stack(images), gaussians, tiny.names, np.stack(depths))
 
 
+def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
+    """The same pixels and depths, seen through another lens."""
+    means = []
+    for pose, points in zip(tiny.c2w, tiny.gaussians.means.double().numpy().reshape(3, -1, 3), strict=True):
+        camera = (points - pose[:3, 3]) @ pose[:3, :3]
+        rays = camera @ tiny.K.T @ np.linalg.inv(K).T
+        means.append(rays @ pose[:3, :3].T + pose[:3, 3])
+    moved = torch.from_numpy(np.concatenate(means)).float()
+    return replace(tiny, K=K, gaussians=replace(tiny.gaussians, means=moved))
+
+
 def depth_map_mask(depth: np.ndarray) -> np.ndarray:
     """What Depth Anything 3 keeps of a view: its own rule, in its own words."""
     height, width = depth.shape
@@ -65,6 +76,7 @@ def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, norm
     g = tiny.gaussians if index is None else tiny.gaussians[torch.from_numpy(np.ascontiguousarray(index))]
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest)),
              "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
+    names = [name for name in names if normals or name[0] != "n"]
     rows = np.zeros(len(g), [(name, normals if name[0] == "n" else "f4") for name in names])
     columns: dict[str, Any] = {"opacity": torch.logit(g.opacities)}
     columns |= {name: g.means[:, i] for i, name in enumerate("xyz")}

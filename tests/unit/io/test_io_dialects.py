@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,6 +17,7 @@ from exports import (
     save_export,
     smooth_scene,
     turned,
+    with_intrinsics,
     with_surface_rotations,
 )
 from plyfile import PlyData, PlyElement
@@ -346,3 +348,48 @@ def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
     np.savez(folder / "views.npz", c2w=np.array([{}], dtype=object), K=smooth.K, images=smooth.images)
     with pytest.raises(SceneError, match="found a damaged one"):  # nothing is unpickled
         read_scene(folder)
+
+
+def test_the_camera_inside_a_sharp_file(tmp_path: Path, smooth: Tiny) -> None:
+    """Two layers on a square grid, a photo of another shape, the camera in the file."""
+    side, size = 36, (48, 36)
+    square = smooth_scene(side, side)
+    one = np.arange(side * side)
+    rows = export_rows(square, np.concatenate([one, one]), normals="")
+    rows["opacity"][side * side :] = -2
+    means = np.stack([rows[c] for c in "xyz"], 1) @ square.w2c[0, :3, :3].T + square.w2c[0, :3, 3]
+    for i, name in enumerate("xyz"):
+        rows[name] = means[:, i]
+    K = square.K * np.array([[size[0] / side], [size[1] / side], [1.0]])
+    parts = {"extrinsic": np.eye(4).reshape(-1), "intrinsic": K.reshape(-1), "image_size": np.array(size)}
+    elements = [PlyElement.describe(rows, "vertex")]
+    for name, values in parts.items():
+        kind = "u4" if name == "image_size" else "f4"
+        elements.append(PlyElement.describe(np.array([(v,) for v in values], [(name, kind)]), name))
+    PlyData(elements, byte_order="<").write(str(tmp_path / "photo.ply"))
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "photo.png"), cv2.resize(square.images[0], size)[..., ::-1])
+    loaded = load_scene(tmp_path / "photo.ply")
+    scene = loaded.pixel_scene()
+    assert scene.valid.shape == (2, side, side)
+    assert [d.name for d in loaded.dialects] == ["sharp"]
+    assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
+    assert scene.images.shape == (2, side, side, 3)
+    assert torch.allclose(scene.gaussians.opacities[side * side :], torch.sigmoid(torch.tensor(-2.0)))
+
+
+@pytest.mark.parametrize("fastest", [False, True])
+def test_cameras_from_the_grid_alone(tmp_path: Path, fastest: bool) -> None:
+    tiny = smooth_scene(96, 72)
+    K = np.array([[110.0, 0, 48], [0, 110, 36], [0, 0, 1]])
+    tiny = with_intrinsics(tiny, K)
+    index = np.arange(3 * 96 * 72).reshape(3, -1)
+    save_export(tmp_path, tiny, export_rows(tiny, (index.T if fastest else index).reshape(-1)))
+    (tmp_path / "transforms.json").unlink()
+    loaded = load_scene(tmp_path)
+    scene = loaded.pixel_scene()
+    assert home(scene, tiny) == 1
+    assert loaded.cameras.source == "estimated from the grid"
+    assert any("no cameras were given" in note for note in loaded.notes)
+    assert scene.cameras.Ks[0, 0, 0].item() == pytest.approx(110, rel=0.02)
+    assert np.allclose(scene.cameras.centres, tiny.c2w[:, :3, 3], atol=0.1)
