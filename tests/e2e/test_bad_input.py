@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -97,6 +98,7 @@ def unreadable_image(scene: Path) -> list[object]:
 
 def no_cameras(scene: Path) -> list[object]:
     (scene / "transforms.json").unlink()
+    shutil.rmtree(scene / "images")
     return []
 
 

@@ -15,9 +15,9 @@ from gsmerge.io.layouts import Layout, exact_layouts, thinned
 from gsmerge.types import Gaussians
 
 SOURCE = "estimated from the grid"
-_SAMPLES = 1500  # Gaussians per view
+_SAMPLES = 300  # Gaussians per view
 _MARGIN = 2.0  # by which the best order of the rows must beat the next one
-_ROUNDS = 3  # each time without the Gaussians that lie far from their pixels
+_ROUNDS = 2  # each time without the Gaussians that lie far from their pixels
 _FLAGS = (
     cv2.CALIB_USE_INTRINSIC_GUESS
     | cv2.CALIB_FIX_PRINCIPAL_POINT
