@@ -14,6 +14,7 @@ import numpy as np
 
 _ROUNDS = 4  # of reweighted least squares
 _POSED = 2000  # points that a camera's pose is solved from
+_SMALL_TURN, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
 _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one frame for all cameras, beside a pose for each
 
 
@@ -126,6 +127,8 @@ def candidate_frames(
     frame = _similar(seen.points, rays @ turn.T, centres @ turn.T, turn, shifted=True)
     if frame is not None:
         angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+        if angle < _SMALL_TURN and abs(np.log(frame.scale)) < _SMALL_SCALE:
+            return  # no exporter's habit: the cameras are inexact, and a turn hides it
         words = f"turned by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
         yield replace(frame, words=words, kind="other")
 
