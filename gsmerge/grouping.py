@@ -44,6 +44,7 @@ class Canvas:
         pictures: ``[v,h,w,3]`` what superpixels are cut from.
         robust: Whether the merge is chosen by the photos.
         share: Part of the Gaussians that the stages before the fit leave for it to begin with.
+        each: Superpixels of each view that the options ask for.
         usual: Gaussians that density and K ask for.
         most: Gaussians that budget, size and preset allow.
         exact: Gaussians that a budget or a size asks for; None without either.
@@ -52,6 +53,7 @@ class Canvas:
     pictures: Tensor
     robust: bool
     share: float
+    each: int
     usual: int
     most: int
     exact: int | None
@@ -72,20 +74,19 @@ def scene_canvas(scene: PixelScene, options: CompactOptions) -> Canvas:
     asked = count_for(options.segment, scene.cameras.height, scene.cameras.width)
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
-    num_input = len(scene.gaussians)
+    num_input = scene.num_gaussians
     most = most_allowed(options.target, num_input, degree)
     if most < len(scene):
         raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
     share = start_share(options.fit) if scene.images is not None else 1.0
-    usual = asked * len(scene) * options.decode.count
+    usual = max(len(scene), asked * num_input // pixels) * options.decode.count
     exact = exact_count(options.target, num_input, degree)
-    return Canvas(scene_pictures(scene), uses_robust(scene, options), share, usual, most, exact)
+    return Canvas(scene_pictures(scene), uses_robust(scene, options), share, asked, usual, most, exact)
 
 
 def group_scene(canvas: Canvas, options: CompactOptions) -> Grouping:
     """The same number of superpixels for every view, as density or ``superpixels`` say."""
-    views = len(canvas.pictures)
-    each = max(1, int(canvas.usual // options.decode.count // views * canvas.share))
+    each = max(1, int(canvas.each * canvas.share))
     coarse = min(round(_behind(canvas, options) * each), each - 1)
     groups = segment(canvas.pictures, options.segment, each - coarse)
     return Grouping(groups, _coarse(canvas, options, coarse), canvas.robust, canvas.usual, exact=False)
@@ -102,8 +103,7 @@ def scene_tree(scene: PixelScene, canvas: Canvas, options: CompactOptions, count
         options: All settings.
         count: Most Gaussians that it will be cut to.
     """
-    views, each = len(scene), canvas.usual // options.decode.count // len(scene)
-    leaves = min(max(each, -(-count // views)), scene.pixels_per_view)
+    leaves = min(max(canvas.each, -(-count // len(scene))), scene.pixels_per_view)
     fine = segment(canvas.pictures, options.segment, leaves)
     return region_tree(canvas.pictures, pixel_depths(scene), fine, scene.valid, options.allocate)
 

@@ -13,14 +13,17 @@ from gsmerge.errors import SceneError
 from gsmerge.io import (
     Alignment,
     PlyScene,
+    Reading,
     SceneFiles,
     align_scene,
     find_scene_files,
     ply_notes,
     read_cameras,
-    read_ply,
+    read_told,
 )
+from gsmerge.io.dialects import dialect_words, recognise
 from gsmerge.io.ply import OpacityChoice
+from gsmerge.io.reading import make_reading
 from gsmerge.types import Gaussians
 
 _MAX_EXTENT_SAMPLES = 200_000
@@ -57,6 +60,8 @@ class Inspection:
         images: Where the images are, None where none were found.
         alignment: The measured alignment; None if it could not be measured.
         alignment_problem: Why the scene is not known to have one Gaussian per pixel; None if it has.
+        dialect: The exporters that may have written the file.
+        rows: Which reading of the rows won, and by how much; None while there is none.
         notes: What was adapted or looks odd, one sentence each.
     """
 
@@ -85,6 +90,8 @@ class Inspection:
     images: str | None
     alignment: Alignment | None
     alignment_problem: str | None
+    dialect: str
+    rows: str | None
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,6 +106,7 @@ def inspect(
     cameras: str | os.PathLike[str] | None = None,
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
+    **reading: Any,
 ) -> Inspection:
     """Say what a scene is made of, and whether it has one Gaussian per pixel of its views.
 
@@ -109,13 +117,15 @@ def inspect(
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
+        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist.
     """
+    told = make_reading(reading)
     files = find_scene_files(path, cameras=cameras, images=images)
-    ply = read_ply(files.ply, opacity=opacity)
-    return Inspection(**_of_ply(ply), **_of_views(ply, files))
+    ply = read_told(files.ply, opacity=opacity, reading=told)
+    return Inspection(**_of_ply(ply), **_of_views(ply, files, told))
 
 
 def _plain(value: Any) -> Any:
@@ -157,7 +167,7 @@ def _box(gaussians: Gaussians) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(map(float, low)), tuple(map(float, high))
 
 
-def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
+def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, Any]:
     found: dict[str, Any] = {
         "num_views": 0,
         "width": 0,
@@ -167,6 +177,8 @@ def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
         "images": None if files.images is None else str(files.images),
         "alignment": None,
         "alignment_problem": None,
+        "dialect": dialect_words(recognise(ply.info, None, None, None)),
+        "rows": None,
         "notes": ply_notes(ply.info),
     }
     camera_file = None
@@ -174,8 +186,12 @@ def _of_views(ply: PlyScene, files: SceneFiles) -> dict[str, Any]:
         if files.cameras is not None:
             camera_file = read_cameras(files.cameras)
             found |= {"num_views": len(camera_file), "camera_format": camera_file.source}
-        load = align_scene(ply, files, camera_file)
+        load = align_scene(ply, files, camera_file, reading=reading)
     except SceneError as error:
         return found | {"alignment_problem": str(error)}
+    found |= {"dialect": dialect_words(load.dialects), "notes": load.notes}
+    found |= {"num_views": len(load.scene.cameras), "camera_format": load.cameras.source}
+    if load.recovery is None:
+        return found | {"alignment_problem": load.problem}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
-    return found | size | {"alignment": load.alignment, "notes": load.notes}
+    return found | size | {"alignment": load.alignment, "rows": load.recovery.words}

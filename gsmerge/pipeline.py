@@ -196,7 +196,7 @@ def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
     if work.scene.images is not None:
         with journal.stage("score"):
             after = input_psnr(gaussians, scene_photos(work.scene), NEAR * work.frame.unit)
-    counts = len(work.scene.gaussians), len(gaussians)
+    counts = work.scene.num_gaussians, len(gaussians)
     settings = options.to_dict() | {"fit_steps": options.fit.steps}
     report = CompactReport(
         *counts, journal.seconds, work.before, after, journal.choices, journal.notes, settings, peak_memory()

@@ -199,6 +199,7 @@ def plan_document(
     fit_steps: int,
     wanted: int | None = None,
     notes: Sequence[str] = (),
+    count: int | None = None,
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory.
 
@@ -213,6 +214,7 @@ def plan_document(
         fit_steps: Steps of the full fit.
         wanted: Gaussians that a budget or a file size asks for; None without either.
         notes: What the reader had to say.
+        count: Gaussians of the file; None: one for each pixel of the grid.
 
     Returns:
         ``schema_version`` 1: the plan; ``estimate`` holds within a factor of about two on a common processor once
@@ -227,15 +229,15 @@ def plan_document(
     steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
     children = 1 if options["k"] == "auto" else options["k"]
-    at_most = per_view * views * children if wanted is None else wanted
+    at_most = per_view * (count or pixels) // (height * width) * children if wanted is None else wanted
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
         **document_head(),
         "dry_run": True,
-        "input": {**files, "num_gaussians": pixels, "num_views": views, "height": height, "width": width},
+        "input": {**files, "num_gaussians": count or pixels, "num_views": views, "height": height, "width": width},
         "output": {
             "path": os.fspath(output_path),
-            "num_gaussians_at_most": min(pixels, at_most),
+            "num_gaussians_at_most": min(count or pixels, at_most),
         },
         "superpixels_per_view": per_view if wanted is None and options["k"] != "auto" else None,
         "robust": robust,
@@ -282,6 +284,7 @@ def inspection_lines(found: Mapping[str, Any]) -> list[str]:
     lines = [
         f"file       {found['path']}: {human_bytes(found['bytes'])} ({parts})",
         f"layout     {found['layout']}, {found['format']}; opacity stored {_ENCODINGS[found['opacity_encoding']]}",
+        f"dialect    {found['dialect']}",
         f"ignored    {', '.join(extras)}" if extras else "",
         f"Gaussians  {found['count']:,}: {found['num_nonfinite']} not finite, {found['num_transparent']:,} transparent,"
         f" {found['num_opaque']:,} opaque",
@@ -293,8 +296,8 @@ def inspection_lines(found: Mapping[str, Any]) -> list[str]:
         lines.append(f"alignment  not one Gaussian per pixel: {found['alignment_problem']}")
     elif alignment is not None:
         lines.append(
-            f"alignment  one Gaussian per pixel, {found['num_views']} x {found['height']} x {found['width']};"
-            f" median offset {max(alignment['median_px']):.2f} px in the worst view"
+            f"alignment  one Gaussian per pixel, {found['num_views']} x {found['height']} x {found['width']}"
+            f" ({found['rows']}); median offset {max(alignment['median_px']):.2f} px in the worst view"
         )
     return [line for line in lines if line] + [f"note       {note}" for note in found["notes"]]
 

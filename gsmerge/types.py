@@ -130,11 +130,13 @@ class PixelScene:
 
     Args:
         gaussians: V·H·W rows; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v. Rows that were not
-            finite in the file are kept, as fully transparent ones, so that the order survives.
+            finite in the file are kept, as fully transparent ones, so that the order survives; pixels that the
+            file has no row for are filled up with such ones.
         cameras: The V views; width and height are the grid's.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
-        valid: ``[v,h,w]`` bool, False where the file's row was not finite.
+        valid: ``[v,h,w]`` bool, False where the file's row was not finite, or there is none.
         names: The views' names (image file names where known).
+        num_missing: Pixels that the file has no row for.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -145,6 +147,7 @@ class PixelScene:
     images: Tensor | None
     valid: Tensor
     names: tuple[str, ...]
+    num_missing: int = 0
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
@@ -160,9 +163,44 @@ class PixelScene:
         return len(self.cameras)
 
     @property
+    def num_gaussians(self) -> int:
+        """Gaussians of the file: what budgets and ratios count."""
+        return len(self.gaussians) - self.num_missing
+
+    @property
     def pixels_per_view(self) -> int:
         """H·W."""
         return self.cameras.height * self.cameras.width
+
+
+@dataclass(frozen=True)
+class LooseScene:
+    """Gaussians that belong to no pixels, with views that see them.
+
+    Args:
+        gaussians: Any number of rows, in the frame of the cameras.
+        cameras: The V views.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
+        names: The views' names (image file names where known).
+
+    Raises:
+        ValueError: If the sizes do not fit together.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    images: Tensor | None
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
+        if self.images is not None:
+            _expect("images", self.images, (v, h, w, 3))
+        if len(self.names) != v:
+            raise ValueError(f"expected {v} view names, got {len(self.names)}")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, default_output, input_files, level_output
-from gsmerge.cli.settings import superpixels_per_view, told_as_usage
+from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
-    from gsmerge.io import SceneFiles, SceneLoad
+    from gsmerge.io import Reading, SceneFiles, SceneLoad
     from gsmerge.io.ply import OpacityChoice
     from gsmerge.options import CompactOptions
     from gsmerge.types import PixelScene
@@ -27,6 +27,10 @@ def compact(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
     method: opt.MethodOption = None,
@@ -56,6 +60,7 @@ def compact(
 ) -> None:
     """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)
@@ -79,11 +84,11 @@ def compact(
     chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads}
     settings = _settings(chosen)
     if dry_run:
-        _print_plan(files, settings, out, opacity=opacity.value, as_json=json)
+        _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
     document = _run(
-        files, settings, out, opacity=opacity.value, overwrite=overwrite, quiet=quiet or json, start=start,
-        hashed=json or report is not None,
+        files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
+        start=start, hashed=json or report is not None,
     )  # fmt: skip
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
     if document["unmet"]:
@@ -105,6 +110,7 @@ def _run(
     out: Path,
     *,
     opacity: OpacityChoice,
+    reading: Reading,
     overwrite: bool,
     quiet: bool,
     start: float,
@@ -112,13 +118,14 @@ def _run(
 ) -> dict[str, Any]:
     """Read, compact and write; returns the report."""
     from gsmerge import pipeline
-    from gsmerge.io import align_scene, atomic_output, read_ply, write_ply
+    from gsmerge.io import atomic_output, load_files, write_ply
     from gsmerge.report import report_document
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
-        superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
+        loaded = load_files(files, opacity=opacity, reading=reading)
+        pixel_scene = loaded.pixel_scene()
+        superpixels_per_view(settings.segment, pixel_scene.cameras.width, pixel_scene.cameras.height)
         read = perf_counter()
         with (
             announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
@@ -131,7 +138,7 @@ def _run(
                 if progress is not None:
                     progress(stage, done, total)
 
-            result = pipeline.compact(loaded.scene, settings, progress=moved)
+            result = pipeline.compact(pixel_scene, settings, progress=moved)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
@@ -154,8 +161,9 @@ def _run(
 def _recognised(loaded: SceneLoad) -> dict[str, Any]:
     """What the report says about the input."""
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
-    cameras = loaded.scene.cameras
-    views = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    cameras, recovery = loaded.scene.cameras, loaded.recovery
+    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    views |= {"dialects": [dialect.name for dialect in loaded.dialects], "rows": recovery and recovery.words}
     return views | {name: getattr(loaded.ply, name) for name in names}
 
 
@@ -175,14 +183,15 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 
 
 def _print_plan(
-    files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, as_json: bool
+    files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
-    from gsmerge.io import align_scene, read_ply
+    from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
-    loaded = align_scene(read_ply(files.ply, opacity=opacity), files)
-    scene, cameras = loaded.scene, loaded.scene.cameras
+    loaded = load_files(files, opacity=opacity, reading=reading)
+    scene = loaded.pixel_scene()
+    cameras = scene.cameras
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(scene), cameras.height, cameras.width),
@@ -194,6 +203,7 @@ def _print_plan(
         fit_steps=settings.fit.steps,
         wanted=_wanted(scene, settings),
         notes=loaded.notes,
+        count=scene.num_gaussians,
     )
     if as_json:
         sys.stdout.write(to_json(document))

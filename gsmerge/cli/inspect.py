@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from gsmerge.cli import options as opt
+from gsmerge.cli.settings import reading_of
 
 
 def inspect(
@@ -12,15 +13,20 @@ def inspect(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
     json: opt.JsonOption = False,
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
     """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
     from gsmerge.inspect import inspect as inspect_scene
     from gsmerge.report import document_head, inspection_lines, to_json
 
-    found = inspect_scene(scene, cameras=cameras, images=images, opacity=opacity.value).to_dict()
+    found = inspect_scene(scene, cameras=cameras, images=images, opacity=opacity.value, **vars(reading)).to_dict()
     if json:
         sys.stdout.write(to_json({**document_head(), **found}))
     elif not quiet:

@@ -78,6 +78,26 @@ class Opacity(str, Enum):
     raw = "raw"
 
 
+class Quats(str, Enum):
+    """How the file stores rotations."""
+
+    auto = "auto"
+    wxyz = "wxyz"
+    xyzw = "xyzw"
+    camera = "camera"
+
+
+class Order(str, Enum):
+    """Order of the file's rows."""
+
+    auto = "auto"
+    view_major = "view-major"
+    view_fastest = "view-fastest"
+    layer_major = "layer-major"
+    column_major = "column-major"
+    none = "none"
+
+
 def debug_wanted() -> bool:
     """Whether the command line asked for tracebacks."""
     return _state["debug"]
@@ -112,6 +132,29 @@ OpacityOption = Annotated[
     typer.Option(
         help="How the file stores opacity: as logits, or raw in [0, 1]; auto looks at the values.",
         rich_help_panel=INPUT,
+    ),
+]
+DialectOption = Annotated[
+    str,
+    typer.Option(
+        help="Which exporter wrote the file, such as da3 or depthsplat; auto recognises it.", rich_help_panel=INPUT
+    ),
+]
+QuatsOption = Annotated[
+    Quats,
+    typer.Option(
+        help="How the file stores rotations: w first, w last, or relative to each view's camera.",
+        rich_help_panel=INPUT,
+    ),
+]
+OrderOption = Annotated[
+    Order,
+    typer.Option(help="Order of the rows; none: they belong to no pixels.", rich_help_panel=INPUT),
+]
+SceneScaleOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Size of the Gaussians' world in units of the cameras'.", show_default="found", rich_help_panel=INPUT
     ),
 ]
 SuperpixelsOption = Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,14 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import cameras_of, check_output, input_files
 from gsmerge.cli.pictures import tell_pictures, write_picture
+from gsmerge.cli.settings import reading_of
+from gsmerge.errors import SceneError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gsmerge.io import CameraFile, PlyScene, Reading, SceneFiles
+    from gsmerge.types import Cameras
 
 
 def preview(
@@ -20,6 +28,10 @@ def preview(
     images: opt.ImagesOption = None,
     views: Annotated[int, typer.Option(min=1, help="Views at most.", rich_help_panel=opt.OUTPUT)] = 4,
     opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
     json: opt.JsonOption = False,
@@ -28,24 +40,25 @@ def preview(
     debug: opt.DebugOption = False,
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
-    from gsmerge.io import find_scene_files, ply_notes, read_photos, read_ply, to_cameras
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    from gsmerge.io import find_scene_files, ply_notes, read_ply, read_told
     from gsmerge.preview import contact_sheet, pick_views
     from gsmerge.threads import use_threads
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     check_output(output, (*scenes, *input_files(files)), overwrite=overwrite)
     camera_file = cameras_of(files)
-    photos = read_photos(files, camera_file)
-    size = None if photos is None else (photos.shape[2], photos.shape[1])
-    plys = [read_ply(path, opacity=opacity.value) for path in scenes]
+    plys = [read_told(files.ply, opacity=opacity.value, reading=reading)]
+    plys += [read_ply(path, opacity=opacity.value) for path in scenes[1:]]
+    seen_from, photos = _views(plys[0], files, camera_file, reading)
     notes = [f"{path}: {note}" for path, ply in zip(scenes, plys, strict=True) for note in ply_notes(ply.info)]
     say_notes(notes, quiet=quiet or json)
     if not dry_run:
         parts = [(path.name, ply.gaussians) for path, ply in zip(scenes, plys, strict=True)]
         with use_threads(threads), announce_compilation(quiet=quiet or json):
-            sheet = contact_sheet(parts, to_cameras(camera_file, size), photos, most_views=views)
+            sheet = contact_sheet(parts, seen_from, photos, most_views=views)
         write_picture(output, sheet, overwrite=overwrite)
-    ids = pick_views(len(camera_file), views)
+    ids = pick_views(len(seen_from), views)
     facts = {
         "scenes": {str(path): ply.info.count for path, ply in zip(scenes, plys, strict=True)},
         "views": ids,
@@ -54,3 +67,17 @@ def preview(
     }
     line = f"{len(scenes)} scene(s) from {len(ids)} views"
     tell_pictures(output, [output], facts, line, dry_run=dry_run, as_json=json, quiet=quiet)
+
+
+def _views(
+    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, reading: Reading
+) -> tuple[Cameras, Tensor | None]:
+    """Cameras and photos: in the frame of the Gaussians where their pixels are found, otherwise as they stand."""
+    from gsmerge.io import align_scene, read_photos, to_cameras
+
+    try:
+        scene = align_scene(ply, files, camera_file, reading=reading).scene
+    except SceneError:
+        photos = read_photos(files, camera_file)
+        return to_cameras(camera_file, None if photos is None else (photos.shape[2], photos.shape[1])), photos
+    return scene.cameras, scene.images

@@ -12,7 +12,7 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import check_folder, input_files
 from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
-from gsmerge.cli.settings import superpixels_per_view, told_as_usage
+from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
 
 if TYPE_CHECKING:
     from gsmerge.segment import SegmentOptions
@@ -33,6 +33,10 @@ def segment(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
     json: opt.JsonOption = False,
@@ -41,7 +45,8 @@ def segment(
     debug: opt.DebugOption = False,
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
-    from gsmerge.io import align_scene, find_scene_files, read_ply
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    from gsmerge.io import find_scene_files, load_files
     from gsmerge.segment import SegmentOptions
     from gsmerge.threads import use_threads
 
@@ -51,8 +56,8 @@ def segment(
         options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
     files = find_scene_files(scene, cameras=cameras, images=images)
     check_folder(output, input_files(files), overwrite=overwrite)
-    loaded = align_scene(read_ply(files.ply, opacity=opacity.value), files)
-    pixel_scene = loaded.scene
+    loaded = load_files(files, opacity=opacity.value, reading=reading)
+    pixel_scene = loaded.pixel_scene()
     per_view = superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
     say_notes(loaded.notes, quiet=quiet or json)
     stems = picture_stems(pixel_scene.names)

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
+    from gsmerge.io import Reading
+    from gsmerge.io.layouts import Order
+    from gsmerge.io.reading import QuatChoice
     from gsmerge.segment import SegmentOptions
 
 
@@ -26,6 +29,20 @@ def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> in
             f"--superpixels: expected at most {width * height}, one per pixel of {width} x {height}, got {count}"
         )
     return count
+
+
+def reading_of(dialect: str, quats: QuatChoice, order: Order, scene_scale: float | None) -> Reading:
+    """What the command line tells about the file.
+
+    Raises:
+        UsageError: If a value is none of the possible ones.
+    """
+    from gsmerge.io import Reading
+    from gsmerge.io.dialects import find_dialect
+
+    with told_as_usage():
+        find_dialect(dialect)
+        return Reading(dialect=dialect, quats=quats, order=order, scene_scale=scene_scale)
 
 
 @contextmanager

@@ -6,20 +6,27 @@ from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
 from gsmerge.io.images import read_images
 from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.ply_writer import write_ply
-from gsmerge.io.scene import SceneLoad, align_scene, load_scene, read_photos, read_scene
+from gsmerge.io.reading import AUTO, Reading
+from gsmerge.io.recover import Recovery
+from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, read_scene, read_told
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
+from gsmerge.io.views import read_photos
 
 __all__ = [
+    "AUTO",
     "Alignment",
     "CameraFile",
     "PlyInfo",
     "PlyScene",
+    "Reading",
+    "Recovery",
     "SceneFiles",
     "SceneLoad",
     "align_scene",
     "atomic_output",
     "check_alignment",
     "find_scene_files",
+    "load_files",
     "load_scene",
     "ply_notes",
     "read_cameras",
@@ -27,6 +34,7 @@ __all__ = [
     "read_photos",
     "read_ply",
     "read_scene",
+    "read_told",
     "to_cameras",
     "write_ply",
 ]

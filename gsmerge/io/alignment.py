@@ -65,6 +65,11 @@ def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Al
     return _measure(_sample(gaussians, cameras, valid), cameras)
 
 
+def pixel_limit(width: int, height: int) -> float:
+    """Median distance in pixels up to which Gaussians are taken to be those of their pixels."""
+    return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
+
+
 def _sample(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> _Sample:
     views, width, pixels = len(cameras), cameras.width, cameras.width * cameras.height
     if len(gaussians) != views * pixels:
@@ -79,7 +84,7 @@ def _sample(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> _Sample:
 
 
 def _measure(sample: _Sample, cameras: Cameras) -> Alignment:
-    limit = max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(cameras.width * cameras.height)))
+    limit = pixel_limit(cameras.width, cameras.height)
     viewmats, Ks = cameras.viewmats.double(), cameras.Ks.double()
     camera = sample.points @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     image = camera @ Ks.transpose(1, 2)

@@ -12,6 +12,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
 from gsmerge.errors import SceneError
+from gsmerge.io.compressed import is_compressed, unpack
 from gsmerge.io.ply_layout import (
     BLOCK_BYTES,
     LOGIT_COMMENT,
@@ -47,6 +48,8 @@ class PlyInfo:
         columns: All columns of the vertex element, in the file's order.
         extra_columns: Those that mean nothing here.
         extra_elements: Elements beside ``vertex``.
+        byte_columns: Columns stored as bytes.
+        comments: Of the header.
         sh_degree: 0 to 4.
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
         opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
@@ -64,6 +67,8 @@ class PlyInfo:
     columns: tuple[str, ...]
     extra_columns: tuple[str, ...]
     extra_elements: tuple[str, ...]
+    byte_columns: tuple[str, ...]
+    comments: tuple[str, ...]
     sh_degree: int
     opacity_encoding: str
     opacity_guessed: bool
@@ -116,16 +121,17 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
     data = _open(path)
-    vertex = _vertex(path, data)
-    names = tuple(p.name for p in vertex.properties)
-    num_rest = _num_rest(path, vertex)
-    rows = np.asarray(vertex.data)
+    compressed = is_compressed(data)
+    rows = unpack(path, data) if compressed else np.asarray(_vertex(path, data).data)
+    names = tuple(rows.dtype.names or ())
+    num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
     size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
     blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
     done = parallel_map(lambda block: _convert(rows[block], {k: v[block] for k, v in out.items()}), blocks)
 
-    named = _named_encoding(opacity, data)
+    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
+    named = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
     encoding = named or _likely_encoding(done)
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _set_aside(path, out)
@@ -133,7 +139,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     extra = tuple(name for name in names if name not in used)
     info = PlyInfo(
         path=str(path),
-        layout=layout_name(names, num_rest),
+        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
         format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
         count=len(rows),
         file_bytes=path.stat().st_size,
@@ -141,6 +147,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         columns=names,
         extra_columns=extra,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+        byte_columns=tuple(name for name in names if rows.dtype[name].itemsize == 1),
+        comments=comments,
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
         opacity_guessed=named is None,
@@ -189,7 +197,7 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     if missing:
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
-            remedy = "it is compressed: convert it to an ordinary .ply first"
+            remedy = "it is compressed, but lacks its element 'chunk'"
         elif missing == ["scale_2"]:
             remedy = "flat 2D Gaussians need a scale_2 column of their own"
         elif len(missing) < len(REQUIRED) // 2:
@@ -200,8 +208,8 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     return vertex
 
 
-def _num_rest(path: Path, vertex: PlyElement) -> int:
-    names = [p.name for p in vertex.properties if p.name.startswith("f_rest_")]
+def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
+    names = [name for name in columns if name.startswith("f_rest_")]
     if len(names) not in (0, 9, 24, 45, 72) or set(names) != {f"f_rest_{i}" for i in range(len(names))}:
         raise SceneError(
             path,
@@ -297,14 +305,6 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
         exact[length == 0] = (1, 0, 0, 0)
         out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
     return zero
-
-
-def _named_encoding(opacity: str, data: PlyData) -> str | None:
-    """The encoding that the caller or the file's own comment names."""
-    if opacity != "auto":
-        return opacity
-    comments = [*data.comments, *(c for e in data.elements for c in e.comments)]
-    return "logit" if LOGIT_COMMENT in comments else None
 
 
 def _likely_encoding(done: list[_Converted]) -> str:

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignment
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
-from gsmerge.io.cameras.da3 import read_da3
-from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
-from gsmerge.io.images import as_tensor, find_image, natural_key, read_images
+from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
+from gsmerge.io.dialects import Dialect, find_dialect, recognise
+from gsmerge.io.fill import fill_from_depths
+from gsmerge.io.frame import SAME, Frame
+from gsmerge.io.images import natural_key
+from gsmerge.io.loose import looks_like_a_grid, sight
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
+from gsmerge.io.reading import AUTO, Reading, make_reading
+from gsmerge.io.recover import Clues, Recovery, recover
+from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
+from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.types import Cameras, PixelScene
+from gsmerge.io.views import cameras_of, read_photos
+from gsmerge.types import Cameras, LooseScene, PixelScene
 
 _ASPECT_TOLERANCE = 0.04  # backbones round each side to a multiple of 14 by itself
 _MIN_CORRELATION = 0.5
@@ -28,20 +41,36 @@ class SceneLoad:
     """A scene and how it came about.
 
     Args:
-        scene: The scene.
+        scene: The scene: one Gaussian per pixel, or a loose one where no pixels were found.
         ply: What was found in the ``.ply``.
         files: The files that were read.
         cameras: The cameras in the order of the views, as their file has them.
-        alignment: How well every view's Gaussians project into their own pixels.
+        alignment: How well every view's Gaussians project into their own pixels; None for a loose scene.
+        recovery: Which reading of the rows won, and by how much; None for a loose scene.
+        problem: Why no pixels were found, in one sentence; None where they were.
+        dialects: The exporters that may have written the file, or the one that was told.
         notes: What was adapted or looks odd, one sentence each, without a full stop.
     """
 
-    scene: PixelScene
+    scene: PixelScene | LooseScene
     ply: PlyInfo
     files: SceneFiles
     cameras: CameraFile
-    alignment: Alignment
+    alignment: Alignment | None
+    recovery: Recovery | None
+    problem: str | None
+    dialects: tuple[Dialect, ...]
     notes: tuple[str, ...]
+
+    def pixel_scene(self) -> PixelScene:
+        """The scene, for those who need one Gaussian per pixel.
+
+        Raises:
+            SceneError: If no pixels were found; says why.
+        """
+        if isinstance(self.scene, PixelScene):
+            return self.scene
+        raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
 
 
 def read_scene(
@@ -50,22 +79,30 @@ def read_scene(
     cameras: str | os.PathLike[str] | None = None,
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
-) -> PixelScene:
-    """Read a scene with one Gaussian per pixel: ``.ply``, cameras, and images where there are any.
+    **reading: Any,
+) -> PixelScene | LooseScene:
+    """Read a scene: ``.ply``, cameras, and images where there are any.
+
+    Which row belongs to which pixel is found by measuring (docs/dialects.md).
 
     Args:
         path: The ``.ply``, or a folder that has it.
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
+        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``.
+
+    Returns:
+        One Gaussian per pixel; a :class:`gsmerge.types.LooseScene` where the rows belong to no pixels.
 
     Raises:
-        SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' pixels.
+        SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' views.
+        ValueError: If an argument is none of the possible ones.
 
     Example:
         >>> scene = read_scene("scene.ply")  # doctest: +SKIP
     """
-    return load_scene(path, cameras=cameras, images=images, opacity=opacity).scene
+    return load_scene(path, cameras=cameras, images=images, opacity=opacity, **reading).scene
 
 
 def load_scene(
@@ -74,73 +111,151 @@ def load_scene(
     cameras: str | os.PathLike[str] | None = None,
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
+    **reading: Any,
 ) -> SceneLoad:
     """:func:`read_scene` with everything that was found on the way."""
-    files = find_scene_files(path, cameras=cameras, images=images)
-    return align_scene(read_ply(files.ply, opacity=opacity), files)
+    chosen = make_reading(reading)
+    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, reading=chosen)
 
 
-def align_scene(ply: PlyScene, files: SceneFiles, camera_file: CameraFile | None = None) -> SceneLoad:
-    """Put Gaussians, cameras and images together and verify that they belong together.
+def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO) -> SceneLoad:
+    """:func:`load_scene` for files that are found already."""
+    return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
 
-    The views are tried in the order of the camera file, then in the order of the images' names.
+
+def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlyScene:
+    """The file's rows, with opacities as told, or as the told exporter stores them."""
+    told = find_dialect(reading.dialect)
+    return read_ply(path, opacity=opacity if told is None or opacity != "auto" else told.opacity)
+
+
+def align_scene(
+    ply: PlyScene, files: SceneFiles, camera_file: CameraFile | None = None, *, reading: Reading = AUTO
+) -> SceneLoad:
+    """Put Gaussians, cameras and images together and find out which row belongs to which pixel.
 
     Args:
         ply: The Gaussians.
         files: Where the cameras and images are.
         camera_file: The cameras, if they are read already.
+        reading: What is told instead of found.
 
     Raises:
         SceneError: As :func:`read_scene`.
     """
-    if files.cameras is None:
-        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        raise SceneError(files.ply, f"no cameras found beside it (looked for {places})", "name them with --cameras")
-    camera_file = read_cameras(files.cameras) if camera_file is None else camera_file
-    names = camera_file.names
-    images = read_photos(files, camera_file)
-    cameras, notes = _fit_grid(ply.info, files, camera_file, images)
-    alignment = check_alignment(ply.gaussians, cameras, ply.valid)
-    if not alignment.ok:
-        order = sorted(range(len(names)), key=lambda i: natural_key(names[i]))
-        by_name = check_alignment(ply.gaussians, cameras[order], ply.valid)
-        if not by_name.ok:
-            raise _misaligned(ply, camera_file, cameras, alignment)
-        cameras, camera_file, alignment = cameras[order], select_views(camera_file, order), by_name
-        images = None if images is None else images[order]
-        notes.append("views are in the order of the image names, not of the camera file")
-    valid = ply.valid.reshape(len(cameras), cameras.height, cameras.width)
-    scene = PixelScene(ply.gaussians, cameras, images, valid, camera_file.names)
-    notes += _colour_notes(scene)
-    return SceneLoad(scene, ply.info, files, camera_file, alignment, (*ply_notes(ply.info), *notes))
+    read = cameras_of(ply, files) if camera_file is None else camera_file
+    images = read_photos(files, read)
+    cameras, notes = _fit_grid(ply.info, files, read, images)
+    told = find_dialect(reading.dialect)
+    known = told.order if told is not None else read.order
+    order = known if reading.order == "auto" else reading.order
+    orders, depths = _labellings(read.names), partial(read_depths, Path(read.path))
+    clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, order, reading.scene_scale)
+    recovery = recover(clues)
+    if recovery is None:
+        return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
+    best = recovery.best
+    dialects = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
+    moved = torch.from_numpy(best.frame.move_cameras(clues.viewmats))
+    in_frame = cameras if best.frame is SAME else replace(cameras, viewmats=moved)
+    scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, images, read.names)
+    scene, filled = _filled(scene, recovery, depths)
+    scene, turned = _with_rotations(scene, reading, dialects)
+    if best.layout.per_pixel == 1:
+        read = select_views(read, best.layout.views)
+    if read.source == ESTIMATED:
+        notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
+    notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
+    alignment = check_alignment(scene.gaussians, scene.cameras, scene.valid)
+    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
 
 
-def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
-    """The images of the cameras: from the folder, an ``.npz``, or where the camera file itself says.
+def _filled(
+    scene: PixelScene, recovery: Recovery, depths: Callable[[], np.ndarray | None]
+) -> tuple[PixelScene, list[str]]:
+    """Pixels that were dropped for being far, put back from the depth maps beside the cameras; and a note of it."""
+    layout = recovery.best.layout
+    maps = depths() if layout.kind == "box+depth" else None
+    if maps is None:
+        return scene, []
+    full = fill_from_depths(scene, maps[list(layout.views)])
+    count = int(full.valid.sum()) - int(scene.valid.sum())
+    return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] if count else []
 
-    Args:
-        files: Where the images are.
-        camera_file: The cameras.
 
-    Returns:
-        ``[c,h,w,3]`` float32 in [0, 1], in the order of the cameras; None if there are none.
+def _with_rotations(scene: PixelScene, reading: Reading, dialects: Sequence[Dialect]) -> tuple[PixelScene, list[str]]:
+    """Rotations as told, as the told exporter stores them, or as the surface says; and a note where that was it."""
+    if reading.quats != "auto":
+        return read_rotations(scene, reading.quats), []
+    if reading.dialect != "auto":
+        return read_rotations(scene, dialects[0].quats), []
+    if any(not dialect.check_rotations for dialect in dialects):
+        return scene, []
+    choice, words = likely_rotations(scene)
+    return read_rotations(scene, choice), [words] if words else []
+
+
+def _labellings(names: Sequence[str]) -> list[list[int]]:
+    """Orders that the views may be in: that of the camera file, and that of the images' names."""
+    return [list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))]
+
+
+def _layout_notes(recovery: Recovery, clues: Clues) -> list[str]:
+    """How the pixels were found, unless the file was simply in order."""
+    layout, frame = recovery.best.layout, recovery.best.frame
+    if layout.is_plain and frame is SAME and len(layout.views) == len(clues.cameras):
+        if layout.views == tuple(clues.labellings[0]):
+            return []
+        if layout.views == tuple(clues.labellings[1]):
+            return ["views are in the order of the image names, not of the camera file"]
+    notes = [f"read as: {recovery.words}"]
+    used = len(set(layout.views))
+    return notes + ([f"{used} of {len(clues.cameras)} views are in the file"] if used < len(clues.cameras) else [])
+
+
+def _loose(
+    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, clues: Clues, reading: Reading, notes: tuple[str, ...]
+) -> SceneLoad:
+    """The scene without pixels, if the cameras see it.
 
     Raises:
-        SceneError: As :func:`gsmerge.io.read_images`.
+        SceneError: If they do not, or if other cameras or another reading of them would make it one with pixels.
     """
-    if files.images is None:
-        folder = Path(camera_file.path).parent
-        found = [find_image(folder, name) for name in camera_file.names]
-        paths = [f for f in found if f is not None]
-        return read_images(paths, camera_file.names) if len(paths) == len(found) else None
-    if files.images.suffix != ".npz":
-        return read_images(files.images, camera_file.names)
-    own = files.cameras is not None and files.cameras.resolve() == files.images.resolve()
-    stored = camera_file.images if own else read_da3(files.images).images
-    if stored is None or len(stored) != len(camera_file):
-        found_count = 0 if stored is None else len(stored)
-        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {found_count}")
-    return as_tensor(stored)
+    cameras, images = clues.cameras, clues.images
+    views, width, height = len(cameras), cameras.width, cameras.height
+    problem, remedy = _count_problem(ply.info, views, width, height), _other_grid(ply.info.count, views, width, height)
+    if clues.order != "none":
+        if len(ply.gaussians) == views * width * height:
+            alignment = check_alignment(ply.gaussians, cameras, ply.valid)
+            reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
+            if reason or looks_like_a_grid(ply.gaussians, ply.valid, cameras):
+                raise _misaligned(camera_file, alignment, reason)
+            problem = f"expected one Gaussian per pixel, found {ply.info.count} rows that are in no known order"
+        if _lacks_cameras(clues):
+            raise SceneError(ply.info.path, problem, remedy)
+    if clues.scale is not None:
+        scaled = Frame(np.eye(3), clues.scale, np.zeros(3))
+        cameras = replace(cameras, viewmats=torch.from_numpy(scaled.move_cameras(clues.viewmats)))
+    seen = sight(ply.gaussians, ply.valid, cameras, images)
+    if not seen.ok:
+        raise SceneError(ply.info.path, f"{problem}; {seen.words}", remedy)
+    told = find_dialect(reading.dialect)
+    dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
+    gaussians = ply.gaussians[ply.valid]
+    if reading.quats == "xyzw":
+        gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
+    scene = LooseScene(gaussians, cameras, images, camera_file.names)
+    lost = "the rows belong to no pixels that could be found: unaligned"
+    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, lost))
+
+
+def _lacks_cameras(clues: Clues) -> bool:
+    """Whether the first views are in order, and there are more of them than cameras."""
+    pixels = len(clues.cameras) * clues.cameras.width * clues.cameras.height
+    if len(clues.gaussians) <= pixels or len(clues.gaussians) % (clues.cameras.width * clues.cameras.height):
+        return False
+    first = replace(clues, gaussians=clues.gaussians[:pixels], valid=clues.valid[:pixels], order="view-major")
+    return recover(first) is not None
 
 
 def _fit_grid(
@@ -149,9 +264,7 @@ def _fit_grid(
     """Cameras of the size of the Gaussian grid: the images' size, which the camera file's must agree with."""
     sizes = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
     if images is None:
-        cameras = to_cameras(camera_file)
-        _expect_count(ply, len(cameras), cameras.width, cameras.height)
-        return cameras, []
+        return to_cameras(camera_file), []
     height, width = images.shape[1:3]
     views = len(camera_file)
     if ply.count != views * height * width:
@@ -162,7 +275,6 @@ def _fit_grid(
                 f"expected images of the Gaussian grid's size {grid[0]} x {grid[1]}, found {width} x {height}",
                 "give the images that the backbone saw, or resize these",
             )
-        _expect_count(ply, views, width, height)
     for w, h in sizes:
         if w and h and abs(w * height / (h * width) - 1) > _ASPECT_TOLERANCE:
             swapped = (w, h) == (height, width)
@@ -176,15 +288,12 @@ def _fit_grid(
     return to_cameras(camera_file, (width, height)), notes
 
 
-def _expect_count(ply: PlyInfo, views: int, width: int, height: int) -> None:
+def _count_problem(ply: PlyInfo, views: int, width: int, height: int) -> str:
     pixels = width * height
-    if ply.count == views * pixels:
-        return
-    problem = (
+    return (
         f"expected one Gaussian per pixel, {views} x {height} x {width} = {views * pixels} (views x height x width), "
         f"found {ply.count}"
     )
-    raise SceneError(ply.path, problem, _other_grid(ply.count, views, width, height))
 
 
 def _other_grid(count: int, views: int, width: int, height: int) -> str:
@@ -207,13 +316,12 @@ def _other_grid(count: int, views: int, width: int, height: int) -> str:
     return "give the cameras and images that belong to it"
 
 
-def _misaligned(ply: PlyScene, camera_file: CameraFile, cameras: Cameras, alignment: Alignment) -> SceneError:
-    worst = alignment.worst_px
+def _misaligned(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
     measured = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
-        f"found a median of up to {worst:.1f} px and {100 * alignment.share_in_front:.0f} % in front of their camera"
+        f"found a median of up to {alignment.worst_px:.1f} px and "
+        f"{100 * alignment.share_in_front:.0f} % in front of their camera"
     )
-    reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
     unknown = "no other convention fits either: give the cameras that belong to the .ply"
     return SceneError(camera_file.path, measured, f"{reason}: convert one to the other" if reason else unknown)
 

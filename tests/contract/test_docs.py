@@ -70,7 +70,11 @@ def test_every_option_has_help(name: str) -> None:
 def cli_defaults() -> Iterator[tuple[str, str]]:
     """Name and told default of those options of ``compact`` that leave the default to the library."""
     for param in COMMANDS["compact"].params:
-        if isinstance(getattr(param, "show_default", None), str) and param.name not in ("output", "threads"):
+        if isinstance(getattr(param, "show_default", None), str) and param.name not in (
+            "output",
+            "threads",
+            "scene_scale",
+        ):
             yield param.name, param.show_default
 
 
@@ -97,6 +101,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
     """Merging and segmentation options carry the API's names."""
     fields = set(gsmerge.CompactOptions().to_dict())
     own = {"output", "overwrite", "report", "json", "quiet", "dry-run", "debug", "cameras", "images", "opacity"}
+    own |= {"dialect", "quats", "order", "scene-scale"}
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
     assert {name.replace("-", "_") for name in names} - fields == set()
 

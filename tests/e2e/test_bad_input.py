@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -97,6 +98,7 @@ def unreadable_image(scene: Path) -> list[object]:
 
 def no_cameras(scene: Path) -> list[object]:
     (scene / "transforms.json").unlink()
+    shutil.rmtree(scene / "images")
     return []
 
 
@@ -105,11 +107,11 @@ def broken_json(scene: Path) -> list[object]:
     return []
 
 
-def dropped_pixels(scene: Path) -> list[object]:
-    head, rows = header_and_rows(scene / "scene.ply")
-    count = len(rows) // 68
-    head = head.replace(f"element vertex {count}", f"element vertex {count - 7}")
-    (scene / "scene.ply").write_bytes(head.encode() + b"\n"[:0] + HEADER_END + rows[: -7 * 68])
+def missing_cameras(scene: Path) -> list[object]:
+    path = scene / "transforms.json"
+    data = json.loads(path.read_text())
+    data["frames"] = data["frames"][:-1]
+    path.write_text(json.dumps(data))
     return []
 
 
@@ -160,7 +162,7 @@ CASES: dict[str, tuple[Spoil, int, list[str]]] = {
     "unreadable image": (unreadable_image, 3, ["view_03.png"]),
     "no cameras": (no_cameras, 3, ["scene.ply", "no cameras", "--cameras"]),
     "broken JSON": (broken_json, 3, ["transforms.json", "expected JSON"]),
-    "dropped pixels": (dropped_pixels, 3, ["scene.ply", "30720", "30713"]),
+    "missing cameras": (missing_cameras, 3, ["scene.ply", "30720", "24576", "5 views"]),
     "no such cameras": (given("--cameras", "nowhere.json"), 3, ["nowhere.json", "no such file"]),
     "no such images": (given("--images", "nowhere"), 3, ["nowhere", "no such file"]),
     "output in no folder": (output_in_no_folder, 3, ["small.ply", "nowhere"]),

@@ -9,7 +9,6 @@ from types import ModuleType
 
 import pytest
 
-from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
 
 
@@ -41,7 +40,15 @@ def test_a_plain_export_lines_up(exporter: ModuleType, root: Path, tmp_path: Pat
     assert loaded.notes == ()
 
 
-def test_a_pruned_export_is_refused(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
-    ply = exporter.export(shared_folder(root) / "scenes" / "eval" / "lightfield", tmp_path, "da3", max_views=2)
-    with pytest.raises(SceneError, match="expected one Gaussian per pixel"):
-        load_scene(ply)
+def test_a_pruned_export_is_put_back(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
+    scene = shared_folder(root) / "scenes" / "eval" / "lightfield"
+    ply = exporter.export(scene, tmp_path, "da3", max_views=2, nested_scale=1.7)
+    loaded = load_scene(ply)
+    assert loaded.alignment is not None
+    assert loaded.alignment.share_within_1px > 0.999
+    assert loaded.recovery is not None
+    assert loaded.recovery.best.layout.kind == "box+depth"
+    assert loaded.recovery.best.frame.scale == pytest.approx(1 / 1.7, rel=1e-3)
+    found = loaded.pixel_scene()
+    assert found.num_gaussians == loaded.ply.count
+    assert found.valid.all()  # what was dropped is put back from the depth maps

@@ -38,6 +38,7 @@ class CameraFile:
         source: The format's name.
         convention: How the format stores poses.
         images: ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves.
+        order: Order of the Gaussians' rows where the file names it, otherwise "auto".
     """
 
     path: str
@@ -49,6 +50,7 @@ class CameraFile:
     source: str
     convention: Convention = W2C_OPENCV
     images: np.ndarray | None = None
+    order: str = "auto"
 
     def __len__(self) -> int:
         return len(self.names)

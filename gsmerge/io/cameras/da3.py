@@ -34,7 +34,7 @@ def read_da3(path: Path) -> CameraFile:
         )
     images, depths = _first(arrays, _IMAGES), _first(arrays, _DEPTHS)
     if images is not None:
-        images = _as_images(path, images, len(poses))
+        images = as_images(path, images, len(poses))
     grid = images if images is not None else depths
     Ks = Ks.astype(np.float64)
     if grid is not None and grid.ndim >= 3:
@@ -58,6 +58,20 @@ def holds_images(path: Path) -> bool:
         return False
 
 
+def read_depths(path: Path) -> np.ndarray | None:
+    """The depth maps ``[c,h,w]`` beside the cameras; None where there are none."""
+    if path.suffix != ".npz" or not zipfile.is_zipfile(path):
+        return None
+    try:
+        with path.open("rb") as file, np.load(file) as stored:
+            depths = _first({name: stored[name] for name in _DEPTHS if name in stored.files}, _DEPTHS)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error
+    if depths is not None and depths.ndim == 4 and depths.shape[3] == 1:
+        depths = depths[..., 0]
+    return depths if depths is not None and depths.ndim == 3 else None
+
+
 def _load(path: Path) -> dict[str, np.ndarray]:
     """The arrays that matter; depth only for its shape, so the confidence is never decompressed."""
     wanted = {*_EXTRINSICS, *_INTRINSICS, *_IMAGES}
@@ -76,7 +90,8 @@ def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray 
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
+def as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
+    """``[c,h,w,3]`` uint8 from images in any of the usual forms."""
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
     if images.ndim != 4 or images.shape[0] != count or images.shape[3] != 3:
@@ -90,8 +105,8 @@ def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Intrinsics at the given size: these networks keep the principal point in the middle, which tells their size."""
     ratio_x, ratio_y = 2 * Ks[:, 0, 2] / width, 2 * Ks[:, 1, 2] / height
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
-    # the same ratio on both axes: another size; one that differs between them: a principal point off the middle
-    other_size = (np.abs(ratio_x / ratio_y - 1) < 0.03) & (np.abs(ratio_x - 1) > 0.01)
+    # the same ratio on both axes, clearly: another size; otherwise a principal point that is not in the middle
+    other_size = (np.abs(ratio_x / ratio_y - 1) < 0.03) & (np.abs(ratio_x - 1) > 0.1)
     scaled = Ks.copy()
     for i in range(len(Ks)):
         if normalised[i]:

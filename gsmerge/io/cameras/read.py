@@ -10,6 +10,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
 from gsmerge.io.cameras.da3 import read_da3
+from gsmerge.io.cameras.dump import is_dump, read_dump
 from gsmerge.io.cameras.inria import read_inria
 from gsmerge.io.cameras.long_lrm import read_long_lrm
 from gsmerge.io.cameras.trajectory import is_trajectory, read_trajectory
@@ -19,6 +20,7 @@ from gsmerge.io.cameras.world_mirror import read_world_mirror
 # Where cameras lie beside a scene, the first that exists wins; a COLMAP model right in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
+    "views.npz",
     "transforms.json",
     "cameras.json",
     "camera_params.json",
@@ -48,8 +50,9 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
     ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,
-    ``results.npz`` of Depth Anything 3, ``camera_params.json`` of WorldMirror, the dataset file of Long-LRM, and text
-    files with one pose per line. Poses become world-to-camera with OpenCV axes.
+    ``results.npz`` of Depth Anything 3, ``views.npz`` dumped from a running model, ``camera_params.json`` of
+    WorldMirror, the dataset file of Long-LRM, and text files with one pose per line. Poses become world-to-camera with
+    OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
@@ -74,7 +77,7 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
             raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
         return read_colmap(path.parent)
     if path.suffix == ".npz":
-        return read_da3(path)
+        return read_dump(path) if is_dump(path) else read_da3(path)
     if path.suffix == ".json":
         return _read_json(path)
     raise SceneError(path, "expected cameras as .json, .npz or a COLMAP folder, found another kind of file")

@@ -1,0 +1,57 @@
+"""The camera that SHARP writes into its ``.ply``: elements ``extrinsic``, ``intrinsic`` and ``image_size``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from plyfile import PlyData, PlyParseError
+from torch import Tensor
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+
+SOURCE = "SHARP"
+LAYERS = 2  # Gaussians per cell: a front and a back layer
+
+
+def read_sharp(path: Path) -> CameraFile | None:
+    """The camera inside a ``.ply``, at the size of its grid; None where there is none.
+
+    The grid is square whatever the photo's shape: the photo was stretched to it.
+
+    Raises:
+        SceneError: If the numbers are damaged.
+    """
+    try:
+        data = PlyData.read(str(path), mmap="r")
+    except (PlyParseError, ValueError, OSError):
+        return None  # the reader of the Gaussians says what is wrong
+    if not all(name in data for name in ("vertex", "extrinsic", "intrinsic", "image_size")):
+        return None
+    extrinsic, intrinsic, size = (
+        np.asarray([row[0] for row in data[name].data], np.float64) for name in ("extrinsic", "intrinsic", "image_size")
+    )
+    side = round((data["vertex"].count / LAYERS) ** 0.5)
+    if LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
+        return None
+    if len(extrinsic) not in (12, 16) or len(intrinsic) not in (4, 9):
+        raise SceneError(path, f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}")
+    if len(intrinsic) == 4:
+        fx, fy, cx, cy = intrinsic
+        intrinsic = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+    K = intrinsic.reshape(3, 3) * np.array([[side / size[0]], [side / size[1]], [1.0]])
+    return make_camera_file(path, SOURCE, W2C_OPENCV, [extrinsic.reshape(-1, 4)], [K], [(side, side)], [path.stem])
+
+
+def stretched(images: Tensor, width: int, height: int) -> Tensor:
+    """``[v,h,w,3]`` photos stretched to another size."""
+    if tuple(images.shape[1:3]) == (height, width):
+        return images
+    shrinks = images.shape[1] * images.shape[2] > width * height
+    kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return torch.from_numpy(
+        np.stack([cv2.resize(image, (width, height), interpolation=kind) for image in images.numpy()])
+    )

@@ -1,0 +1,197 @@
+"""Which row of a file may belong to which pixel: what the number of rows allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "none"]
+ORDERS: tuple[str, ...] = get_args(Order)
+
+TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
+PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
+DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote.
+
+    Args:
+        words: What it is, for people.
+        kind: "full", "trim", "box", "box+depth" or "pruned": which pixels there are.
+        order: In which order the rows are.
+        width: Of the grid, pixels.
+        height: The same.
+        views: The camera of each block.
+        rows: The rows of each block, of any shape: not a copy where a stride will do.
+        pixels: ``[p]`` the pixel ``y·W + x`` of each of these rows.
+        per_pixel: Gaussians per pixel; above 1 each layer is a block.
+    """
+
+    words: str
+    kind: str
+    order: str
+    width: int
+    height: int
+    views: tuple[int, ...]
+    rows: tuple[np.ndarray, ...]
+    pixels: tuple[np.ndarray, ...]
+    per_pixel: int = 1
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the rows are the grid as they stand: nothing to move, nothing missing."""
+        return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
+
+
+@dataclass(frozen=True)
+class Box:
+    """The part of a view that was kept: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
+
+    kind: str
+    words: str
+    top: int
+    left: int
+
+    def pixels(self, width: int, height: int) -> np.ndarray:
+        """Pixels of the box, row by row."""
+        grid = np.arange(width * height, dtype=np.int64).reshape(height, width)
+        return grid[self.top : height - self.top, self.left : width - self.left]
+
+
+def boxes(width: int, height: int) -> list[Box]:
+    """What is cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
+    top, left = da3_border(width, height)
+    found = [Box("full", "every pixel", 0, 0)]
+    if min(width, height) > 2 * TRIM:
+        found.append(Box("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
+    if (top or left) and (top, left) != (TRIM, TRIM):
+        found.append(Box("box", f"{top} rows and {left} columns trimmed at every border", top, left))
+    return found
+
+
+def da3_border(width: int, height: int) -> tuple[int, int]:
+    """Rows and columns that Depth Anything 3 cuts off at each side."""
+    return int(8 / 256 * height), int(8 / 256 * width)
+
+
+def every_nth(views: int, count: int) -> tuple[int, ...] | None:
+    """Which ``count`` of the views an exporter that takes every n-th one has; None where no n does."""
+    for step in range(1, views + 1):
+        chosen = tuple(range(0, views, step))
+        if len(chosen) == count:
+            return chosen
+    return None
+
+
+def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
+    """Layouts with exactly ``count`` rows, for every number of views up to ``views``.
+
+    Which camera a block belongs to is a first guess: the cameras in order, or every n-th of them.
+    """
+    index = np.arange(count, dtype=np.int64)
+    for box in boxes(width, height):
+        grid = box.pixels(width, height)
+        for per_pixel in PER_PIXEL:
+            blocks = count / (grid.size * per_pixel)
+            if blocks != int(blocks) or not 1 <= blocks <= views:
+                continue
+            chosen = every_nth(views, int(blocks)) or tuple(range(int(blocks)))
+            yield from _orders(index, box, grid, per_pixel, chosen, width, height)
+
+
+def _orders(
+    index: np.ndarray, box: Box, grid: np.ndarray, per_pixel: int, views: tuple[int, ...], width: int, height: int
+) -> Iterator[Layout]:
+    rows, columns, blocks = *grid.shape, len(views)
+    arranged = {
+        "view-major": index.reshape(blocks, rows, columns, per_pixel).transpose(0, 3, 1, 2),
+        "view-fastest": index.reshape(rows, columns, per_pixel, blocks).transpose(3, 2, 0, 1),
+        "column-major": index.reshape(blocks, columns, rows, per_pixel).transpose(0, 3, 2, 1),
+        "layer-major": index.reshape(per_pixel, blocks, rows, columns).transpose(1, 0, 2, 3),
+    }
+    pixels = grid.reshape(-1)
+    for order, laid in arranged.items():
+        if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and blocks == 1):
+            continue
+        words = box.words + (f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else "") + f", {order}"
+        parts = tuple(laid[block, layer] for block in range(blocks) for layer in range(per_pixel))
+        yield Layout(
+            words=words,
+            kind=box.kind,
+            order=order,
+            width=width,
+            height=height,
+            views=tuple(view for view in views for _ in range(per_pixel)),
+            rows=parts,
+            pixels=(pixels,) * len(parts),
+            per_pixel=per_pixel,
+        )
+
+
+def depth_layout(count: int, depths: np.ndarray) -> Layout | None:
+    """The layout of Depth Anything 3 from the depth maps beside it: border, nearest 90 % of each view, every n-th view.
+
+    Args:
+        count: Rows of the file.
+        depths: ``[v,h,w]``; only their order matters, so any scale will do.
+
+    Returns:
+        None if no choice of views has that many pixels.
+    """
+    views, height, width = depths.shape
+    kept = [depth_mask(depth) for depth in depths]
+    for step in range(1, views + 1):
+        chosen = tuple(range(0, views, step))
+        if sum(len(kept[view]) for view in chosen) == count:
+            ends = np.cumsum([len(kept[view]) for view in chosen])
+            top, left = da3_border(width, height)
+            every = "" if step == 1 else f", every {step}. view"
+            return Layout(
+                words=f"{top} rows and {left} columns trimmed, nearest 90 % of each view{every}, view-major",
+                kind="box+depth",
+                order="view-major",
+                width=width,
+                height=height,
+                views=chosen,
+                rows=tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1])),
+                pixels=tuple(kept[view] for view in chosen),
+            )
+    return None
+
+
+def depth_mask(depth: np.ndarray) -> np.ndarray:
+    """Pixels of one view that Depth Anything 3 keeps, in order.
+
+    Its threshold is the 90 % quantile of all the view's depths, interpolated: between two depths that occur, so
+    the lower of the two decides.
+    """
+    height, width = depth.shape
+    rank = int(DEPTH_SHARE * (depth.size - 1))
+    mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
+    top, left = da3_border(width, height)
+    inside = np.zeros_like(mask)
+    inside[top : height - top, left : width - left] = True
+    return np.flatnonzero(mask & inside)
+
+
+def relabelled(layout: Layout, views: Sequence[int]) -> Layout:
+    """The same with other cameras for its blocks."""
+    return replace(layout, views=tuple(views))
+
+
+def thinned(layout: Layout, per_block: int) -> Layout:
+    """About ``per_block`` rows of each block, spread over all columns and rows."""
+    rows, pixels = [], []
+    for some, where in zip(layout.rows, layout.pixels, strict=True):
+        step = max(1, -(-some.size // per_block))
+        while step > 1 and np.gcd(step, layout.width) > 1:  # a step that divides the width sees some columns only
+            step += 1
+        chosen = np.arange(0, some.size, step)
+        rows.append(some.flat[chosen])
+        pixels.append(where[chosen])
+    return replace(layout, rows=tuple(rows), pixels=tuple(pixels))

@@ -1,0 +1,61 @@
+"""What a caller tells about a file instead of leaving it to be found out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, cast
+
+from gsmerge.io.layouts import ORDERS, Order
+
+QuatChoice = Literal["auto", "wxyz", "xyzw", "camera"]
+QUATS: tuple[str, ...] = ("auto", "wxyz", "xyzw", "camera")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How to read a file where its values do not tell, or tell something wrong.
+
+    Args:
+        dialect: Which exporter wrote it, a name of :data:`gsmerge.io.dialects.DIALECTS`; "auto": found out.
+        quats: How rotations are stored: "wxyz", "xyzw", or "camera" (wxyz, relative to the own view's camera);
+            "auto": as the dialect says, and checked against the surface where the pixels are known.
+        order: Order of the rows; "none": they belong to no pixels.
+        scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
+
+    Raises:
+        ValueError: If a value is none of the possible ones.
+    """
+
+    dialect: str = "auto"
+    quats: QuatChoice = "auto"
+    order: Order = "auto"
+    scene_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, known in (("quats", QUATS), ("order", ORDERS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected {_listed(known)}, got {getattr(self, name)!r}")
+        if self.scene_scale is not None and not 0 < self.scene_scale < float("inf"):
+            raise ValueError(f"scene_scale: expected a positive number, got {self.scene_scale}")
+
+
+AUTO = Reading()
+
+
+def make_reading(values: Mapping[str, Any]) -> Reading:
+    """A reading from keyword arguments.
+
+    Raises:
+        ValueError: If one is unknown or none of its possible values.
+    """
+    known = {field.name for field in fields(Reading)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise ValueError(f"expected {_listed(sorted(known))}, got {unknown[0]!r}")
+    return Reading(**cast("dict[str, Any]", dict(values)))
+
+
+def _listed(names: Any) -> str:
+    *most, last = (repr(name) for name in names)
+    return f"{', '.join(most)} or {last}"

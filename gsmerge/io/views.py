@@ -1,0 +1,73 @@
+"""The cameras and photos of a scene, wherever they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.cameras.da3 import read_da3
+from gsmerge.io.cameras.estimate import estimate_cameras
+from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
+from gsmerge.io.cameras.sharp import SOURCE as SHARP
+from gsmerge.io.cameras.sharp import read_sharp, stretched
+from gsmerge.io.images import as_tensor, find_image, image_size, list_images, read_images
+from gsmerge.io.ply import PlyScene
+from gsmerge.io.scene_files import SceneFiles
+
+
+def cameras_of(ply: PlyScene, files: SceneFiles) -> CameraFile:
+    """The cameras: from their file, from the ``.ply`` itself, or estimated for the images where there is nothing else.
+
+    Raises:
+        SceneError: If there are none and they cannot be estimated.
+    """
+    if files.cameras is not None:
+        return read_cameras(files.cameras)
+    found = read_sharp(files.ply)
+    if found is None and files.images is not None and files.images.is_dir():
+        paths = list_images(files.images)
+        width, height = image_size(paths[0]) if paths else (0, 0)
+        names = [path.relative_to(files.images).as_posix() for path in paths]
+        found = estimate_cameras(files.ply, ply.gaussians, ply.valid.numpy(), names, width, height)
+    if found is None:
+        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
+        raise SceneError(files.ply, f"no cameras found beside it (looked for {places})", "name them with --cameras")
+    return found
+
+
+def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
+    """The images of the cameras: from the folder, an ``.npz``, or where the camera file itself says.
+
+    Args:
+        files: Where the images are.
+        camera_file: The cameras.
+
+    Returns:
+        ``[c,h,w,3]`` float32 in [0, 1], in the order of the cameras; None if there are none.
+
+    Raises:
+        SceneError: As :func:`gsmerge.io.read_images`.
+    """
+    images = _stored_photos(files, camera_file)
+    if images is not None and camera_file.source == SHARP:
+        return stretched(images, int(camera_file.widths[0]), int(camera_file.heights[0]))
+    return images
+
+
+def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
+    if files.images is None:
+        folder = Path(camera_file.path).parent
+        found = [find_image(folder, name) for name in camera_file.names]
+        paths = [f for f in found if f is not None]
+        return read_images(paths, camera_file.names) if len(paths) == len(found) else None
+    if files.images.suffix != ".npz":
+        return read_images(files.images, camera_file.names)
+    own = files.cameras is not None and files.cameras.resolve() == files.images.resolve()
+    stored = camera_file.images if own else read_da3(files.images).images
+    if stored is None or len(stored) != len(camera_file):
+        found_count = 0 if stored is None else len(stored)
+        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {found_count}")
+    return as_tensor(stored)

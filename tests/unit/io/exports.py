@@ -1,0 +1,150 @@
+"""Exports of made scenes: rows of a file as exporters write them, before any reader has touched them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms
+
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.types import SH_C0
+
+
+@dataclass(frozen=True)
+class Smooth(Tiny):
+    """A tiny scene of a smooth surface, with its depth maps ``[3,h,w]``."""
+
+    depths: np.ndarray
+
+
+def smooth_scene(width: int, height: int) -> Smooth:
+    """Three views of a smooth surface with smooth colours, jitter a quarter of a pixel."""
+    tiny, rng = make_tiny(width, height), np.random.default_rng(5)
+    y, x = np.mgrid[:height, :width]
+    c2w = tiny.c2w.copy()
+    means, depths, images = [], [], []
+    for i in range(3):
+        c2w[i, :3, :3] = rotation(0.02 * i + 0.1, 0.2 - 0.2 * i, 0.05 * i)
+        c2w[i, :3, 3] = (0.6 * i - 0.6, 0.2 * i + 0.1, -0.2 * i - 1.5)
+        depth = 3 + 0.5 * np.sin(x / 9 + i) * np.cos(y / 7) + 1e-4 * rng.random((height, width))
+        u, v = (x + 0.5 + rng.uniform(-0.2, 0.2, x.shape), y + 0.5 + rng.uniform(-0.2, 0.2, x.shape))
+        K = tiny.K
+        camera = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], -1)
+        world = camera.reshape(-1, 3) @ c2w[i, :3, :3].T + c2w[i, :3, 3]
+        colors = 0.5 + 0.4 * np.sin(2.5 * world + np.array([0, 1, 2]))
+        means.append(world)
+        depths.append(depth)
+        images.append((colors * 255).round().astype(np.uint8).reshape(height, width, 3))
+    n = 3 * width * height
+    gaussians = replace(
+        tiny.gaussians,
+        means=torch.from_numpy(np.concatenate(means)).float(),
+        scales=torch.tensor([0.03, 0.03, 0.03]).repeat(n, 1),
+        sh0=(torch.from_numpy(np.stack(images).reshape(n, 1, 3) / 255.0).float() - 0.5) / SH_C0,
+    )
+    return Smooth(c2w, tiny.K, width, height, np.stack(images), gaussians, tiny.names, np.stack(depths))
+
+
+def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
+    """The same pixels and depths, seen through another lens."""
+    means = []
+    for pose, points in zip(tiny.c2w, tiny.gaussians.means.double().numpy().reshape(3, -1, 3), strict=True):
+        camera = (points - pose[:3, 3]) @ pose[:3, :3]
+        rays = camera @ tiny.K.T @ np.linalg.inv(K).T
+        means.append(rays @ pose[:3, :3].T + pose[:3, 3])
+    moved = torch.from_numpy(np.concatenate(means)).float()
+    return replace(tiny, K=K, gaussians=replace(tiny.gaussians, means=moved))
+
+
+def depth_map_mask(depth: np.ndarray) -> np.ndarray:
+    """What Depth Anything 3 keeps of a view: its own rule, in its own words."""
+    height, width = depth.shape
+    mask = np.zeros((height, width), bool)
+    top, left = int(8 / 256 * height), int(8 / 256 * width)
+    mask[top : height - top, left : width - left] = True
+    return mask & (depth <= np.quantile(depth, 0.9))
+
+
+def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, normals: str = "f4") -> np.ndarray:
+    """The scene's Gaussians, those of ``index`` in its order, as the 17 columns of nearly all exporters."""
+    g = tiny.gaussians if index is None else tiny.gaussians[torch.from_numpy(np.ascontiguousarray(index))]
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest)),
+             "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
+    names = [name for name in names if normals or name[0] != "n"]
+    rows = np.zeros(len(g), [(name, normals if name[0] == "n" else "f4") for name in names])
+    columns: dict[str, Any] = {"opacity": torch.logit(g.opacities)}
+    columns |= {name: g.means[:, i] for i, name in enumerate("xyz")}
+    columns |= {f"f_dc_{i}": g.sh0[:, 0, i] for i in range(3)}
+    columns |= {f"scale_{i}": g.scales[:, i].log() for i in range(3)}
+    columns |= {f"rot_{i}": g.quats[:, i] for i in range(4)}
+    for name, values in columns.items():
+        rows[name] = values.numpy()
+    return rows
+
+
+def turned(
+    rows: np.ndarray,
+    turn: np.ndarray,
+    *,
+    scale: float = 1.0,
+    shift: np.ndarray | None = None,
+    rotate_quats: bool = True,
+) -> np.ndarray:
+    """The rows in another world: ``scale * turn @ x + shift``."""
+    out = rows.copy()
+    means = scale * np.stack([rows[c] for c in "xyz"], 1) @ turn.T + (0 if shift is None else shift)
+    for i, name in enumerate("xyz"):
+        out[name] = means[:, i]
+        out[f"scale_{i}"] = rows[f"scale_{i}"] + np.log(scale)
+    if rotate_quats:
+        quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
+        moved = wxyz_of(turn @ quat_to_rotmat(torch.from_numpy(quats)).double().numpy())
+        for i in range(4):
+            out[f"rot_{i}"] = moved[:, i]
+    return out
+
+
+def wxyz_of(matrices: np.ndarray) -> np.ndarray:
+    """``[n,3,3]`` rotations -> ``[n,4]``, one after the other."""
+    quats = []
+    for matrix in matrices:
+        vector = cv2.Rodrigues(np.ascontiguousarray(matrix))[0][:, 0]
+        angle = float(np.linalg.norm(vector))
+        axis = vector / angle if angle > 1e-12 else np.zeros(3)
+        quats.append([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+    return np.array(quats)
+
+
+def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> Tiny:
+    """Discs that lie in the surface, with rotations to the world or to each view's camera."""
+    h, w = tiny.height, tiny.width
+    grid = tiny.gaussians.means.double().numpy().reshape(3, h, w, 3)
+    across, down = np.gradient(grid, axis=2), np.gradient(grid, axis=1)
+    across = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in across])
+    down = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in down])
+    normal = np.cross(across, down)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    first = across - (across * normal).sum(-1, keepdims=True) * normal
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    frames = np.stack([first, np.cross(normal, first), normal], -1)
+    if relative_to_camera:
+        frames = tiny.c2w[:, None, None, :3, :3].swapaxes(-1, -2) @ frames
+    quats = torch.from_numpy(wxyz_of(frames.reshape(-1, 3, 3))).float()
+    scales = torch.tensor([0.04, 0.03, 0.005]).repeat(len(quats), 1)
+    return replace(tiny, gaussians=replace(tiny.gaussians, quats=quats, scales=scales))
+
+
+def save_export(folder: Path, tiny: Tiny, rows: np.ndarray, *, cameras: bool = True, name: str = "scene.ply") -> Path:
+    """Write the rows with cameras and photos beside them; returns the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(folder / name))
+    if cameras:
+        write_transforms(folder / "transforms.json", tiny)
+        write_images(folder / "images", tiny)
+    return folder
