@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsmerge.allocate import auto_count, count_for_bytes, cut_tree, parse_budget, parse_bytes, pixel_depths, region_tree
+from gsmerge.contribution import seen_depths
 from gsmerge.errors import UsageError
 from gsmerge.fit import start_share
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_pictures
 from gsmerge.robust import MIN_VIEWS
 from gsmerge.segment import count_for, segment
-from gsmerge.types import Groups, PixelScene
+from gsmerge.types import Groups, LooseScene, PixelScene
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Grouping:
     exact: bool
 
 
-def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
+def group_scene(scene: PixelScene | LooseScene, options: CompactOptions) -> Grouping:
     """Superpixels of every view.
 
     Without a budget every view gets the same number. With one, or with ``k="auto"``, the superpixels of all views are
@@ -52,7 +53,7 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
     robust = uses_robust(scene, options)
     behind = options.backing.backing if robust and views >= MIN_VIEWS else 0.0
     share = start_share(options.fit) if scene.images is not None else 1.0
-    asked = count_for(options.segment, scene.cameras.height, scene.cameras.width)
+    asked = asked_per_view(scene, options)
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
     wanted, auto = target_count(scene, options), options.decode.k == "auto"
@@ -64,7 +65,11 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
     else:
         leaves = min(max(asked, -(-(wanted or 0) // views)), pixels)
         fine = segment(pictures, options.segment, leaves)
-        tree = region_tree(pictures, pixel_depths(scene), fine, scene.valid, options.allocate)
+        if isinstance(scene, LooseScene):
+            depths, valid = seen_depths(scene)
+        else:
+            depths, valid = pixel_depths(scene), scene.valid
+        tree = region_tree(pictures, depths, fine, valid, options.allocate)
         knee = auto_count(tree, options.allocate) if auto else len(tree)
         total = min(knee, wanted) if wanted is not None and auto else wanted if wanted is not None else knee
         if total < views:
@@ -76,13 +81,22 @@ def group_scene(scene: PixelScene, options: CompactOptions) -> Grouping:
     return Grouping(groups, coarse_groups, robust, total, exact=wanted is not None or auto)
 
 
-def uses_robust(scene: PixelScene, options: CompactOptions) -> bool:
+def asked_per_view(scene: PixelScene | LooseScene, options: CompactOptions) -> int:
+    """Superpixels of each view. Where there are fewer Gaussians than pixels, ``density`` is a share of those."""
+    cameras = scene.cameras
+    asked = count_for(options.segment, cameras.height, cameras.width)
+    if isinstance(scene, PixelScene) or options.segment.superpixels is not None:
+        return asked
+    return max(1, min(asked, int(options.segment.density * len(scene.gaussians) / len(cameras))))
+
+
+def uses_robust(scene: PixelScene | LooseScene, options: CompactOptions) -> bool:
     """Whether the photos choose the merge: as asked, otherwise unless a full fit follows."""
     asked = options.robust.robust
     return scene.images is not None and (options.fit.fit != "full" if asked is None else asked)
 
 
-def target_count(scene: PixelScene, options: CompactOptions) -> int | None:
+def target_count(scene: PixelScene | LooseScene, options: CompactOptions) -> int | None:
     """The number of Gaussians that a budget or a file size asks for, the smaller of the two; None without either."""
     num_input, wanted = len(scene.gaussians), []
     if options.budget is not None:

@@ -13,7 +13,6 @@ import torch
 
 from gsmerge.allocate import split_counts
 from gsmerge.backing import encode_backing
-from gsmerge.canonical import canonicalise
 from gsmerge.decode import decode
 from gsmerge.encode import encode
 from gsmerge.fit import fit
@@ -22,19 +21,20 @@ from gsmerge.match import match
 from gsmerge.memory import peak_memory, release_memory
 from gsmerge.merge import merge
 from gsmerge.metrics import psnr
-from gsmerge.moments import Members, scene_members
+from gsmerge.moments import Members
 from gsmerge.options import CompactOptions
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
 from gsmerge.robust import choose_merge, close_holes
 from gsmerge.threads import parallel_map, use_threads
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
+from gsmerge.unaligned import make_ready, members_of
 
 Progress = Callable[[str, int, int], None]
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 NEAR = 0.01  # near plane, in canonical units
 RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
-STAGES = ("prepare", "segment", "encode", "robust", "match", "decode", "fit", "score")
+STAGES = ("prepare", "segment", "members", "encode", "robust", "match", "decode", "fit", "score")
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,17 @@ class _Run:
 
 
 def compact(
-    scene: PixelScene, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
+    scene: PixelScene | LooseScene,
+    options: CompactOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    **settings: Any,
 ) -> CompactResult:
-    """Replace a per-pixel scene by a compact one that renders at least as well from new viewpoints.
+    """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:
-        scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`.
+        scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`; or Gaussians in no order, which are
+            given to the superpixels by what they add to the views.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the fit with ("fit: ...", step, steps).
@@ -112,16 +117,20 @@ def compact(
         The Gaussians and a report.
 
     Raises:
-        ValueError: If a setting is unknown or out of range.
+        ValueError: If a setting is unknown or out of range, or no Gaussian is finite.
     """
-    options = (options or CompactOptions()).with_settings(settings)
+    settled = (options or CompactOptions()).with_settings(settings)
     run = _Run(progress)
-    with use_threads(options.threads), torch.no_grad():
+    with use_threads(settled.threads), torch.no_grad():
         with run.stage("prepare"):
-            canonical, frame = canonicalise(scene)
-            members = scene_members(canonical)
+            ready = make_ready(scene, settled)
+            canonical, frame, options, kept = ready.scene, ready.frame, ready.options, ready.kept
+            run.notes += ready.notes
+            del ready
         with run.stage("segment"):
             grouping = group_scene(canonical, options)
+        with run.stage("members"):
+            members = members_of(canonical, grouping.groups, options)
         features = _merged_features(canonical, members, grouping, options, run)
         with run.stage("decode"):
             children = _filled(features, members, grouping, options)
@@ -131,7 +140,7 @@ def compact(
             with run.stage("fit"):
                 gaussians = _fitted(gaussians, canonical, grouping, options, run)
         del canonical
-        gaussians = frame.leave(gaussians)
+        gaussians = frame.leave(gaussians if kept is None else Gaussians.concat([gaussians, kept]))
         before = after = None
         if scene.images is not None:
             with run.stage("score"):
@@ -141,13 +150,13 @@ def compact(
         progress("done", len(STAGES), len(STAGES))
     counts = len(scene.gaussians), len(gaussians)
     report = CompactReport(
-        *counts, run.seconds, before, after, run.choices, run.notes, options.to_dict(), peak_memory()
+        *counts, run.seconds, before, after, run.choices, run.notes, settled.to_dict(), peak_memory()
     )
     return CompactResult(gaussians, report)
 
 
 def _merged_features(
-    scene: PixelScene, members: Members, grouping: Grouping, options: CompactOptions, run: _Run
+    scene: PixelScene | LooseScene, members: Members, grouping: Grouping, options: CompactOptions, run: _Run
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
     with run.stage("encode"):
@@ -184,7 +193,7 @@ def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> 
 
 
 def _fitted(
-    gaussians: Gaussians, scene: PixelScene, grouping: Grouping, options: CompactOptions, run: _Run
+    gaussians: Gaussians, scene: PixelScene | LooseScene, grouping: Grouping, options: CompactOptions, run: _Run
 ) -> Gaussians:
     """Gaussians that no photo shows left out, the rest fitted to the photos."""
     photos = scene_photos(scene), scene_photos(scene, 2)

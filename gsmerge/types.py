@@ -166,6 +166,41 @@ class PixelScene:
 
 
 @dataclass(frozen=True)
+class LooseScene:
+    """A scene whose Gaussians are in no order of pixels: voxels, optimised scenes, pruned exports.
+
+    Args:
+        gaussians: Any number of Gaussians.
+        cameras: The V views; none where none are known.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
+        names: The views' names (image file names where known).
+
+    Raises:
+        ValueError: If the sizes do not fit together.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    images: Tensor | None
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
+        if self.images is not None:
+            _expect("images", self.images, (v, h, w, 3))
+        if len(self.names) != v:
+            raise ValueError(f"expected {v} view names, got {len(self.names)}")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    @property
+    def pixels_per_view(self) -> int:
+        """H·W."""
+        return self.cameras.height * self.cameras.width
+
+
+@dataclass(frozen=True)
 class Groups:
     """A partition of the pixels of every view into superpixels.
 
