@@ -28,7 +28,7 @@ from gsmerge.render import composite, plan_view, prepare
 from gsmerge.robust import choose_merge, close_holes
 from gsmerge.threads import parallel_map, use_threads
 from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
-from gsmerge.unaligned import make_ready, members_of
+from gsmerge.unaligned import loose_count, make_ready, members_of
 
 Progress = Callable[[str, int, int], None]
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
@@ -180,9 +180,10 @@ def _filled(
     features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
 ) -> np.ndarray | None:
     """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
-    if not grouping.exact or options.fit.grows:
+    wanted = grouping.wanted if grouping.exact else loose_count(features, members, grouping.groups, options)
+    if wanted is None or options.fit.grows:
         return None
-    return split_counts(features, members, max(0, grouping.wanted - len(features)))
+    return split_counts(features, members, max(0, wanted - len(features)))
 
 
 def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> FeatureGaussians:

@@ -19,7 +19,7 @@ from gsmerge.grouping import target_count
 from gsmerge.moments import Members, loose_members, pool_members, scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.render import render
-from gsmerge.types import Gaussians, Groups, LooseScene, PixelScene
+from gsmerge.types import FeatureGaussians, Gaussians, Groups, LooseScene, PixelScene
 from gsmerge.viewpoints import place_cameras
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
@@ -134,3 +134,18 @@ def members_of(scene: PixelScene | LooseScene, groups: Groups, options: CompactO
         return scene_members(scene)
     least = options.contribution.min_contribution
     return loose_members(scene, owner_pixels(find_owners(scene, groups), groups, least))
+
+
+def loose_count(features: FeatureGaussians, members: Members, groups: Groups, options: CompactOptions) -> int | None:
+    """Gaussians that a scene in no order should become where no number is asked for; None: K for each group.
+
+    What a near and a far view both show belongs to the near one, so many superpixels of the far one stay empty. Their
+    Gaussians are spent on the others.
+    """
+    if members.pixels is None:
+        return None
+    own = groups.labels.reshape(-1).numpy()[members.pixels]
+    first = np.cumsum(groups.counts) - groups.counts
+    own = own + first[members.pixels // groups.labels[0].numel()]
+    num_filled = len(np.unique(own[members.pixels >= 0]))
+    return options.decode.count * (len(features) + len(groups) - num_filled)
