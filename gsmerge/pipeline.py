@@ -168,7 +168,8 @@ def _merged_features(
         coarse = grouping.coarse
         backing = encode_backing(scene, members, coarse, options.backing) if coarse is not None else None
         photos = scene_photos(scene, 2)
-        features, choice = choose_merge(features, backing, photos, options.robust)
+        aligned = isinstance(scene, PixelScene)
+        features, choice = choose_merge(features, backing, photos, options.robust, left_out=aligned)
         run.choices["merge"], run.choices["merge_scores"] = choice.name, choice.scores
     with run.stage("match"):
         features, choice = close_holes(_matched(features, options, run), backing, photos, options.robust)

@@ -15,6 +15,7 @@ from gsmerge.canonical import Frame, canonicalise
 from gsmerge.contribution import find_owners, owner_pixels, seen_weights
 from gsmerge.decode import DecodeOptions, decode
 from gsmerge.encode import from_moments
+from gsmerge.errors import UsageError
 from gsmerge.grouping import target_count
 from gsmerge.moments import Members, loose_members, pool_members, scene_members
 from gsmerge.options import CompactOptions
@@ -129,11 +130,20 @@ def _morton(points: np.ndarray) -> np.ndarray:
 
 
 def members_of(scene: PixelScene | LooseScene, groups: Groups, options: CompactOptions) -> Members:
-    """The scene's Gaussians as arrays; of a scene in no order, each with a pixel of the superpixel it adds most to."""
+    """The scene's Gaussians as arrays; of a scene in no order, each with a pixel of the superpixel it adds most to.
+
+    Raises:
+        UsageError: If no view sees any Gaussian.
+    """
     if isinstance(scene, PixelScene):
         return scene_members(scene)
-    least = options.contribution.min_contribution
-    return loose_members(scene, owner_pixels(find_owners(scene, groups), groups, least))
+    pixels = owner_pixels(find_owners(scene, groups), groups, options.contribution.min_contribution)
+    if not (pixels >= 0).any():
+        raise UsageError(
+            f"expected views that see the scene, found that none of {len(scene)} sees any of {len(pixels)} Gaussians: "
+            "give the cameras that belong to it"
+        )
+    return loose_members(scene, pixels)
 
 
 def loose_count(features: FeatureGaussians, members: Members, groups: Groups, options: CompactOptions) -> int | None:
