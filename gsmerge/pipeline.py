@@ -181,10 +181,11 @@ def _filled(
     features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
 ) -> np.ndarray | None:
     """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
-    wanted = grouping.wanted if grouping.exact else loose_count(features, members, grouping.groups, options)
-    if wanted is None or options.fit.grows:
-        return None
-    return split_counts(features, members, max(0, wanted - len(features)))
+    if grouping.exact and not options.fit.grows:
+        wanted: int | None = grouping.wanted
+    else:
+        wanted = loose_count(features, members, grouping, options)
+    return None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
 
 
 def _matched(features: FeatureGaussians, options: CompactOptions, run: _Run) -> FeatureGaussians:

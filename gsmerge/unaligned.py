@@ -16,7 +16,7 @@ from gsmerge.contribution import find_owners, owner_pixels, seen_weights
 from gsmerge.decode import DecodeOptions, decode
 from gsmerge.encode import from_moments
 from gsmerge.errors import UsageError
-from gsmerge.grouping import target_count
+from gsmerge.grouping import Grouping, target_count
 from gsmerge.moments import Members, loose_members, pool_members, scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.render import render
@@ -146,16 +146,19 @@ def members_of(scene: PixelScene | LooseScene, groups: Groups, options: CompactO
     return loose_members(scene, pixels)
 
 
-def loose_count(features: FeatureGaussians, members: Members, groups: Groups, options: CompactOptions) -> int | None:
-    """Gaussians that a scene in no order should become where no number is asked for; None: K for each group.
+def loose_count(
+    features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
+) -> int | None:
+    """Gaussians that the groups of a scene in no order should become; None for one in order: K for each group.
 
     What a near and a far view both show belongs to the near one, so many superpixels of the far one stay empty. Their
     Gaussians are spent on the others.
     """
     if members.pixels is None:
         return None
-    own = groups.labels.reshape(-1).numpy()[members.pixels]
-    first = np.cumsum(groups.counts) - groups.counts
-    own = own + first[members.pixels // groups.labels[0].numel()]
-    num_filled = len(np.unique(own[members.pixels >= 0]))
-    return options.decode.count * (len(features) + len(groups) - num_filled)
+    groups = grouping.groups
+    sizes = np.array(groups.counts)
+    seen = members.pixels[members.pixels >= 0]
+    labels = groups.labels.reshape(-1).numpy()[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].numel()]
+    num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
+    return min(grouping.wanted, options.decode.count * (len(features) + len(groups) - num_filled))
