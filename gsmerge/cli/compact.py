@@ -38,6 +38,7 @@ def compact(
     time_budget: opt.TimeBudgetOption = None,
     budget: opt.BudgetOption = None,
     max_bytes: opt.MaxBytesOption = None,
+    unseen: opt.UnseenOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -66,7 +67,8 @@ def compact(
         "preset": preset,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
-    chosen |= {"budget": budget, "max_bytes": max_bytes, "seed": seed, "threads": threads}
+    chosen |= {"budget": budget, "max_bytes": max_bytes, "unseen": unseen}
+    chosen |= {"seed": seed, "threads": threads}
     settings = _settings(chosen)
     if dry_run:
         _print_plan(files, settings, out, opacity=opacity.value, as_json=json)
@@ -168,7 +170,7 @@ def _print_plan(
     scene, cameras = loaded.scene, loaded.scene.cameras
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
-        (len(scene), cameras.height, cameras.width),
+        (len(cameras), cameras.height, cameras.width),
         settings.to_dict(),
         output_path=out,
         per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height),
