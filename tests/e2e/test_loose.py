@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import loose
+import numpy as np
 import pytest
-import torch
+from plyfile import PlyData
 
 import gsmerge
 from gsmerge.io import read_loose_scene
@@ -26,10 +26,10 @@ def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# Measured when written: input 20.4 dB; floors are half a dB below what was found.
+# Measured when written: 30.1, 25.1, 27.8 and 30.8 dB; the floors are half a dB below.
 @pytest.mark.parametrize(
     ("settings", "floor"),
-    [({}, 0.0), ({"fit": "color"}, 0.0), ({"budget": "2%"}, 0.0), ({"k": 2}, 0.0)],
+    [({}, 29.5), ({"fit": "color"}, 24.6), ({"budget": "2%"}, 27.3), ({"k": 2}, 30.3)],
     ids=str,
 )
 def test_floor(settings: dict, floor: float, made: Path, tmp_path: Path, target_psnr: Measure) -> None:
@@ -38,9 +38,7 @@ def test_floor(settings: dict, floor: float, made: Path, tmp_path: Path, target_
     assert len(result.gaussians) <= 0.044 * settings.get("k", 1) * len(scene.gaussians)
     out = tmp_path / "small.ply"
     gsmerge.write_ply(out, result.gaussians)
-    found = target_psnr(made / "targets", out)
-    print("FOUND", settings, found, len(result.gaussians), len(scene.gaussians))
-    assert found >= floor
+    assert target_psnr(made / "targets", out) >= floor
 
 
 def test_a_grid_without_its_order(made_scene: Path, tmp_path: Path, target_psnr: Measure) -> None:
@@ -69,9 +67,9 @@ def test_only_a_ply(made: Path, tmp_path: Path, target_psnr: Measure) -> None:
 
 
 def test_reading_leaves_out_what_is_not_finite(made: Path, tmp_path: Path) -> None:
-    scene = read_loose_scene(made)
-    means = scene.gaussians.means.clone()
-    means[::10] = torch.nan
     folder = Path(shutil.copytree(made, tmp_path / "spoilt"))
-    gsmerge.write_ply(folder / "scene.ply", replace(scene.gaussians, means=means), overwrite=True)
-    assert len(read_loose_scene(folder).gaussians) == len(means) - len(means[::10])
+    ply = PlyData.read(folder / "scene.ply", mmap=False)
+    count = len(ply["vertex"]["x"])
+    ply["vertex"]["x"][::10] = np.nan
+    ply.write(folder / "scene.ply")
+    assert len(read_loose_scene(folder).gaussians) == count - len(range(0, count, 10))
