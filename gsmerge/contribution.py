@@ -14,14 +14,17 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from gsmerge.kernels.contribution import dominant_labels
+from gsmerge.kernels.contribution import PAIR, add_row, settle_row
+from gsmerge.kernels.project import TILE
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
+from gsmerge.render.plan import MAX_SIZE
 from gsmerge.threads import parallel_map
 from gsmerge.types import Groups, LooseScene
 
 Unseen = Literal["drop", "keep"]
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
+FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
 
@@ -142,11 +145,21 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
         labels: ``[h,w]`` int32, 0 to ``count - 1``.
         count: Superpixels.
     """
-    values, found = np.empty(len(plan.ids), np.float32), np.empty(len(plan.ids), np.int32)
-    dominant_labels(
-        plan.footprints, plan.members, plan.offsets, plan.columns, np.ascontiguousarray(labels, np.int32), count,
-        values, found,
-    )  # fmt: skip
+    labels = np.ascontiguousarray(labels, np.int32)
+    num, room = len(plan.ids), max(FIRST_PAIRS, count)
+    values, found = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
+    heads, active = np.full(num, -1, np.int32), np.empty(num + 1, np.int32)
+    pairs, num_pairs, num_active = np.empty((room, PAIR)), 0, 0
+    for line in range(plan.lines):
+        pairs, num_pairs, num_active = add_row(
+            plan.footprints, plan.members, plan.offsets, plan.columns, line, labels,
+            heads, pairs, num_pairs, active, num_active, stamps,
+        )  # fmt: skip
+        bottom = (line + 1) * TILE if line < plan.lines - 1 else MAX_SIZE
+        pairs, num_pairs, num_active = settle_row(
+            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, found
+        )
     return values, found
 
 

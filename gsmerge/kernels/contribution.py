@@ -15,28 +15,14 @@ from gsmerge.kernels.project import TILE
 from gsmerge.kernels.raster import BATCH, P1, PLANE, _gather, _live_rows, _open_tile, _weights
 from gsmerge.kernels.weights import _columns
 
-FIRST_PAIRS = 1 << 16  # room for pairs to begin with
 LAST_ROW = 7  # column of a footprint
+LABEL, SUM, NEXT, PAIR = 0, 1, 2, 3  # columns of a pair, the last the next pair of the same Gaussian, -1 for none
 
 
 @kernel
-def _room_for_pairs(count):
-    """Label, sum and next pair of the same Gaussian, for each of ``count`` pairs."""
-    return np.empty(count, np.int32), np.empty(count, np.float64), np.empty(count, np.int32)
-
-
-@kernel
-def _grown(pairs, count):
-    """Twice the room with the same pairs."""
-    more = _room_for_pairs(2 * pairs[0].shape[0])
-    more[0][:count], more[1][:count], more[2][:count] = pairs[0][:count], pairs[1][:count], pairs[2][:count]
-    return more
-
-
-@kernel
-def _chain(pairs, heads, k, at, label, value):
+def _chain(pairs, at, heads, k, label, value):
     """Write a pair and put it in front of its Gaussian's chain."""
-    pairs[0][at], pairs[1][at], pairs[2][at] = label, value, heads[k]
+    pairs[at, LABEL], pairs[at, SUM], pairs[at, NEXT] = label, value, heads[k]
     heads[k] = at
 
 
@@ -76,61 +62,32 @@ def _sum_tile(state, batch, j, y0, y1, num_x, lanes, sums, touched):
 
 
 @kernel
-def _settle(k, final, heads, pairs, carried, num_carried, totals, seen, out_values, out_labels):
-    """Add up the pairs of one Gaussian; decide if this is final, carry them over if not -> pairs carried."""
-    count, pair = 0, heads[k]
-    while pair >= 0:
-        label = pairs[0][pair]
-        if totals[label] == 0.0:
-            seen[count] = label
-            count += 1
-        totals[label] += pairs[1][pair]
-        pair = pairs[2][pair]
-    heads[k] = -1
-    best = seen[0]
-    for i in range(count):
-        label = seen[i]
-        more = (totals[label] > totals[best]) | ((totals[label] == totals[best]) & (label < best))
-        best = label if more else best
-        if not final:
-            _chain(carried, heads, k, num_carried, label, totals[label])
-            num_carried += 1
-    if final:
-        out_values[k], out_labels[k] = f4(totals[best]), best
-    for i in range(count):
-        totals[seen[i]] = 0.0
-    return num_carried
-
-
-@kernel
-def dominant_labels(footprints, members, offsets, columns, labels, num_labels, out_values, out_labels):
-    """The superpixel that gets the largest sum of blending weights from each Gaussian, and that sum.
-
-    Of equal sums the superpixel with the smallest label counts.
+def add_row(footprints, members, offsets, columns, line, labels, heads, pairs, num_pairs, active, num_active, stamps):
+    """Append the pairs of a row of tiles.
 
     Args:
         footprints: ``[m,FOOTPRINT]`` float32.
         members: ``[intersections]`` int32 tile lists.
         offsets: ``[tiles + 1]`` int64 starts of the lists.
         columns: Tiles per row.
-        labels: ``[h,w]`` int32, 0 to ``num_labels - 1``.
-        num_labels: Superpixels of the view.
-        out_values: ``[m]`` float32, written: sum over the pixels, 0 where nothing is seen.
-        out_labels: ``[m]`` int32, written: -1 where nothing is seen.
+        line: The row.
+        labels: ``[h,w]`` int32.
+        heads: ``[m]`` int32, each Gaussian's last pair, -1 for none; updated.
+        pairs: ``[room,PAIR]`` float64, appended to.
+        num_pairs: Pairs there are already.
+        active: ``[m+1]`` int32: the Gaussians that have pairs, appended to.
+        num_active: How many there are already.
+        stamps: ``[labels]`` int32, -1 everywhere before and after.
+
+    Returns:
+        The pairs, in a larger array if they needed one, their number, and that of the Gaussians that have some.
     """
     height, width = labels.shape
     state, batch = np.empty(2 * PLANE, np.float32), np.empty((BATCH, 12), np.float32)
-    stamps, lanes, names = np.full(num_labels, -1, np.int32), np.zeros(PLANE, np.int32), np.empty(PLANE, np.int32)
+    lanes, names = np.zeros(PLANE, np.int32), np.empty(PLANE, np.int32)
     sums, touched = np.zeros(PLANE, np.float32), np.empty(PLANE + 1, np.int32)
-    totals, seen = np.zeros(num_labels), np.empty(num_labels, np.int32)
-    heads = np.full(footprints.shape[0], -1, np.int32)  # each Gaussian's last pair; -1: none
-    room = max(FIRST_PAIRS, num_labels)  # at least one Gaussian's, so that twice the room always holds one more
-    pairs, carried = _room_for_pairs(room), _room_for_pairs(room)
-    active = np.empty(footprints.shape[0] + 1, np.int32)  # Gaussians with pairs
-    num_pairs, num_active = 0, 0
-    out_values[:], out_labels[:] = f4(0.0), -1
-    for tile in range(offsets.shape[0] - 1):
-        left, top = tile % columns * TILE, tile // columns * TILE
+    for tile in range(line * columns, (line + 1) * columns):
+        left, top = tile % columns * TILE, line * TILE
         num_x, num_y = min(TILE, width - left), min(TILE, height - top)
         start, end = offsets[tile], offsets[tile + 1]
         _number_labels(labels, left, top, num_x, num_y, stamps, lanes, names)
@@ -139,31 +96,75 @@ def dominant_labels(footprints, members, offsets, columns, labels, num_labels, o
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
             _gather(footprints, members, start, stop, end, left, top, batch)
-            if num_pairs + BATCH * PLANE > pairs[0].shape[0]:
-                pairs = _grown(pairs, num_pairs)
+            if num_pairs + BATCH * PLANE > pairs.shape[0]:
+                more = np.empty((2 * pairs.shape[0], PAIR))
+                more[:num_pairs] = pairs[:num_pairs]
+                pairs = more
             for j in range(stop - start):
                 y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
                 _weights(state, batch, j, y0, y1)
                 count, k = _sum_tile(state, batch, j, y0, y1, num_x, lanes, sums, touched), members[start + j]
                 active[num_active] = k
                 num_active += 1 if (count > 0) & (heads[k] < 0) else 0
-                for i in range(num_pairs, num_pairs + count):
-                    label = touched[i - num_pairs]
-                    _chain(pairs, heads, k, i, names[label], sums[label])
-                    sums[label] = f4(0.0)
+                for i in range(count):
+                    _chain(pairs, num_pairs + i, heads, k, names[touched[i]], sums[touched[i]])
+                    sums[touched[i]] = f4(0.0)
                 num_pairs += count
             start = stop
             y_low, y_high = _live_rows(state, y_low, y_high)
-        if tile % columns == columns - 1:  # the row is done
-            num_carried, num_staying = 0, 0
-            for a in range(num_active):
-                k = active[a]
-                final = (footprints[k, LAST_ROW] < f4(top + TILE)) | (top + TILE >= height)
-                if num_carried + num_labels > carried[0].shape[0]:
-                    carried = _grown(carried, num_carried)
-                num_carried = _settle(
-                    k, final, heads, pairs, carried, num_carried, totals, seen, out_values, out_labels
-                )
-                active[num_staying] = k
-                num_staying += 0 if final else 1
-            pairs, carried, num_pairs, num_active = carried, pairs, num_carried, num_staying
+    return pairs, num_pairs, num_active
+
+
+@kernel
+def settle_row(bottom, footprints, heads, pairs, room, active, num_active, totals, seen, out_values, out_labels):
+    """Add up the pairs of every Gaussian; decide on those that end above ``bottom``, carry over the others' sums.
+
+    Of equal sums the superpixel with the smallest label counts.
+
+    Args:
+        bottom: First row of pixels that is still to come.
+        footprints: ``[m,FOOTPRINT]`` float32.
+        heads: ``[m]`` int32, each Gaussian's last pair, -1 for none; updated.
+        pairs: ``[room,PAIR]`` float64.
+        room: Rows of the array of pairs to begin with, at least as many as there are superpixels.
+        active: ``[m+1]`` int32: the Gaussians that have pairs; then those that are not decided on.
+        num_active: How many there are.
+        totals: ``[labels]`` float64, zero before and after.
+        seen: ``[labels]`` int32, anything.
+        out_values: ``[m]`` float32, written for those that are decided on: the largest sum.
+        out_labels: ``[m]`` int32, likewise: its superpixel.
+
+    Returns:
+        The pairs carried over, their number, and that of the Gaussians that are not decided on.
+    """
+    carried, num_carried, num_staying = np.empty((room, PAIR)), 0, 0
+    for a in range(num_active):
+        k = active[a]
+        count, pair = 0, heads[k]
+        while pair >= 0:
+            label = int(pairs[pair, LABEL])
+            if totals[label] == 0.0:
+                seen[count] = label
+                count += 1
+            totals[label] += pairs[pair, SUM]
+            pair = int(pairs[pair, NEXT])
+        heads[k] = -1
+        final = footprints[k, LAST_ROW] < f4(bottom)
+        if num_carried + count > carried.shape[0]:  # the room of one Gaussian's fits, so twice it fits one more
+            more = np.empty((2 * carried.shape[0], PAIR))
+            more[:num_carried] = carried[:num_carried]
+            carried = more
+        best = seen[0]
+        for i in range(count):
+            label, total = seen[i], totals[seen[i]]
+            best = label if (total > totals[best]) | ((total == totals[best]) & (label < best)) else best
+            if not final:
+                _chain(carried, num_carried, heads, k, label, total)
+                num_carried += 1
+        if final:
+            out_values[k], out_labels[k] = f4(totals[best]), best
+        for i in range(count):
+            totals[seen[i]] = 0.0
+        active[num_staying] = k
+        num_staying += 0 if final else 1
+    return carried, num_carried, num_staying

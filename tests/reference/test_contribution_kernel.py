@@ -10,8 +10,7 @@ import torch
 from numpy.testing import assert_allclose
 from renderer import render_reference
 
-from gsmerge.contribution import find_owners, view_owners
-from gsmerge.kernels import contribution
+from gsmerge.contribution import FIRST_PAIRS, find_owners, view_owners
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.segment import superpixels
 from gsmerge.types import Cameras, Gaussians, Groups, LooseScene
@@ -82,7 +81,7 @@ def test_pairs_beyond_the_first_room() -> None:
     plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
     values, found = view_owners(plan, labels, HEIGHT * WIDTH)
     sums = superpixel_sums(gaussians, labels)[plan.ids]
-    assert (sums[:, : 16 * WIDTH] > 0).sum() > contribution.FIRST_PAIRS
+    assert (sums[:, : 16 * WIDTH] > 0).sum() > FIRST_PAIRS
     assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
     assert_allclose(sums[np.arange(len(found)), found], sums.max(1), rtol=1e-3, atol=1e-4)
 
