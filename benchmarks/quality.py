@@ -69,7 +69,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.lpips and not lpips_available("vgg"):
         parser.error(f"--lpips needs weights: {INSTALL}")
-    settings = {k: _value(v) for k, v in (s.split("=") for s in args.set)}
+    settings = {k: setting(v) for k, v in (s.split("=") for s in args.set)}
     rows = []
     for folder in scene_folders(args.scenes):
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_targets(folder)
@@ -102,7 +102,7 @@ def main() -> None:
             print(f"mean {name:21s} {np.mean([r[name] for r in rows], 0).round(3)}")
 
 
-def _value(text: str) -> object:
+def setting(text: str) -> object:
     try:
         return json.loads(text)
     except json.JSONDecodeError:

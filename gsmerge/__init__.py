@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from gsmerge.segment import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
+    from gsmerge.types import LooseScene as LooseScene
     from gsmerge.types import PixelScene as PixelScene
 
 __version__ = "0.1.0"
@@ -47,7 +48,7 @@ _HOMES = {
     "pipeline": ("CompactReport", "CompactResult", "compact"),
     "render": ("Rendering", "render"),
     "segment": ("saliency", "superpixels"),
-    "types": ("Cameras", "Gaussians", "PixelScene"),
+    "types": ("Cameras", "Gaussians", "LooseScene", "PixelScene"),
 }
 _EXPORTS = {name: home for home, names in _HOMES.items() for name in names}
 

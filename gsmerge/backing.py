@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsmerge.encode import from_moments, group_rows
+from gsmerge.encode import from_moments, member_rows
 from gsmerge.kernels.backing import draw_in, image_extinctions
 from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Groups, PixelScene
+from gsmerge.types import FeatureGaussians, Groups, LooseScene, PixelScene
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,9 @@ class BackingOptions:
             raise ValueError(f"backing_spread: expected more than 0, got {self.backing_spread}")
 
 
-def encode_backing(scene: PixelScene, members: Members, groups: Groups, options: BackingOptions) -> FeatureGaussians:
+def encode_backing(
+    scene: PixelScene | LooseScene, members: Members, groups: Groups, options: BackingOptions
+) -> FeatureGaussians:
     """The coarse Feature Gaussians of every view.
 
     Depths of the members are drawn in to one footprint of the group about its median (no curtain survives), the
@@ -54,7 +56,7 @@ def encode_backing(scene: PixelScene, members: Members, groups: Groups, options:
         groups: Coarse superpixels of every view.
         options: Push and spread.
     """
-    starts, ids, views = group_rows(scene, groups)
+    starts, ids, views = member_rows(scene, members, groups)
     drawn = _draw_in_members(scene, members, starts, ids, views)
     layer = from_moments(pool_members(drawn, starts, ids), starts, ids, views)
     optical_depths = _image_optical_depths(scene, drawn, layer)
@@ -75,29 +77,29 @@ def _view_slices(views: np.ndarray, num_views: int) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(edges)]
 
 
-def _camera(scene: PixelScene, view: int) -> tuple[np.ndarray, float, float]:
+def _camera(scene: PixelScene | LooseScene, view: int) -> tuple[np.ndarray, float, float]:
     K = scene.cameras.Ks[view].double()
     return scene.cameras.viewmats[view].double().numpy(), float(K[0, 0]), float(K[1, 1])
 
 
 def _draw_in_members(
-    scene: PixelScene, members: Members, starts: np.ndarray, ids: np.ndarray, views: np.ndarray
+    scene: PixelScene | LooseScene, members: Members, starts: np.ndarray, ids: np.ndarray, views: np.ndarray
 ) -> Members:
     """The members moved along their rays to within one footprint of their group's median depth."""
     means, scales = members.means.copy(), members.scales.copy()
-    pixels = scene.pixels_per_view
+    pixels, inverse, factors = scene.pixels_per_view, np.ones(len(means)), np.ones(len(means))
 
     def one_view(item: tuple[int, slice]) -> None:
         view, groups = item
         viewmat, fx, _ = _camera(scene, view)
         eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
-        rows = slice(view * pixels, (view + 1) * pixels)
-        depths = means[rows] @ viewmat[2, :3].astype(np.float32) + np.float32(viewmat[2, 3])
-        inverse = (1 / np.maximum(depths, 1e-6)).astype(np.float64)
-        factors = np.ones(pixels)
         own = starts[groups.start : groups.stop + 1]
-        draw_in(own - own[0], ids[own[0] : own[-1]] - view * pixels, inverse, 1 / abs(fx), factors)
-        shrink = factors.astype(np.float32)[:, None]
+        seen = ids[own[0] : own[-1]]
+        rows = slice(view * pixels, (view + 1) * pixels) if members.pixels is None else seen
+        depths = means[rows] @ viewmat[2, :3].astype(np.float32) + np.float32(viewmat[2, 3])
+        inverse[rows] = 1 / np.maximum(depths, 1e-6)
+        draw_in(own - own[0], seen, inverse, 1 / abs(fx), factors)
+        shrink = factors[rows].astype(np.float32)[:, None]
         means[rows] = eye + (means[rows] - eye) * shrink
         scales[rows] *= shrink
 
@@ -105,7 +107,7 @@ def _draw_in_members(
     return replace(members, means=means, scales=scales)
 
 
-def _image_optical_depths(scene: PixelScene, members: Members, layer: FeatureGaussians) -> np.ndarray:
+def _image_optical_depths(scene: PixelScene | LooseScene, members: Members, layer: FeatureGaussians) -> np.ndarray:
     """Optical depth ``[g]`` that covers as much of the source image as the members did."""
     starts, ids, views = layer.starts.numpy(), layer.members.numpy(), layer.views.numpy()
     sums = np.zeros(len(layer))

@@ -19,7 +19,8 @@ from gsmerge.moments import Members
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_photos
 from gsmerge.robust import choose_merge, close_holes
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
+from gsmerge.unaligned import loose_count, members_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +29,11 @@ class Source:
 
     Args:
         scene: The canonical scene.
-        members: Its Gaussians as members of groups.
+        members: Its Gaussians as members of groups; None where the superpixels decide who belongs to them.
     """
 
-    scene: PixelScene
-    members: Members
+    scene: PixelScene | LooseScene
+    members: Members | None
 
 
 def build(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Gaussians:
@@ -47,20 +48,25 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     Returns:
         Canonical Gaussians.
     """
-    features = _merged_features(source, grouping, options, journal)
+    members = source.members
+    if members is None:
+        with journal.stage("members"):
+            members = members_of(source.scene, grouping.groups, options)
+    features = _merged_features(source.scene, members, grouping, options, journal)
     with journal.stage("decode"):
-        children = _filled(features, source.members, grouping, options)
-        gaussians = decode(features, source.members, options.decode, children, options.encode.rule)
-    del features
+        children = _filled(features, members, grouping, options)
+        gaussians = decode(features, members, options.decode, children, options.encode.rule)
+    del features, members
     if source.scene.images is None:
         return gaussians
     with journal.stage("fit"):
         return _fitted(gaussians, source.scene, grouping, options, journal)
 
 
-def _merged_features(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> FeatureGaussians:
+def _merged_features(
+    scene: PixelScene | LooseScene, members: Members, grouping: Grouping, options: CompactOptions, journal: Journal
+) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
-    scene, members = source.scene, source.members
     with journal.stage("encode"):
         features = encode(scene, members, grouping.groups, options.encode)
     if not grouping.robust:
@@ -70,7 +76,8 @@ def _merged_features(source: Source, grouping: Grouping, options: CompactOptions
         coarse = grouping.coarse
         backing = encode_backing(scene, members, coarse, options.backing) if coarse is not None else None
         photos = scene_photos(scene, 2)
-        features, choice = choose_merge(features, backing, photos, options.robust)
+        aligned = isinstance(scene, PixelScene)
+        features, choice = choose_merge(features, backing, photos, options.robust, left_out=aligned)
         journal.choices["merge"], journal.choices["merge_scores"] = choice.name, choice.scores
     with journal.stage("match"):
         features, choice = close_holes(_matched(features, options, journal), backing, photos, options.robust)
@@ -82,9 +89,11 @@ def _filled(
     features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
 ) -> np.ndarray | None:
     """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
-    if not grouping.exact or options.fit.grows:
-        return None
-    return split_counts(features, members, max(0, grouping.wanted - len(features)))
+    if grouping.exact and not options.fit.grows:
+        wanted: int | None = grouping.wanted
+    else:
+        wanted = loose_count(features, members, grouping, options)
+    return None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
 
 
 def _matched(features: FeatureGaussians, options: CompactOptions, journal: Journal) -> FeatureGaussians:
@@ -95,7 +104,7 @@ def _matched(features: FeatureGaussians, options: CompactOptions, journal: Journ
 
 
 def _fitted(
-    gaussians: Gaussians, scene: PixelScene, grouping: Grouping, options: CompactOptions, journal: Journal
+    gaussians: Gaussians, scene: PixelScene | LooseScene, grouping: Grouping, options: CompactOptions, journal: Journal
 ) -> Gaussians:
     """Gaussians that no photo shows left out, the rest fitted to the photos."""
     photos = scene_photos(scene), scene_photos(scene, 2)

@@ -9,11 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from gsmerge.types import Cameras, Gaussians, PixelScene
+from gsmerge.geometry import project
+from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
+
+Scene = TypeVar("Scene", PixelScene, LooseScene)
+SAMPLES = 65536  # Gaussians that are looked at
+MAX_VIEWS = 32  # of a scene in no order
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,7 @@ def find_frame(scene: PixelScene) -> Frame:
     rows = torch.nonzero(scene.valid.reshape(-1))[:, 0]
     if len(rows) == 0:
         raise ValueError("expected at least one valid Gaussian, got none")
-    rows = rows[:: max(1, len(rows) // 65536)]
+    rows = rows[:: max(1, len(rows) // SAMPLES)]
     means = scene.gaussians.means[rows].double()
     origin = means.median(0).values
     viewmats = scene.cameras.viewmats.double()[rows // (h * w)]
@@ -66,7 +72,24 @@ def find_frame(scene: PixelScene) -> Frame:
     return Frame(origin, unit)
 
 
-def canonicalise(scene: PixelScene) -> tuple[PixelScene, Frame]:
+def find_loose_frame(scene: LooseScene) -> Frame:
+    """The canonical frame of a scene in no order: median mean, and median depth of what the views have before them.
+
+    Raises:
+        ValueError: If there is no Gaussian or no view.
+    """
+    if len(scene.gaussians) == 0 or len(scene) == 0:
+        raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
+    means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].double()
+    views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
+    pixels, depths = project(means, views)
+    size = torch.tensor([views.width, views.height])
+    seen = (depths > 0) & ((pixels > 0) & (pixels < size)).all(-1)
+    depth = float(depths[seen].median()) if bool(seen.any()) else 0.0
+    return Frame(means.median(0).values, 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
+
+
+def canonicalise(scene: Scene) -> tuple[Scene, Frame]:
     """The scene in its canonical frame, and the frame."""
-    frame = find_frame(scene)
+    frame = find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame

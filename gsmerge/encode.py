@@ -10,7 +10,7 @@ import torch
 from gsmerge.kernels.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Groups, PixelScene
+from gsmerge.types import FeatureGaussians, Groups, LooseScene, PixelScene
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,9 @@ class EncodeOptions:
             raise ValueError(f'rule: expected "depth" or "paper", got {self.rule!r}')
 
 
-def encode(scene: PixelScene, members: Members, groups: Groups, options: EncodeOptions) -> FeatureGaussians:
+def encode(
+    scene: PixelScene | LooseScene, members: Members, groups: Groups, options: EncodeOptions
+) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, view by view.
 
     Args:
@@ -45,8 +47,24 @@ def encode(scene: PixelScene, members: Members, groups: Groups, options: EncodeO
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
     """
-    starts, ids, views = group_rows(scene, groups)
+    starts, ids, views = member_rows(scene, members, groups)
     return from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
+
+
+def member_rows(
+    scene: PixelScene | LooseScene, members: Members, groups: Groups
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Members by superpixel: ``starts [g+1]``, ``ids [m]``, ``views [g]``; empty superpixels left out."""
+    if isinstance(scene, PixelScene):
+        return group_rows(scene, groups)
+    assert members.pixels is not None
+    counts = np.asarray(groups.counts)
+    first = np.cumsum(counts) - counts
+    labels = groups.labels.reshape(-1).numpy()[members.pixels] + first[members.pixels // scene.pixels_per_view]
+    labels = np.where(members.pixels >= 0, labels, -1).astype(np.int32)
+    starts, ids = group_members(labels, int(counts.sum()))
+    filled = np.diff(starts) > 0
+    return np.append(starts[:-1][filled], starts[-1]), ids, np.repeat(np.arange(len(counts)), counts)[filled]
 
 
 def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from gsmerge.allocate import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
+from gsmerge.contribution import seen_depths
 from gsmerge.errors import UsageError
 from gsmerge.fit import start_share
 from gsmerge.options import CompactOptions
@@ -14,7 +15,7 @@ from gsmerge.photos import scene_pictures
 from gsmerge.robust import MIN_VIEWS
 from gsmerge.segment import count_for, segment
 from gsmerge.targets import exact_count, most_allowed
-from gsmerge.types import Groups, PixelScene
+from gsmerge.types import Groups, LooseScene, PixelScene
 
 
 @dataclass(frozen=True)
@@ -64,24 +65,45 @@ class Canvas:
         return len(self.pictures)
 
 
-def scene_canvas(scene: PixelScene, options: CompactOptions) -> Canvas:
+def scene_canvas(scene: PixelScene | LooseScene, options: CompactOptions) -> Canvas:
     """Pictures of the views and limits of the number of Gaussians.
 
     Raises:
         UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
     """
-    pixels, degree = scene.pixels_per_view, scene.gaussians.sh_degree
-    asked = count_for(options.segment, scene.cameras.height, scene.cameras.width)
+    asked, pixels = asked_per_view(scene, options), scene.pixels_per_view
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
-    num_input = scene.num_gaussians
-    most = most_allowed(options.target, num_input, degree)
+    most = most_allowed(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
     if most < len(scene):
         raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
     share = start_share(options.fit) if scene.images is not None else 1.0
-    usual = max(len(scene), asked * num_input // pixels) * options.decode.count
-    exact = exact_count(options.target, num_input, degree)
+    usual = usual_count(scene, options)
+    exact = exact_count(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
     return Canvas(scene_pictures(scene), uses_robust(scene, options), share, asked, usual, most, exact)
+
+
+def usual_count(scene: PixelScene | LooseScene, options: CompactOptions) -> int:
+    """Gaussians that density and K ask for; of a scene without views, those that density leaves of it."""
+    if len(scene) == 0:
+        return max(1, int(options.segment.density * scene.num_gaussians)) * options.decode.count
+    asked = asked_per_view(scene, options)
+    total = asked * scene.num_gaussians // scene.pixels_per_view
+    return max(len(scene), total if isinstance(scene, PixelScene) else asked * len(scene)) * options.decode.count
+
+
+def limit_of(scene: PixelScene | LooseScene, options: CompactOptions) -> int | None:
+    """The number of Gaussians that a budget, a size or a preset sets; None where density and K do.
+
+    Raises:
+        UsageError: If it leaves fewer than one for each view.
+    """
+    num_input, degree = scene.num_gaussians, scene.gaussians.sh_degree
+    most = most_allowed(options.target, num_input, degree)
+    if most < len(scene):
+        raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
+    exact = exact_count(options.target, num_input, degree)
+    return exact if exact is not None else most if usual_count(scene, options) > most else None
 
 
 def group_scene(canvas: Canvas, options: CompactOptions) -> Grouping:
@@ -92,7 +114,7 @@ def group_scene(canvas: Canvas, options: CompactOptions) -> Grouping:
     return Grouping(groups, _coarse(canvas, options, coarse), canvas.robust, canvas.usual, exact=False)
 
 
-def scene_tree(scene: PixelScene, canvas: Canvas, options: CompactOptions, count: int) -> RegionTree:
+def scene_tree(scene: PixelScene | LooseScene, canvas: Canvas, options: CompactOptions, count: int) -> RegionTree:
     """All ways to cut the scene into fewer superpixels, those of all views merged where that costs least.
 
     A wall ends up with few, a fern with many.
@@ -105,10 +127,13 @@ def scene_tree(scene: PixelScene, canvas: Canvas, options: CompactOptions, count
     """
     leaves = min(max(canvas.each, -(-count // len(scene))), scene.pixels_per_view)
     fine = segment(canvas.pictures, options.segment, leaves)
-    return region_tree(canvas.pictures, pixel_depths(scene), fine, scene.valid, options.allocate)
+    depths, valid = seen_depths(scene) if isinstance(scene, LooseScene) else (pixel_depths(scene), scene.valid)
+    return region_tree(canvas.pictures, depths, fine, valid, options.allocate)
 
 
-def cut_scene(scene: PixelScene, canvas: Canvas, tree: RegionTree, options: CompactOptions, count: int) -> Grouping:
+def cut_scene(
+    scene: PixelScene | LooseScene, canvas: Canvas, tree: RegionTree, options: CompactOptions, count: int
+) -> Grouping:
     """The superpixels that become exactly ``count`` Gaussians; from a finer tree where this one does not reach."""
     views = len(canvas.pictures)
     begun = max(views, int(count * canvas.share))
@@ -124,7 +149,16 @@ def knee_count(tree: RegionTree, canvas: Canvas, options: CompactOptions) -> int
     return max(canvas.least, min(auto_count(tree, options.allocate), canvas.most))
 
 
-def uses_robust(scene: PixelScene, options: CompactOptions) -> bool:
+def asked_per_view(scene: PixelScene | LooseScene, options: CompactOptions) -> int:
+    """Superpixels of each view. Where there are fewer Gaussians than pixels, ``density`` is a share of those."""
+    cameras = scene.cameras
+    asked = count_for(options.segment, cameras.height, cameras.width)
+    if isinstance(scene, PixelScene) or options.segment.superpixels is not None:
+        return asked
+    return max(1, min(asked, int(options.segment.density * len(scene.gaussians) / len(cameras))))
+
+
+def uses_robust(scene: PixelScene | LooseScene, options: CompactOptions) -> bool:
     """Whether the photos choose the merge: as asked, otherwise unless a full fit follows."""
     asked = options.robust.robust
     return scene.images is not None and (options.fit.fit != "full" if asked is None else asked)

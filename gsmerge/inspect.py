@@ -190,7 +190,7 @@ def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, A
     except SceneError as error:
         return found | {"alignment_problem": str(error)}
     found |= {"dialect": dialect_words(load.dialects), "notes": load.notes}
-    found |= {"num_views": len(load.scene.cameras), "camera_format": load.cameras.source}
+    found |= {"num_views": len(load.scene.cameras), "camera_format": load.cameras and load.cameras.source}
     if load.recovery is None:
         return found | {"alignment_problem": load.problem}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}

@@ -12,7 +12,7 @@ from gsmerge.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
 RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
-STAGES = ("prepare", "input", "segment", "curve", "encode", "robust", "match", "decode", "fit", "score")
+STAGES = ("prepare", "input", "segment", "curve", "members", "encode", "robust", "match", "decode", "fit", "score")
 
 
 @dataclass

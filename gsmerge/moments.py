@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsmerge.kernels.pool import decompose, pool
 from gsmerge.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene
+from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
 
 Rule = Literal["depth", "paper"]
 
@@ -31,6 +31,8 @@ class Members:
         opacities: ``[n]``.
         sh: ``[n,k,3]``.
         footprints: ``[n]`` size of one pixel of the own view at the member's depth, world units.
+        pixels: ``[n]`` int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for none;
+            None: one member per pixel, in order.
     """
 
     means: np.ndarray
@@ -39,6 +41,7 @@ class Members:
     opacities: np.ndarray
     sh: np.ndarray
     footprints: np.ndarray
+    pixels: np.ndarray | None = None
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -49,7 +52,6 @@ def scene_members(scene: PixelScene) -> Members:
     """The members of a canonical scene, with the pixel footprint of each in its own view."""
     g, cameras = scene.gaussians, scene.cameras
     means = _array(g.means)
-    sh = _array(g.sh0) if g.sh_degree == 0 else np.concatenate([_array(g.sh0), _array(g.shN)], 1)
     footprints = np.empty(len(g), np.float32)
     pixels = scene.pixels_per_view
 
@@ -61,7 +63,37 @@ def scene_members(scene: PixelScene) -> Members:
         footprints[rows] = np.maximum(depths, 1e-6) / focal
 
     parallel_map(fill, range(len(scene)))
-    return Members(means, _array(g.quats), _array(g.scales), _array(g.opacities), sh, footprints)
+    return gaussian_members(g, footprints)
+
+
+def loose_members(scene: LooseScene, pixels: np.ndarray) -> Members:
+    """The members of a canonical scene without an order, by the pixel that each belongs to.
+
+    Args:
+        scene: n Gaussians and their views.
+        pixels: ``[n]`` int64, see :class:`Members`. What belongs to no pixel is taken to be seen by the nearest
+            camera.
+    """
+    means, cameras = _array(scene.gaussians.means), scene.cameras
+    focals = (cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]).abs().sqrt().double().numpy()
+    thirds = cameras.viewmats[:, 2].double().numpy()
+    views = pixels // scene.pixels_per_view
+    depths = np.abs(np.einsum("nd,nd->n", means, thirds[views, :3]) + thirds[views, 3])
+    footprints = np.maximum(depths, 1e-6) / focals[views]
+    alone = np.flatnonzero(pixels < 0)
+    if len(alone):
+        centres = cameras.centres.double().numpy()
+        distances = np.stack([np.linalg.norm(means[alone] - centre, axis=1) for centre in centres])
+        footprints[alone] = np.maximum((distances / focals[:, None]).min(0), 1e-6)
+    return gaussian_members(scene.gaussians, footprints.astype(np.float32), pixels)
+
+
+def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
+    """Gaussians as arrays, with their footprints and pixels."""
+    sh = _array(g.sh0) if g.sh_degree == 0 else np.concatenate([_array(g.sh0), _array(g.shN)], 1)
+    return Members(
+        _array(g.means), _array(g.quats), _array(g.scales), _array(g.opacities), sh, footprints, pixels
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

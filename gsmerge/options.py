@@ -8,6 +8,7 @@ from typing import Any
 
 from gsmerge.allocate import AllocateOptions
 from gsmerge.backing import BackingOptions
+from gsmerge.contribution import ContributionOptions
 from gsmerge.decode import DecodeOptions
 from gsmerge.encode import EncodeOptions
 from gsmerge.fit import FitOptions
@@ -24,6 +25,7 @@ class CompactOptions:
     Args:
         segment: Superpixels.
         allocate: How a budget is spread over the views.
+        contribution: Gaussians that are not one per pixel.
         encode: How a group becomes one Gaussian.
         robust: Choice among merges by the photos.
         backing: The coarse layer that the choice may add.
@@ -37,6 +39,7 @@ class CompactOptions:
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
     allocate: AllocateOptions = field(default_factory=AllocateOptions)
+    contribution: ContributionOptions = field(default_factory=ContributionOptions)
     encode: EncodeOptions = field(default_factory=EncodeOptions)
     robust: RobustOptions = field(default_factory=RobustOptions)
     backing: BackingOptions = field(default_factory=BackingOptions)

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from gsmerge.threads import parallel_map
-from gsmerge.types import SH_C0, PixelScene
+from gsmerge.types import SH_C0, LooseScene, PixelScene
 
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
@@ -56,15 +56,21 @@ class Photos:
         }
 
 
-def scene_pictures(scene: PixelScene) -> Tensor:
-    """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none."""
+def scene_pictures(scene: PixelScene | LooseScene) -> Tensor:
+    """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none.
+
+    Raises:
+        ValueError: If there are no photos and the Gaussians are not one per pixel.
+    """
     if scene.images is not None:
         return scene.images
+    if isinstance(scene, LooseScene):
+        raise ValueError("expected a scene with images")
     shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
     return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
 
 
-def scene_photos(scene: PixelScene, level: int = 1) -> Photos:
+def scene_photos(scene: PixelScene | LooseScene, level: int = 1) -> Photos:
     """The scene's photos, each side divided by ``level`` (area averages).
 
     Raises:

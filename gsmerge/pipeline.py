@@ -10,7 +10,7 @@ import torch
 
 from gsmerge.allocate import RegionTree
 from gsmerge.build import Source, build
-from gsmerge.canonical import Frame, canonicalise
+from gsmerge.canonical import Frame
 from gsmerge.curve import measure_curve
 from gsmerge.errors import UsageError
 from gsmerge.grouping import Canvas, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
@@ -23,7 +23,8 @@ from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
 from gsmerge.targets import AUTO_RUNGS, MOST, RUNGS, count_within, curve_knee, level_counts, rungs, search_count
 from gsmerge.threads import parallel_map, use_threads
-from gsmerge.types import Gaussians, PixelScene
+from gsmerge.types import Gaussians, LooseScene, PixelScene
+from gsmerge.unaligned import make_ready
 
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 NEAR = 0.01  # near plane, in canonical units
@@ -75,24 +76,35 @@ class CompactResult:
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """A run under way: the scene as given, what Gaussians are built from, and what is known of their number."""
+    """A run under way: the scene as given, what Gaussians are built from, and what is known of their number.
 
-    scene: PixelScene
+    ``kept`` are Gaussians that are in no view, merged already; ``settings`` are what was asked for, of which
+    ``options`` are what is left without those.
+    """
+
+    scene: PixelScene | LooseScene
     frame: Frame
     source: Source
     options: CompactOptions
     canvas: Canvas
     tree: RegionTree | None
     before: float | None
+    kept: Gaussians | None
+    settings: CompactOptions
 
 
 def compact(
-    scene: PixelScene, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
+    scene: PixelScene | LooseScene,
+    options: CompactOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    **settings: Any,
 ) -> CompactResult:
-    """Replace a per-pixel scene by a compact one that renders at least as well from new viewpoints.
+    """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:
-        scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`.
+        scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`; or Gaussians in no order, which are
+            given to the superpixels by what they add to the views.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the longer ones with ("fit: ...", step, steps).
@@ -119,15 +131,17 @@ def compact(
     return replace(result, coarser=coarser)
 
 
-def _begun(scene: PixelScene, options: CompactOptions, journal: Journal) -> _Work:
+def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> _Work:
     """The scene in its own frame, how good it is as it came, and its superpixels if they are to be cut to a number."""
-    target = options.target
+    target = settings.target
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     with journal.stage("prepare"):
-        canonical, frame = canonicalise(scene)
+        ready = make_ready(scene, settings)
+        canonical, frame, options = ready.scene, ready.frame, ready.options
+        journal.notes += ready.notes
         canvas = scene_canvas(canonical, options)
-        source = Source(canonical, scene_members(canonical))
+        source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
     before = None
     if scene.images is not None:
         with journal.stage("input"):
@@ -137,7 +151,7 @@ def _begun(scene: PixelScene, options: CompactOptions, journal: Journal) -> _Wor
     if not plain or target.levels > 1:
         with journal.stage("segment"):
             tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
-    return _Work(scene, frame, source, options, canvas, tree, before)
+    return _Work(scene, frame, source, options, canvas, tree, before, ready.kept, settings)
 
 
 def _decided(work: _Work, journal: Journal) -> int | None:
@@ -191,13 +205,14 @@ def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
         else:
             assert work.tree is not None
             grouping = cut_scene(work.source.scene, canvas, work.tree, options, count)
-    gaussians = work.frame.leave(build(work.source, grouping, options, journal))
+    gaussians = build(work.source, grouping, options, journal)
+    gaussians = work.frame.leave(gaussians if work.kept is None else Gaussians.concat([gaussians, work.kept]))
     after = None
     if work.scene.images is not None:
         with journal.stage("score"):
             after = input_psnr(gaussians, scene_photos(work.scene), NEAR * work.frame.unit)
     counts = work.scene.num_gaussians, len(gaussians)
-    settings = options.to_dict() | {"fit_steps": options.fit.steps}
+    settings = work.settings.to_dict() | {"fit_steps": options.fit.steps}
     report = CompactReport(
         *counts, journal.seconds, work.before, after, journal.choices, journal.notes, settings, peak_memory()
     )

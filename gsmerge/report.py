@@ -197,6 +197,7 @@ def plan_document(
     photos: bool,
     threads: int,
     fit_steps: int,
+    usual: int,
     wanted: int | None = None,
     notes: Sequence[str] = (),
     count: int | None = None,
@@ -212,7 +213,8 @@ def plan_document(
         photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
         fit_steps: Steps of the full fit.
-        wanted: Gaussians that a budget or a file size asks for; None without either.
+        usual: Gaussians that density and K ask for.
+        wanted: Gaussians that a budget, a file size or a preset asks for; None without any.
         notes: What the reader had to say.
         count: Gaussians of the file; None: one for each pixel of the grid.
 
@@ -221,15 +223,14 @@ def plan_document(
         the kernels are compiled.
     """
     views, height, width = grid
-    pixels = views * height * width
+    pixels = max(views * height * width, count or 0)
     fit = options["fit"] if photos else "none"
     robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
     work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
     work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
     steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
-    children = 1 if options["k"] == "auto" else options["k"]
-    at_most = per_view * (count or pixels) // (height * width) * children if wanted is None else wanted
+    at_most = usual if wanted is None else wanted
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
         **document_head(),
@@ -243,7 +244,7 @@ def plan_document(
         "robust": robust,
         "fit": fit,
         "estimate": {
-            "seconds": round(COST_FIXED + seconds / min(threads, views), 1),
+            "seconds": round(COST_FIXED + seconds / max(1, min(threads, views)), 1),
             "memory_bytes": memory,
         },
         "options": dict(options),

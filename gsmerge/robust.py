@@ -63,7 +63,12 @@ class RobustChoice:
 
 
 def choose_merge(
-    features: FeatureGaussians, backing: FeatureGaussians | None, photos: Photos, options: RobustOptions
+    features: FeatureGaussians,
+    backing: FeatureGaussians | None,
+    photos: Photos,
+    options: RobustOptions,
+    *,
+    left_out: bool = True,
 ) -> tuple[FeatureGaussians, RobustChoice]:
     """The candidate that shows the photos best.
 
@@ -75,10 +80,12 @@ def choose_merge(
         backing: The coarse layer, see :mod:`gsmerge.backing`; None: no candidate has one.
         photos: The input views, usually at half size.
         options: The family.
+        left_out: False: the photos are always rendered from everything. For Gaussians that are in no order: what
+            several views show belongs to one of them, and would be missing with it.
     """
     many = len(photos) >= MIN_VIEWS
     family = _family(features, backing, photos, options) if many else _spreads(features, options)
-    return _best(family, photos, left_out=many)
+    return _best(family, photos, left_out=many and left_out)
 
 
 def close_holes(

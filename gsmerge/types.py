@@ -179,7 +179,7 @@ class LooseScene:
 
     Args:
         gaussians: Any number of rows, in the frame of the cameras.
-        cameras: The V views.
+        cameras: The V views; none where none are known.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
         names: The views' names (image file names where known).
 
@@ -201,6 +201,16 @@ class LooseScene:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    @property
+    def num_gaussians(self) -> int:
+        """Gaussians of the file."""
+        return len(self.gaussians)
+
+    @property
+    def pixels_per_view(self) -> int:
+        """H·W."""
+        return self.cameras.height * self.cameras.width
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from gsmerge.io import Reading, SceneFiles, SceneLoad
     from gsmerge.io.ply import OpacityChoice
     from gsmerge.options import CompactOptions
-    from gsmerge.types import PixelScene
 
 
 def compact(
@@ -48,6 +47,7 @@ def compact(
     device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
+    unseen: opt.UnseenOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -81,7 +81,7 @@ def compact(
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
-    chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads}
+    chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads, "unseen": unseen}
     settings = _settings(chosen)
     if dry_run:
         _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
@@ -124,8 +124,8 @@ def _run(
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
         loaded = load_files(files, opacity=opacity, reading=reading)
-        pixel_scene = loaded.pixel_scene()
-        superpixels_per_view(settings.segment, pixel_scene.cameras.width, pixel_scene.cameras.height)
+        if len(loaded.scene):
+            superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
         read = perf_counter()
         with (
             announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
@@ -138,7 +138,7 @@ def _run(
                 if progress is not None:
                     progress(stage, done, total)
 
-            result = pipeline.compact(pixel_scene, settings, progress=moved)
+            result = pipeline.compact(loaded.scene, settings, progress=moved)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
@@ -185,23 +185,26 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 def _print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
+    from gsmerge.grouping import limit_of, usual_count
     from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
     loaded = load_files(files, opacity=opacity, reading=reading)
-    scene = loaded.pixel_scene()
-    cameras = scene.cameras
+    scene, cameras = loaded.scene, loaded.scene.cameras
+    with told_as_usage():
+        wanted = limit_of(scene, settings)
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
-        (len(scene), cameras.height, cameras.width),
+        (len(cameras), cameras.height, cameras.width),
         settings.to_dict(),
         output_path=out,
-        per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height),
+        per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height) if len(scene) else 0,
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
-        wanted=_wanted(scene, settings),
+        usual=usual_count(scene, settings),
+        wanted=wanted,
         notes=loaded.notes,
         count=scene.num_gaussians,
     )
@@ -209,14 +212,3 @@ def _print_plan(
         sys.stdout.write(to_json(document))
     else:
         print("\n".join(plan_lines(document)))
-
-
-def _wanted(scene: PixelScene, settings: CompactOptions) -> int | None:
-    """Gaussians that a budget or a file size asks for, refused as wrong usage where that cannot be."""
-    from gsmerge.grouping import scene_canvas
-
-    with told_as_usage():
-        canvas = scene_canvas(scene, settings)
-    if canvas.exact is None and canvas.usual <= canvas.most:
-        return None
-    return canvas.exact or canvas.most

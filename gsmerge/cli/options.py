@@ -54,6 +54,13 @@ class Match(str, Enum):
     none = "none"
 
 
+class Unseen(str, Enum):
+    """Choices of ``--unseen``."""
+
+    drop = "drop"
+    keep = "keep"
+
+
 class Fit(str, Enum):
     """What is fitted to the input images."""
 
@@ -259,6 +266,13 @@ MatchOption = Annotated[
 ]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
+]
+UnseenOption = Annotated[
+    Unseen | None,
+    typer.Option(
+        help="Gaussians that no view sees, where they are not one per pixel: drop (the default), or keep, merged.",
+        rich_help_panel=MERGING,
+    ),
 ]
 OutputOption = Annotated[
     Path | None,

@@ -44,7 +44,7 @@ class SceneLoad:
         scene: The scene: one Gaussian per pixel, or a loose one where no pixels were found.
         ply: What was found in the ``.ply``.
         files: The files that were read.
-        cameras: The cameras in the order of the views, as their file has them.
+        cameras: The cameras in the order of the views, as their file has them; None where there are none.
         alignment: How well every view's Gaussians project into their own pixels; None for a loose scene.
         recovery: Which reading of the rows won, and by how much; None for a loose scene.
         problem: Why no pixels were found, in one sentence; None where they were.
@@ -55,7 +55,7 @@ class SceneLoad:
     scene: PixelScene | LooseScene
     ply: PlyInfo
     files: SceneFiles
-    cameras: CameraFile
+    cameras: CameraFile | None
     alignment: Alignment | None
     recovery: Recovery | None
     problem: str | None
@@ -143,6 +143,8 @@ def align_scene(
     Raises:
         SceneError: As :func:`read_scene`.
     """
+    if camera_file is None and files.cameras is None and reading.order == "none":
+        return _without_cameras(ply, files, reading)
     read = cameras_of(ply, files) if camera_file is None else camera_file
     images = read_photos(files, read)
     cameras, notes = _fit_grid(ply.info, files, read, images)
@@ -247,6 +249,19 @@ def _loose(
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
     return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, lost))
+
+
+def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> SceneLoad:
+    """Gaussians alone: views are placed later."""
+    none = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
+    told = find_dialect(reading.dialect)
+    dialects = (told,) if told is not None else recognise(ply.info, None, None, "")
+    gaussians = ply.gaussians[ply.valid]
+    if reading.quats == "xyzw":
+        gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
+    scene = LooseScene(gaussians, none, None, ())
+    problem = "expected one Gaussian per pixel, found no cameras that have any"
+    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, ply_notes(ply.info))
 
 
 def _lacks_cameras(clues: Clues) -> bool:

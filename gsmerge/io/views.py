@@ -34,7 +34,11 @@ def cameras_of(ply: PlyScene, files: SceneFiles) -> CameraFile:
         found = estimate_cameras(files.ply, ply.gaussians, ply.valid.numpy(), names, width, height)
     if found is None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        raise SceneError(files.ply, f"no cameras found beside it (looked for {places})", "name them with --cameras")
+        raise SceneError(
+            files.ply,
+            f"no cameras found beside it (looked for {places})",
+            "name them with --cameras, or have views placed with --order none",
+        )
     return found
 
 

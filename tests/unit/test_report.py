@@ -81,6 +81,7 @@ def plan(*, photos: bool = True, views: int = 12, wanted: int | None = None, **s
         photos=photos,
         threads=2,
         fit_steps=options.fit.steps,
+        usual=views * 800 * options.decode.count,
         wanted=wanted,
     )
 

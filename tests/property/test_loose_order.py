@@ -1,0 +1,109 @@
+"""Gaussians in no order: what a permutation of them must not change."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import cache
+
+import loose
+import numpy as np
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsmerge import PixelScene, compact
+from gsmerge.contribution import Owners, find_owners, owner_pixels
+from gsmerge.encode import member_rows
+from gsmerge.moments import loose_members
+from gsmerge.segment import SegmentOptions, segment
+from gsmerge.threads import use_threads
+from gsmerge.types import Groups
+
+FEW = settings(max_examples=8, deadline=None, derandomize=True)
+ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
+TURNED = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.02, opacity=(0.05, 0.95), seed=3)
+
+
+@cache
+def groups(count: int) -> Groups:
+    assert ROOM.images is not None
+    return segment(ROOM.images, SegmentOptions(), count)
+
+
+def owners_equal(one: Owners, other: Owners) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("values", "views", "labels"))
+
+
+@FEW
+@given(st.integers(0, 1000), st.integers(1, 300), st.sampled_from([ROOM, TURNED]))
+def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: PixelScene) -> None:
+    """Of so few no two have the same depth in float32, so that each view has one order."""
+    few = replace(loose.loosened(scene), gaussians=scene.gaussians[::8])
+    order = torch.randperm(len(few.gaussians), generator=torch.Generator().manual_seed(seed))
+    one = find_owners(few, groups(count))
+    other = find_owners(replace(few, gaussians=few.gaussians[order]), groups(count))
+    assert owners_equal(Owners(*(column[order.numpy()] for column in (one.values, one.views, one.labels))), other)
+
+
+@FEW
+@given(st.integers(1, 300), st.floats(0, 2))
+def test_each_gaussian_is_in_at_most_one_superpixel(count: int, least: float) -> None:
+    scene = loose.loosened(TURNED)
+    owners = find_owners(scene, groups(count))
+    members = loose_members(scene, owner_pixels(owners, groups(count), least))
+    starts, ids, views = member_rows(scene, members, groups(count))
+    assert len(np.unique(ids)) == len(ids)
+    assert set(ids) == set(np.flatnonzero((owners.values >= least) & (owners.labels >= 0)))
+    assert (np.diff(starts) > 0).all()
+    assert starts[-1] == len(ids)
+    assert len(views) == len(starts) - 1
+    sizes = np.diff(starts)
+    assert (owners.views[ids] == np.repeat(views, sizes)).all()
+    assert len(set(zip(owners.views[ids], owners.labels[ids], strict=True))) == len(views)
+
+
+@FEW
+@given(st.integers(0, 1000), st.sampled_from([{}, {"k": 2}, {"budget": 200}]))
+def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
+    one, other = (
+        compact(scene, density=0.1, robust=False, fit="none", **options).gaussians
+        for scene in (loose.loosened(ROOM), loose.shuffled(ROOM, seed))
+    )
+    assert abs(len(one) - len(other)) <= 2
+    assert abs(scenes.psnr_of(one, ROOM) - scenes.psnr_of(other, ROOM)) < 0.1
+
+
+@pytest.mark.parametrize("count", [1, 25, 300])
+def test_threads_change_no_owner(count: int) -> None:
+    found = []
+    for threads in (1, 2, 8):
+        with use_threads(threads):
+            found.append(find_owners(loose.loosened(TURNED), groups(count)))
+    assert all(owners_equal(a, b) for a, b in itertools.pairwise(found))
+
+
+@pytest.mark.parametrize("options", [{"fit": "color"}, {"fit_steps": 12, "budget": 150}, {"k": "auto"}], ids=str)
+def test_threads_change_no_bit(options: dict) -> None:
+    scene = loose.voxels(ROOM, 0.06)
+    found = [compact(scene, density=0.1, threads=threads, **options).gaussians for threads in (1, 2, 8)]
+    assert all(scenes.identical(a, b) for a, b in itertools.pairwise(found))
+
+
+@FEW
+@given(st.integers(0, 1000), st.floats(-3, 3))
+def test_similarity(seed: int, exponent: float) -> None:
+    """A world in other units, turned and elsewhere."""
+    rng = np.random.default_rng(seed)
+    factor = 10.0**exponent
+    transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)
+    moved = scenes.move(ROOM, *transform)
+    one, other = (
+        compact(loose.loosened(scene), density=0.1, robust=False, fit="none").gaussians for scene in (ROOM, moved)
+    )
+    wanted = scenes.move_gaussians(one, *transform)
+    assert abs(len(one) - len(other)) <= 2
+    distances = torch.cdist(other.means.double(), wanted.means.double()).min(1).values / factor
+    assert (distances < 1e-3).double().mean() > 0.97

@@ -1,0 +1,132 @@
+"""The dominant superpixel of every Gaussian against sums over a dense matrix of weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from renderer import render_reference
+
+from gsmerge.contribution import FIRST_PAIRS, find_owners, view_owners
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.segment import superpixels
+from gsmerge.types import Cameras, Gaussians, Groups, LooseScene
+
+WIDTH, HEIGHT = 75, 53  # not multiples of a tile
+K = np.array([[60.0, 0, 36.3], [0, 62.0, 27.1], [0, 0, 1]])
+
+
+def random_gaussians(n: int, seed: int, opacity: float = 0.5, size: float = -3.5) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        normal(n, 3) * torch.tensor([1.0, 0.8, 1.0]) + torch.tensor([0.0, 0.0, 3.0]),
+        torch.nn.functional.normalize(normal(n, 4), dim=1),
+        torch.exp(normal(n, 3) * 0.9 + size),
+        torch.rand(n, generator=generator) ** opacity,
+        normal(n, 1, 3),
+        torch.zeros(n, 0, 3),
+    )
+
+
+def some_labels(count: int, seed: int = 0) -> np.ndarray:
+    return superpixels(np.random.default_rng(seed).random((HEIGHT, WIDTH, 3)), count).numpy()
+
+
+def superpixel_sums(gaussians: Gaussians, labels: np.ndarray, viewmat: torch.Tensor | None = None) -> np.ndarray:
+    """``[n,labels]`` every Gaussian's weights, one pixel after the other, float64."""
+    g = gaussians
+    weights = render_reference(
+        g.means.double(), g.quats.double(), g.scales.double(), g.opacities.double(),
+        torch.zeros(len(g), 3, dtype=torch.float64),
+        torch.eye(4, dtype=torch.float64) if viewmat is None else viewmat, torch.from_numpy(K), WIDTH, HEIGHT,
+    ).weights  # fmt: skip
+    sums = np.zeros((labels.max() + 1, len(g)))
+    np.add.at(sums, labels.reshape(-1), weights.reshape(len(g), -1).numpy().T)
+    return sums.T
+
+
+# Gaussians of a few pixels; wide ones, that reach over many rows of tiles; hardly opaque and fully opaque ones.
+CASES = [(300, 0, 0.5, -3.5, 90), (80, 1, 0.5, -1.0, 200), (400, 2, 3.0, -2.5, 40), (200, 3, 0.05, -2.0, 400),
+         (1, 4, 0.5, -1.0, 7), (100, 5, 0.5, -2.0, 1)]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
+    n, seed, opacity, size, count = case
+    gaussians, labels = random_gaussians(n, seed, opacity, size), some_labels(count)
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    values, found = view_owners(plan, labels, count)
+    sums = superpixel_sums(gaussians, labels)[plan.ids]
+    assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
+    seen = found >= 0
+    assert (seen == (values > 0)).all()
+    # where two superpixels get nearly the same, either may win
+    assert_allclose(sums[seen, found[seen]], sums[seen].max(1), rtol=1e-3, atol=1e-4)
+    assert sums[~seen].max(initial=0) < 1e-4
+    assert (found[seen] == sums[seen].argmax(1)).mean() > 0.98
+
+
+def test_pairs_beyond_the_first_room() -> None:
+    """Every pixel its own superpixel, and Gaussians over the whole picture: pairs outgrow their arrays."""
+    gaussians = random_gaussians(400, 7, 3.0, 0.3)
+    gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
+    labels = np.arange(HEIGHT * WIDTH, dtype=np.int32).reshape(HEIGHT, WIDTH)
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    values, found = view_owners(plan, labels, HEIGHT * WIDTH)
+    sums = superpixel_sums(gaussians, labels)[plan.ids]
+    assert (sums[:, : 16 * WIDTH] > 0).sum() > FIRST_PAIRS
+    assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
+    assert_allclose(sums[np.arange(len(found)), found], sums.max(1), rtol=1e-3, atol=1e-4)
+
+
+def test_one_superpixel_gets_all() -> None:
+    gaussians = random_gaussians(400, 8)
+    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    values, _ = view_owners(plan, np.zeros((HEIGHT, WIDTH), np.int32), 1)
+    assert_allclose(values, contributions(plan)[0][plan.ids], rtol=1e-5, atol=1e-6)
+
+
+def test_equal_sums_go_to_the_smaller_label() -> None:
+    gaussians = random_gaussians(1, 0)
+    middle = Gaussians(
+        torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.2), torch.tensor([0.5]),
+        gaussians.sh0, gaussians.shN,
+    )  # fmt: skip
+    even = np.array([[60.0, 0, 32], [0, 60.0, 1], [0, 0, 1]])
+    plan = plan_view(prepare(middle), np.eye(4), even, 64, 2)
+    rows = np.repeat(np.array([[0], [1]], np.int32), 64, 1)
+    assert view_owners(plan, rows, 2)[1].tolist() == [0]
+    assert view_owners(plan, 1 - rows, 2)[1].tolist() == [0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_best_of_all_views(seed: int) -> None:
+    gaussians = random_gaussians(150, seed, size=-2.5)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
+    cameras = Cameras(viewmats, torch.from_numpy(K).repeat(3, 1, 1), WIDTH, HEIGHT)
+    labels = np.stack([some_labels(60, view) for view in range(3)])
+    scene = LooseScene(gaussians, cameras, None, ("a", "b", "c"))
+    owners = find_owners(scene, Groups(torch.from_numpy(labels), (60,) * 3))
+    sums = np.stack([superpixel_sums(gaussians, labels[v], viewmats[v]) for v in range(3)], 1)
+    assert_allclose(owners.values, sums.max((1, 2)), rtol=1e-3, atol=1e-4)
+    seen = np.flatnonzero(owners.views >= 0)
+    assert_allclose(sums[seen, owners.views[seen], owners.labels[seen]], sums[seen].max((1, 2)), rtol=1e-3, atol=1e-4)
+    assert len(seen) > 100
+
+
+def test_of_equal_views_the_first() -> None:
+    gaussians = random_gaussians(100, 3)
+    cameras = Cameras(
+        torch.eye(4, dtype=torch.float64).repeat(4, 1, 1), torch.from_numpy(K).repeat(4, 1, 1), WIDTH, HEIGHT
+    )
+    labels = torch.from_numpy(some_labels(30)).repeat(4, 1, 1)
+    owners = find_owners(LooseScene(gaussians, cameras, None, tuple("abcd")), Groups(labels, (30,) * 4))
+    assert set(owners.views.tolist()) <= {-1, 0}

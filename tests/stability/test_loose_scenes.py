@@ -1,0 +1,156 @@
+"""Gaussians in no order that lack something: finite values, views, photos, cameras, anything to see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import loose
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, LooseScene, PixelScene, compact, render
+from gsmerge.pipeline import CompactResult
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
+
+
+def compacted(scene: LooseScene, **settings: Any) -> CompactResult:
+    """A tenth of the pixels, with what must hold of every result checked."""
+    result = compact(scene, **{"density": 0.1, "fit": "color", **settings})
+    for name in scenes.FIELDS:
+        assert torch.isfinite(getattr(result.gaussians, name)).all(), name
+    assert 0 < len(result.gaussians) <= max(len(scene.gaussians), 1)
+    assert (result.report.num_input, result.report.num_output) == (len(scene.gaussians), len(result.gaussians))
+    return result
+
+
+SETTINGS = [
+    {}, {"k": 2}, {"fit": "none"}, {"fit": "full", "fit_steps": 10}, {"budget": 150}, {"budget": 150, "fit": "full"},
+    {"k": "auto"}, {"robust": False}, {"match": "none"}, {"match": "aabb"}, {"method": "slic"}, {"max_bytes": "12KB"},
+    {"unseen": "keep"}, {"rule": "paper", "robust": False}, {"min_contribution": 0.1},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_every_setting(room: PixelScene, settings: dict) -> None:
+    result = compacted(loose.shuffled(room), **settings)
+    if "budget" in settings:
+        assert len(result.gaussians) == 150
+    if "fit" not in settings and "rule" not in settings:
+        assert scenes.psnr_of(result.gaussians, room) > 18
+
+
+def test_values_that_are_not_finite(room: PixelScene) -> None:
+    g = loose.shuffled(room).gaussians
+    columns = {name: getattr(g, name).clone() for name in scenes.FIELDS}
+    columns["means"][::50, 1] = torch.nan
+    columns["scales"][1::50, 0] = torch.inf
+    columns["quats"][2::50] = torch.nan
+    columns["opacities"][3::50] = torch.nan
+    columns["sh0"][4::50] = -torch.inf
+    spoilt = LooseScene(Gaussians(**columns), room.cameras, room.images, room.names)
+    result = compacted(spoilt)
+    assert any("not finite" in note for note in result.report.notes)
+    assert (
+        abs(scenes.psnr_of(result.gaussians, room) - scenes.psnr_of(compacted(loose.loosened(room)).gaussians, room))
+        < 1
+    )
+
+
+def test_nothing_finite(room: PixelScene) -> None:
+    g = room.gaussians
+    spoilt = replace(loose.loosened(room), gaussians=replace(g, means=torch.full_like(g.means, torch.nan)))
+    with pytest.raises(ValueError, match="at least one finite Gaussian"):
+        compact(spoilt)
+
+
+def test_gaussians_that_nobody_sees_change_nothing(room: PixelScene) -> None:
+    alone = loose.loosened(room)
+    hidden = loose.far_behind(room.gaussians, 100)
+    both = replace(alone, gaussians=Gaussians.concat([room.gaussians, hidden]))
+    one, other = (compacted(scene, superpixels=100).gaussians for scene in (alone, both))
+    assert abs(scenes.psnr_of(one, room) - scenes.psnr_of(other, room)) < 0.3
+    assert other.means[:, 2].min() > 0
+
+
+@pytest.mark.parametrize("fit", ["none", "color", "full"])
+def test_one_view(room: PixelScene, fit: str) -> None:
+    single = scenes.take_views(room, [1])
+    result = compacted(loose.shuffled(single), fit=fit, fit_steps=20)
+    assert scenes.psnr_of(result.gaussians, single) > 16
+
+
+def test_one_gaussian(room: PixelScene) -> None:
+    middle = room.gaussians[15 * 40 + 20 : 15 * 40 + 21]
+    assert len(compacted(replace(loose.loosened(room), gaussians=middle), fit="none", robust=False).gaussians) == 1
+
+
+@pytest.mark.parametrize("fit", ["color", "full"])
+def test_without_images(room: PixelScene, fit: str) -> None:
+    """The result looks like the scene itself."""
+    blind = replace(loose.shuffled(room), images=None)
+    result = compacted(blind, fit=fit, fit_steps=60)
+    assert any("no photos" in note for note in result.report.notes)
+    assert result.report.psnr_before is None
+    assert result.report.psnr_after is None
+    own = render(room.gaussians, room.cameras).images.clamp(0, 1)
+    assert scenes.psnr_of(result.gaussians, replace(room, images=own)) > 22
+
+
+def test_without_cameras(room: PixelScene) -> None:
+    blind = LooseScene(loose.shuffled(room).gaussians, loose.NO_CAMERAS, None, ())
+    result = compacted(blind, fit="full", fit_steps=60)
+    assert any("no cameras" in note for note in result.report.notes)
+    own = render(room.gaussians, room.cameras).images.clamp(0, 1)
+    assert scenes.psnr_of(result.gaussians, replace(room, images=own)) > 18
+
+
+@pytest.mark.parametrize("shift", [[1e6, -3e6, 400.0]])
+def test_far_from_the_origin_without_cameras(room: PixelScene, shift: list[float]) -> None:
+    """In geographic coordinates cameras are placed as well as at home."""
+    g = room.gaussians
+    there = replace(g, means=g.means.double() + torch.tensor(shift, dtype=torch.float64))
+    one, other = (compacted(LooseScene(x, loose.NO_CAMERAS, None, ()), fit="none") for x in (g, there))
+    assert abs(len(one.gaussians) - len(other.gaussians)) <= 0.1 * len(one.gaussians)
+    middle = other.gaussians.means.double().mean(0) - torch.tensor(shift, dtype=torch.float64)
+    assert (middle - one.gaussians.means.double().mean(0)).abs().max() < 0.3
+
+
+def test_many_more_views_than_gaussians_for_each() -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(30, 32, 24))
+    few = replace(loose.loosened(scene), gaussians=scene.gaussians[:: 30 * 4])
+    result = compacted(few, density=0.3, fit="none")
+    assert len(result.gaussians) <= 0.3 * len(few.gaussians) + 30
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_harmonics_survive(degree: int) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
+    result = compacted(loose.shuffled(scene))
+    assert result.gaussians.sh_degree == degree
+    assert result.gaussians.shN.abs().max() > 0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_stacked_layers(room: PixelScene, threads: int) -> None:
+    """Every Gaussian four times at one place, fainter: layers that hide nothing and are hidden by nothing."""
+    g = room.gaussians
+    layers = Gaussians.concat([replace(g, opacities=1 - (1 - g.opacities) ** 0.25)] * 4)
+    result = compacted(replace(loose.loosened(room), gaussians=layers), threads=threads)
+    assert scenes.psnr_of(result.gaussians, room) > 18
+
+
+def test_empty_sky() -> None:
+    """Superpixels without a Gaussian are left out, and their share is spent on the ball."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36))
+    near = scene.gaussians.means[:, 2] < 3.3
+    ball = replace(loose.loosened(scene), gaussians=scene.gaussians[near])
+    result = compacted(ball, fit="none", robust=False)
+    assert (result.gaussians.means[:, 2] < 3.3).all()
+    assert np.isfinite(result.report.psnr_after)
