@@ -75,7 +75,7 @@ def scene_canvas(scene: PixelScene | LooseScene, options: CompactOptions) -> Can
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
     most = most_allowed(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
-    if most < len(scene):
+    if most < min(len(scene), scene.num_gaussians):
         raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
     share = start_share(options.fit) if scene.images is not None else 1.0
     usual = usual_count(scene, options)
@@ -100,7 +100,7 @@ def limit_of(scene: PixelScene | LooseScene, options: CompactOptions) -> int | N
     """
     num_input, degree = scene.num_gaussians, scene.gaussians.sh_degree
     most = most_allowed(options.target, num_input, degree)
-    if most < len(scene):
+    if most < min(len(scene), scene.num_gaussians):
         raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
     exact = exact_count(options.target, num_input, degree)
     return exact if exact is not None else most if usual_count(scene, options) > most else None
