@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 
 from gsmerge.fit.full import KERNELS, Engine, Plan, step_sizes
 from gsmerge.fit.loss import WINDOW
-from gsmerge.fit.options import Rates
+from gsmerge.fit.options import FitOptions, Rates
 from gsmerge.fit.state import State, state_of
 from gsmerge.kernels.optimise import C1, C2, COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
 from gsmerge.render.colored import draw_colored, seen_colors
@@ -130,7 +130,7 @@ def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rn
         fade = wanted[3][:, None] + plan.options.opacity_pull * each
         shrink = wanted[2] + plan.options.size_pull * each / held.units
         rows = (wanted[0] * held.units, shrink * scales, wanted[1], fade * slope, wanted[4])
-        adam_step(held, torch.cat(rows, 1), plan.options.rates, progress, step)
+        adam_step(held, torch.cat(rows, 1), plan.options, progress, step)
         return mean_error(image, photo, weight)
 
 
@@ -171,15 +171,15 @@ def mean_error(image: Tensor, photo: Tensor, weight: Tensor) -> float:
     return float(error / (3 * weight.sum(dtype=torch.float64)).clamp_min(1))
 
 
-def adam_step(held: Held, gradient: Tensor, rates: Rates, progress: float, step: int) -> None:
+def adam_step(held: Held, gradient: Tensor, options: FitOptions, progress: float, step: int) -> None:
     """Adam on a gradient ``[n,14]``, then the box: :func:`gsmerge.kernels.optimise.adam` on tensors."""
-    energy = gradient * gradient
+    rates, energy = options.rates, gradient * gradient
     for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
         energy[:, shared] = energy[:, shared].sum(1, keepdim=True) / 3  # degrees of freedom, of a rotation too
     held.m.lerp_(gradient, 1 - rates.beta1)
     held.v.lerp_(energy, 1 - rates.beta2)
     first, second = held.m / (1 - rates.beta1**step), held.v / (1 - rates.beta2**step)
-    move = torch.from_numpy(step_sizes(rates, progress)).to(held.x) * first / (second.sqrt() + 1e-15)
+    move = torch.from_numpy(step_sizes(rates, progress, options.steps)).to(held.x) * first / (second.sqrt() + 1e-15)
     move[:, :SIZE] *= held.units
     confine(held, held.x - move, rates)
 

@@ -31,6 +31,7 @@ GROWTH = 0.5  # part of the run after which Gaussians are added
 FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.1
 PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
+LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
 
@@ -70,7 +71,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
     g.opacities[:] += np.float32(plan.options.opacity_pull / count)
     g.scales[:] += np.float32(plan.options.size_pull / count) / state.units[g.ids, None]
-    steps = step_sizes(rates, progress)
+    steps = step_sizes(rates, progress, plan.options.steps)
     limits = np.array([rates.reach_mean, rates.reach_size, rates.reach_logit], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
 
@@ -103,10 +104,11 @@ class Engine:
 KERNELS = Engine(fit_step, lambda state: None)
 
 
-def step_sizes(rates: Rates, progress: float) -> np.ndarray:
-    """Step of each of the fourteen columns at a point of the run, decaying geometrically."""
+def step_sizes(rates: Rates, progress: float, steps: int) -> np.ndarray:
+    """Step of each of the fourteen columns at a point of the run, decaying geometrically; farther in longer runs."""
+    decay = rates.decay * min(1.0, LONG_RUN / steps)
     columns = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
-    return (np.array(columns) * rates.decay**progress).astype(np.float32)
+    return (np.array(columns) * decay**progress).astype(np.float32)
 
 
 def box_shares(state: State, photos: Photos, alone: float) -> np.ndarray:

@@ -21,7 +21,7 @@ class Rates:
         quat: Step of a quaternion.
         logit: Step of an opacity's logit.
         color: Step of a colour, sRGB in [0, 1].
-        decay: Factor on all steps at the end of the run.
+        decay: Factor on all steps at the end of the run; runs of more than 300 steps end lower in proportion.
         beta1: Decay of Adam's first moment.
         beta2: Decay of its second moment.
         reach_mean: Farthest that a mean may go from its start, in units of the Gaussian's size.

@@ -335,7 +335,7 @@ def test_steps_follow_the_time_budget(photos: Pair) -> None:
 
 def test_rates_decay() -> None:
     rates = Rates()
-    start, half, end = (step_sizes(rates, p) for p in (0.0, 0.5, 1.0))
+    start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
     wanted = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
     np.testing.assert_allclose(start, wanted, rtol=1e-6)
     np.testing.assert_allclose(end, rates.decay * start, rtol=1e-6)
@@ -395,3 +395,11 @@ def test_tiny_photos(size: tuple[int, int]) -> None:
     assert np.isfinite([report.holdout_before, report.holdout_after]).all()
     for name in scenes.FIELDS:
         assert torch.isfinite(getattr(result, name)).all()
+
+
+def test_longer_runs_end_with_smaller_steps() -> None:
+    rates = FitOptions().rates
+    usual, long = step_sizes(rates, 1.0, 300), step_sizes(rates, 1.0, 900)
+    np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
+    np.testing.assert_array_equal(step_sizes(rates, 0.0, 300), step_sizes(rates, 0.0, 900))
+    np.testing.assert_array_equal(step_sizes(rates, 1.0, 12), usual)
