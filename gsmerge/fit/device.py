@@ -106,7 +106,7 @@ def download(held: Held) -> None:
 
 def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """:func:`gsmerge.fit.full.fit_step` on tensors -> mean squared error of the view's training pixels."""
-    level = 1 if progress < plan.options.coarse else 0
+    level = 1 if progress < plan.options.coarse_share else 0
     photos, weights = plan.photos[level], plan.weights[level][view]
     photo = torch.from_numpy(photos.images[view]).to(held.x)
     weight = torch.from_numpy(weights if level == 1 else np.ones_like(weights)).to(held.x)

@@ -16,7 +16,7 @@ import numpy as np
 from gsmerge.fit.grow import grow_to
 from gsmerge.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.fit.loss import image_gradient
-from gsmerge.fit.options import FitOptions, Rates
+from gsmerge.fit.options import LONG_STEPS, FitOptions, Rates
 from gsmerge.fit.report import FitReport
 from gsmerge.fit.state import State, gaussians_of, start_state
 from gsmerge.kernels import optimise as kernels
@@ -28,7 +28,7 @@ from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
 GROWTH = 0.5  # part of the run after which Gaussians are added
-FEW_VIEWS, MANY_STEPS, DROPOUT = 5, 150, 0.1
+FEW_VIEWS, MANY_STEPS, DROPOUT, LONG_DROPOUT = 5, 150, 0.1, 0.05
 PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
@@ -50,13 +50,14 @@ def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int) -> P
     """Held-out blocks, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
-    dropout = options.dropout if options.dropout is not None else DROPOUT if few else 0.0
+    usual = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
+    dropout = usual if options.dropout is None else options.dropout
     return Plan(photos, (full, reduced(full, photos[1])), options, dropout)
 
 
 def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """One Adam step on one view -> mean squared error of its training pixels."""
-    level = 1 if progress < plan.options.coarse else 0
+    level = 1 if progress < plan.options.coarse_share else 0
     photos = plan.photos[level]
     weight = plan.weights[level][view] if level == 1 else np.ones_like(plan.weights[level][view])
     background, opacities = rng.random(3, dtype=np.float32), None
@@ -173,7 +174,7 @@ def fit_full(
         if grows and part >= GROWTH and len(state.x) < count:
             engine.settle(state)
             state = grow_to(state, photos[1], count)
-        if part >= options.coarse and not judged:
+        if part >= options.coarse_share and not judged:
             engine.settle(state)
             after, judged = holdout_score(state, plan), True
             if after <= before:
@@ -202,7 +203,7 @@ def affordable_steps(seconds: float, plan: Plan) -> int:
 
     A step at full size costs up to three times as much.
     """
-    budget, coarse = plan.options.time_budget, plan.options.coarse
+    budget, coarse = plan.options.time_budget, plan.options.coarse_share
     assert budget is not None
     mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse))
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

@@ -8,6 +8,7 @@ from typing import Literal
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
 STEPS = {"fast": 30, "default": 300, "best": 1000}  # of the full fit, by effort
+LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -56,8 +57,8 @@ class FitOptions:
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
-            more, where the photos alone would be learnt by heart, otherwise 0.
-        coarse: Share of the steps that look at half-size photos.
+            more, where the photos alone would be learnt by heart, otherwise 0.05 from 600 steps on and 0 below.
+        coarse: Share of the steps that look at half-size photos; None: 0.7, from 600 steps on 0.5.
         dssim: Share of structural similarity in the loss, the rest is L1.
         opacity_pull: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
             the photos do not need fades, instead of standing in front of other views.
@@ -84,7 +85,7 @@ class FitOptions:
     fit_steps: int | None = None
     time_budget: float | None = None
     dropout: float | None = None
-    coarse: float = 0.7
+    coarse: float | None = None
     dssim: float = 0.2
     opacity_pull: float = 0.03
     size_pull: float = 0.01
@@ -102,6 +103,11 @@ class FitOptions:
     def steps(self) -> int:
         """Steps of the full fit."""
         return STEPS[self.effort] if self.fit_steps is None else self.fit_steps
+
+    @property
+    def coarse_share(self) -> float:
+        """Share of the steps that look at half-size photos."""
+        return self.coarse if self.coarse is not None else 0.5 if self.steps >= LONG_STEPS else 0.7
 
     @property
     def grows(self) -> bool:
@@ -125,8 +131,9 @@ class FitOptions:
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
         for name in ("coarse", "dssim", "prune"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a number from 0 to 1, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 1:
+                raise ValueError(f"{name}: expected a number from 0 to 1, got {value}")
         for name in ("min_gain", "max_gain"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")

@@ -282,6 +282,9 @@ def test_dropout_where_there_are_few_views(photos: Pair) -> None:
     assert plan_run(pair, LONG, 0).dropout == 0
     assert plan_run(pair, replace(LONG, dropout=0.15), 0).dropout == 0.15
     assert plan_run(photos, replace(LONG, dropout=0.0), 0).dropout == 0
+    very_long = replace(LONG, fit_steps=LONG_STEPS)
+    assert 0 < plan_run(pair, very_long, 0).dropout < plan_run(photos, very_long, 0).dropout
+    assert very_long.coarse_share < LONG.coarse_share < replace(LONG, coarse=0.9).coarse_share
 
 
 def test_dropout_leaves_out_its_share(truth: Gaussians, photos: Pair) -> None:
