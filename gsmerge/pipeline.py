@@ -27,6 +27,7 @@ from gsmerge.types import Gaussians, LooseScene, PixelScene
 from gsmerge.unaligned import make_ready
 
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
+AUTO_STEPS = 2  # times the usual ones
 NEAR = 0.01  # near plane, in canonical units
 
 
@@ -116,7 +117,7 @@ def compact(
     Raises:
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
-    options = (options or CompactOptions()).with_settings(settings)
+    options = _settled((options or CompactOptions()).with_settings(settings))
     journal = Journal(progress)
     with use_threads(options.threads), torch.no_grad():
         work = _begun(scene, options, journal)
@@ -129,6 +130,13 @@ def compact(
     if progress:
         progress("done", len(STAGES), len(STAGES))
     return replace(result, coarser=coarser)
+
+
+def _settled(options: CompactOptions) -> CompactOptions:
+    """With ``k="auto"``, twice the steps unless told: fewer Gaussians cost less each, and need them for fine detail."""
+    if options.decode.k != "auto" or options.fit.fit_steps is not None:
+        return options
+    return replace(options, fit=replace(options.fit, fit_steps=AUTO_STEPS * options.fit.steps))
 
 
 def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> _Work:
