@@ -185,13 +185,15 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 def _print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
-    from gsmerge.grouping import limit_of, usual_count
+    from gsmerge.grouping import asked_per_view, limit_of, usual_count
     from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
     loaded = load_files(files, opacity=opacity, reading=reading)
     scene, cameras = loaded.scene, loaded.scene.cameras
+    if len(scene):
+        superpixels_per_view(settings.segment, cameras.width, cameras.height)
     with told_as_usage():
         wanted = limit_of(scene, settings)
     document = plan_document(
@@ -199,7 +201,7 @@ def _print_plan(
         (len(cameras), cameras.height, cameras.width),
         settings.to_dict(),
         output_path=out,
-        per_view=superpixels_per_view(settings.segment, cameras.width, cameras.height) if len(scene) else 0,
+        per_view=asked_per_view(scene, settings) if len(scene) else 0,
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
