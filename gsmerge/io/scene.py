@@ -22,8 +22,10 @@ from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.images import natural_key
-from gsmerge.io.loose import looks_like_a_grid, sight
+from gsmerge.io.loose import looks_like_a_grid
+from gsmerge.io.mismatch import ASPECT_TOLERANCE, count_problem, misaligned, other_grid
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
+from gsmerge.io.poses import aligned_poses, poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
 from gsmerge.io.recover import Clues, Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
@@ -32,7 +34,6 @@ from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.views import cameras_of, read_photos
 from gsmerge.types import Cameras, LooseScene, PixelScene
 
-_ASPECT_TOLERANCE = 0.04  # backbones round each side to a multiple of 14 by itself
 _MIN_CORRELATION = 0.5
 
 
@@ -154,12 +155,16 @@ def align_scene(
     orders, depths = _labellings(read.names), partial(read_depths, Path(read.path))
     clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, order, reading.scene_scale)
     recovery = recover(clues)
+    if recovery is None and (other := aligned_poses(clues, read)) is not None:
+        poses, recovery = other
+        notes.append(poses_note(poses, read.convention))
+        clues, read = replace(clues, cameras=with_poses(clues.cameras, poses.viewmats)), reread(read, poses.convention)
     if recovery is None:
         return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
     best = recovery.best
     dialects = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
-    moved = torch.from_numpy(best.frame.move_cameras(clues.viewmats))
-    in_frame = cameras if best.frame is SAME else replace(cameras, viewmats=moved)
+    moved = with_poses(clues.cameras, best.frame.move_cameras(clues.viewmats))
+    in_frame = clues.cameras if best.frame is SAME else moved
     scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, images, read.names)
     scene, filled = _filled(scene, recovery, depths)
     scene, turned = _with_rotations(scene, reading, dialects)
@@ -225,22 +230,26 @@ def _loose(
     """
     cameras, images = clues.cameras, clues.images
     views, width, height = len(cameras), cameras.width, cameras.height
-    problem, remedy = _count_problem(ply.info, views, width, height), _other_grid(ply.info.count, views, width, height)
+    problem, remedy = count_problem(ply.info, views, width, height), other_grid(ply.info.count, views, width, height)
     if clues.order != "none":
         if len(ply.gaussians) == views * width * height:
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
             if reason or looks_like_a_grid(ply.gaussians, ply.valid, cameras):
-                raise _misaligned(camera_file, alignment, reason)
+                raise misaligned(camera_file, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.info.count} rows that are in no known order"
         if _lacks_cameras(clues):
             raise SceneError(ply.info.path, problem, remedy)
     if clues.scale is not None:
         scaled = Frame(np.eye(3), clues.scale, np.zeros(3))
-        cameras = replace(cameras, viewmats=torch.from_numpy(scaled.move_cameras(clues.viewmats)))
-    seen = sight(ply.gaussians, ply.valid, cameras, images)
+        cameras = with_poses(cameras, scaled.move_cameras(clues.viewmats))
+    poses, seen, said = seen_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
     if not seen.ok:
         raise SceneError(ply.info.path, f"{problem}; {seen.words}", remedy)
+    notes += (said,) if said else ()
+    if poses is not None:
+        notes += (poses_note(poses, camera_file.convention),)
+        cameras, camera_file = with_poses(cameras, poses.viewmats), reread(camera_file, poses.convention)
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
     gaussians = ply.gaussians[ply.valid]
@@ -291,7 +300,7 @@ def _fit_grid(
                 "give the images that the backbone saw, or resize these",
             )
     for w, h in sizes:
-        if w and h and abs(w * height / (h * width) - 1) > _ASPECT_TOLERANCE:
+        if w and h and abs(w * height / (h * width) - 1) > ASPECT_TOLERANCE:
             swapped = (w, h) == (height, width)
             raise SceneError(
                 camera_file.path,
@@ -301,44 +310,6 @@ def _fit_grid(
     other = [s for s in sizes if s != (width, height) and 0 not in s]
     notes = [f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other]
     return to_cameras(camera_file, (width, height)), notes
-
-
-def _count_problem(ply: PlyInfo, views: int, width: int, height: int) -> str:
-    pixels = width * height
-    return (
-        f"expected one Gaussian per pixel, {views} x {height} x {width} = {views * pixels} (views x height x width), "
-        f"found {ply.count}"
-    )
-
-
-def _other_grid(count: int, views: int, width: int, height: int) -> str:
-    """Which simple reading the number of Gaussians has instead."""
-    pixels = width * height
-    if count % (views * pixels) == 0:
-        return f"that is {count // (views * pixels)} Gaussians per pixel"
-    if count % pixels == 0:
-        return f"that is {count // pixels} views of this size: give the cameras of just those"
-    if count == views * (width - 16) * (height - 16):
-        return f"that is {height - 16} x {width - 16} per view: 8 pixels were trimmed at every border"
-    each = count / views
-    guess = round((each * width / height) ** 0.5)
-    for w in range(max(1, guess - 14), guess + 15):
-        h = each / w
-        if h == round(h) and h and abs(w * height / (h * width) - 1) < _ASPECT_TOLERANCE:
-            return f"that is {round(h)} x {w} per view: give cameras and images of that size"
-    if count < views * pixels:
-        return "pixels were dropped or merged by the exporter, which is not supported"
-    return "give the cameras and images that belong to it"
-
-
-def _misaligned(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
-    measured = (
-        f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
-        f"found a median of up to {alignment.worst_px:.1f} px and "
-        f"{100 * alignment.share_in_front:.0f} % in front of their camera"
-    )
-    unknown = "no other convention fits either: give the cameras that belong to the .ply"
-    return SceneError(camera_file.path, measured, f"{reason}: convert one to the other" if reason else unknown)
 
 
 def _colour_notes(scene: PixelScene) -> list[str]:

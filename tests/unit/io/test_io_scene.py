@@ -194,19 +194,6 @@ def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path)
         read_scene(tiny_folder, images=tmp_path / "two.npz")
 
 
-def test_the_wrong_convention_says_which_would_fit(tiny_folder: Path, tiny: Tiny) -> None:
-    def opencv(data: dict) -> None:
-        for frame, pose in zip(data["frames"], tiny.c2w, strict=True):
-            frame["transform_matrix"] = pose.tolist()
-
-    rewrite(tiny_folder / "transforms.json", opencv)
-    with pytest.raises(SceneError) as error:
-        read_scene(tiny_folder)
-    assert "own pixels, found a median of up to inf px and" in str(error.value)
-    assert "the poses fit when read as camera-to-world matrices with OpenCV axes" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder: Path, tiny: Tiny) -> None:
     strange = tiny.c2w.copy()
     strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
