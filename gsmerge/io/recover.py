@@ -109,16 +109,21 @@ class Clues:
         return np.asarray(self.cameras.Ks.double().numpy())
 
 
-def recover(clues: Clues) -> Recovery | None:
-    """The reading under which every Gaussian projects into its own pixel; None where none stands out."""
+def recover(clues: Clues, *, exact_frames: bool = False) -> Recovery | None:
+    """The reading under which every Gaussian projects into its own pixel; None where none stands out.
+
+    Args:
+        clues: What there is.
+        exact_frames: Only look where the cameras stand where their file has them and no pixel is missing: quick.
+    """
     if clues.order == "none":
         return None
     layouts = list(_exact(clues))
     found: list[Evidence] = []
-    for effort in (0, 1, 2):
+    for effort in (0,) if exact_frames else (0, 1, 2):
         if not any(evidence.ok for evidence in found):
             found += [evidence for layout in layouts for evidence in _measured(clues, layout, effort)]
-    if not any(evidence.ok for evidence in found) and clues.order in ("auto", "view-major"):
+    if not (exact_frames or any(evidence.ok for evidence in found)) and clues.order in ("auto", "view-major"):
         found += _pruned(clues)
     found.sort(key=lambda evidence: (not evidence.ok, evidence.worst_px))
     if not found or not found[0].ok:

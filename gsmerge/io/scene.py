@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +14,22 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignment
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
-from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.fill import fill_from_depths
+from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
-from gsmerge.io.images import natural_key
 from gsmerge.io.loose import looks_like_a_grid
-from gsmerge.io.mismatch import ASPECT_TOLERANCE, count_problem, misaligned, other_grid
+from gsmerge.io.mismatch import count_problem, misaligned, other_grid
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
-from gsmerge.io.poses import aligned_poses, poses_note, reread, seen_poses, with_poses
+from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
 from gsmerge.io.recover import Clues, Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.io.views import cameras_of, read_photos
+from gsmerge.io.views import cameras_of, stored_photos
 from gsmerge.types import Cameras, LooseScene, PixelScene
 
 _MIN_CORRELATION = 0.5
@@ -147,26 +145,19 @@ def align_scene(
     if camera_file is None and files.cameras is None and reading.order == "none":
         return _without_cameras(ply, files, reading)
     read = cameras_of(ply, files) if camera_file is None else camera_file
-    images = read_photos(files, read)
-    cameras, notes = _fit_grid(ply.info, files, read, images)
     told = find_dialect(reading.dialect)
     known = told.order if told is not None else read.order
     order = known if reading.order == "auto" else reading.order
-    orders, depths = _labellings(read.names), partial(read_depths, Path(read.path))
-    clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, order, reading.scene_scale)
-    recovery = recover(clues)
-    if recovery is None and (other := aligned_poses(clues, read)) is not None:
-        poses, recovery = other
-        notes.append(poses_note(poses, read.convention))
-        clues, read = replace(clues, cameras=with_poses(clues.cameras, poses.viewmats)), reread(read, poses.convention)
+    fitted = fit_cameras(ply, read, stored_photos(files, read), order=order, scale=reading.scene_scale)
+    clues, recovery, read, notes = fitted.clues, fitted.recovery, fitted.camera_file, fitted.notes
     if recovery is None:
         return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
     best = recovery.best
     dialects = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
     moved = with_poses(clues.cameras, best.frame.move_cameras(clues.viewmats))
     in_frame = clues.cameras if best.frame is SAME else moved
-    scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, images, read.names)
-    scene, filled = _filled(scene, recovery, depths)
+    scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, clues.images, read.names)
+    scene, filled = _filled(scene, recovery, clues.depths)
     scene, turned = _with_rotations(scene, reading, dialects)
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
@@ -200,11 +191,6 @@ def _with_rotations(scene: PixelScene, reading: Reading, dialects: Sequence[Dial
         return scene, []
     choice, words = likely_rotations(scene)
     return read_rotations(scene, choice), [words] if words else []
-
-
-def _labellings(names: Sequence[str]) -> list[list[int]]:
-    """Orders that the views may be in: that of the camera file, and that of the images' names."""
-    return [list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))]
 
 
 def _layout_notes(recovery: Recovery, clues: Clues) -> list[str]:
@@ -280,36 +266,6 @@ def _lacks_cameras(clues: Clues) -> bool:
         return False
     first = replace(clues, gaussians=clues.gaussians[:pixels], valid=clues.valid[:pixels], order="view-major")
     return recover(first) is not None
-
-
-def _fit_grid(
-    ply: PlyInfo, files: SceneFiles, camera_file: CameraFile, images: Tensor | None
-) -> tuple[Cameras, list[str]]:
-    """Cameras of the size of the Gaussian grid: the images' size, which the camera file's must agree with."""
-    sizes = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
-    if images is None:
-        return to_cameras(camera_file), []
-    height, width = images.shape[1:3]
-    views = len(camera_file)
-    if ply.count != views * height * width:
-        grid = next((s for s in sizes if ply.count == views * s[0] * s[1]), None)
-        if grid is not None:
-            raise SceneError(
-                files.images or camera_file.path,
-                f"expected images of the Gaussian grid's size {grid[0]} x {grid[1]}, found {width} x {height}",
-                "give the images that the backbone saw, or resize these",
-            )
-    for w, h in sizes:
-        if w and h and abs(w * height / (h * width) - 1) > ASPECT_TOLERANCE:
-            swapped = (w, h) == (height, width)
-            raise SceneError(
-                camera_file.path,
-                f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}",
-                "width and height are swapped" if swapped else "crop cameras and images alike",
-            )
-    other = [s for s in sizes if s != (width, height) and 0 not in s]
-    notes = [f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other]
-    return to_cameras(camera_file, (width, height)), notes
 
 
 def _colour_notes(scene: PixelScene) -> list[str]:

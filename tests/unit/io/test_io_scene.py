@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -156,13 +155,6 @@ def test_missing_cameras_are_counted(tmp_path: Path, tiny: Tiny) -> None:
     )
     with pytest.raises(SceneError, match=expected):
         read_scene(folder)
-
-
-def test_images_that_are_not_the_grid_s(tiny_folder: Path, tiny: Tiny) -> None:
-    for name, image in zip(tiny.names, tiny.images, strict=True):
-        cv2.imwrite(str(tiny_folder / "images" / name), cv2.resize(image, (40, 28)))
-    with pytest.raises(SceneError, match="images: expected images of the Gaussian grid's size 20 x 14, found 40 x 28"):
-        read_scene(tiny_folder)
 
 
 def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:

@@ -1,0 +1,112 @@
+"""The size of the Gaussian grid, where cameras, photos and grid may each have another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.mapping import Mapping, Size, counted, cover, patched, stretch
+from gsmerge.io.mismatch import ASPECT_TOLERANCE
+from gsmerge.io.ply import PlyInfo
+from gsmerge.types import Cameras
+
+Photos = Sequence[np.ndarray] | np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One way in which cameras and photos may be brought to the grid.
+
+    Args:
+        cameras: At the grid's size.
+        mapping: What is done to the photos; None: nothing.
+        notes: What it is, for people.
+        likely: Whether files say so, and not only the number of rows.
+    """
+
+    cameras: Cameras
+    mapping: Mapping | None
+    notes: tuple[str, ...]
+    likely: bool = True
+
+
+def photo_size(photos: Photos | None) -> Size | None:
+    """(width, height) of the photos; None without any."""
+    return None if photos is None else (photos[0].shape[1], photos[0].shape[0])
+
+
+def as_is(camera_file: CameraFile, size: Size | None) -> Fit:
+    """The grid has the photos' size, or that of the cameras where there are no photos.
+
+    Raises:
+        SceneError: If the cameras' size is not the photos' or a multiple of it.
+    """
+    if size is None:
+        return Fit(to_cameras(camera_file), None, ())
+    width, height = size
+    for w, h in sizes_of(camera_file):
+        if not _alike((w, h), size):
+            swapped = (w, h) == (height, width)
+            raise SceneError(
+                camera_file.path,
+                f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}",
+                "width and height are swapped" if swapped else "crop cameras and images alike",
+            )
+    other = [s for s in sizes_of(camera_file) if s != size]
+    notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
+    return Fit(to_cameras(camera_file, size), None, notes)
+
+
+def mapped(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[Fit]:
+    """All else that the files and the number of rows allow, the likely ones first.
+
+    Args:
+        ply: What was found in the ``.ply``.
+        camera_file: The cameras at the size that their file has.
+        size: (width, height) of the photos; None without any.
+    """
+    known = sizes_of(camera_file)
+    own = known[0] if len(known) == 1 else None
+    if size is not None and own is not None and own != size:
+        yield from _between(camera_file, size, own)
+    base = size or own
+    if base is None or any(not _alike(s, base) for s in known):
+        return
+    cameras = to_cameras(camera_file, base)
+    patches = patched(base) if ply.sh_degree == 0 and ply.opacity_encoding == "logit" else iter(())
+    what = "photos and cameras" if size is not None else "cameras"
+    for likely, mappings in ((False, counted(ply.count, len(camera_file), base)), (True, patches)):
+        for mapping in mappings:
+            if likely and ply.count >= len(camera_file) * mapping.width * mapping.height:
+                continue  # a network's size without dropped pixels is counted already
+            note = f"{what} of {base[0]} x {base[1]} are {mapping.words}, the Gaussian grid's size"
+            yield Fit(_moved(cameras, mapping.intrinsics(cameras.Ks), mapping), mapping, (note,), likely)
+            if not known and mapping.words != stretch(base, (mapping.width, mapping.height)).words:
+                whole = to_cameras(camera_file, (mapping.width, mapping.height))
+                yield Fit(whole, mapping, (f"{note}; the intrinsics are those of the result",), likely)
+
+
+def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[Fit]:
+    """Photos brought to the cameras' size, or cameras of uncropped pictures brought to the photos'."""
+    cameras = to_cameras(camera_file, own)
+    for mapping in (stretch(size, own), cover(size, own)):
+        note = f"photos of {size[0]} x {size[1]} are {mapping.words}, the cameras' and the Gaussian grid's size"
+        yield Fit(cameras, mapping, (note,))
+    if not _alike(own, size):
+        for mapping in (stretch(own, size), cover(own, size)):
+            note = f"cameras of {own[0]} x {own[1]} are {mapping.words}, the images' size"
+            yield Fit(_moved(cameras, mapping.intrinsics(cameras.Ks), mapping), None, (note,))
+
+
+def _moved(cameras: Cameras, Ks: torch.Tensor, mapping: Mapping) -> Cameras:
+    return replace(cameras, Ks=Ks, width=mapping.width, height=mapping.height)
+
+
+def _alike(one: Size, other: Size) -> bool:
+    """Whether two sizes have the same shape, but for rounding."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
