@@ -127,6 +127,12 @@ def test_inspect(made_scene: Path, run: Run) -> None:
     assert (document["count"], document["num_views"], document["width"]) == (30720, VIEWS, WIDTH)
     assert document["opacity_encoding"] == "logit"
     assert document["alignment"]["ok"] is True
+    assert document["alignment_score"] > 0.9
+    assert [view["share_of_pixels"] for view in document["coverage"]] == [1.0] * VIEWS
+    assert "would give about" in outcome.out
+    planned = json.loads(run("compact", made_scene, "--dry-run", "--json").out)
+    assert document["estimate"]["num_gaussians"] == planned["output"]["num_gaussians_at_most"]
+    assert document["estimate"]["memory_bytes"] == planned["estimate"]["memory_bytes"]
 
 
 def test_inspect_of_an_unaligned_file_is_no_error(scene_copy: Path, run: Run) -> None:
