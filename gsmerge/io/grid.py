@@ -10,6 +10,7 @@ import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.cameras.lens import undistorted
 from gsmerge.io.mapping import Mapping, Size, counted, cover, patched, stretch
 from gsmerge.io.mismatch import ASPECT_TOLERANCE
 from gsmerge.io.ply import PlyInfo
@@ -110,3 +111,32 @@ def _moved(cameras: Cameras, Ks: torch.Tensor, mapping: Mapping) -> Cameras:
 def _alike(one: Size, other: Size) -> bool:
     """Whether two sizes have the same shape, but for rounding."""
     return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
+
+
+def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
+    """Photos without lens distortion and cameras that are pinholes, with the same intrinsics; and a note of it.
+
+    Raises:
+        SceneError: If a lens is no pinhole and there are no photos of the camera's shape.
+    """
+    if not camera_file.lenses:
+        return camera_file, photos, []
+    pinholes = replace(camera_file, lenses=())
+    name = next(lens.name for lens in camera_file.lenses if lens is not None)
+    size = photo_size(photos)
+    if photos is None or size is None:
+        raise SceneError(
+            camera_file.path,
+            f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images",
+            "name the images with --images, or undistort them first",
+        )
+    other = next((s for s in sizes_of(camera_file) if not _alike(s, size)), None)
+    if other is not None:
+        raise SceneError(
+            camera_file.path,
+            f"expected images of the cameras' {other[0]} x {other[1]} to undistort ({name}), found"
+            f" {size[0]} x {size[1]}",
+            "give the images as they were taken, or undistort them first",
+        )
+    straight = undistorted(photos, to_cameras(pinholes, size).Ks.numpy(), camera_file.lenses)
+    return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]

@@ -20,6 +20,7 @@ from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
+from gsmerge.io.grid import as_pinholes
 from gsmerge.io.loose import looks_like_a_grid
 from gsmerge.io.mismatch import count_problem, misaligned, other_grid
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
@@ -148,8 +149,10 @@ def align_scene(
     told = find_dialect(reading.dialect)
     known = told.order if told is not None else read.order
     order = known if reading.order == "auto" else reading.order
-    fitted = fit_cameras(ply, read, stored_photos(files, read), order=order, scale=reading.scene_scale)
-    clues, recovery, read, notes = fitted.clues, fitted.recovery, fitted.camera_file, fitted.notes
+    read, photos, notes = as_pinholes(read, stored_photos(files, read))
+    fitted = fit_cameras(ply, read, photos, order=order, scale=reading.scene_scale)
+    clues, recovery, read = fitted.clues, fitted.recovery, fitted.camera_file
+    notes += fitted.notes
     if recovery is None:
         return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
     best = recovery.best

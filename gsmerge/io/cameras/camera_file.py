@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.cameras.lens import Lens
 from gsmerge.types import Cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
@@ -28,7 +29,7 @@ CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
 @dataclass(frozen=True)
 class CameraFile:
-    """c pinhole cameras in the order of their file.
+    """c cameras in the order of their file.
 
     Args:
         path: The file or folder.
@@ -41,6 +42,7 @@ class CameraFile:
         convention: How the format stores poses.
         images: ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves.
         order: Order of the Gaussians' rows where the file names it, otherwise "auto".
+        lenses: Of each camera where one of them is no pinhole; empty where all are.
     """
 
     path: str
@@ -53,6 +55,7 @@ class CameraFile:
     convention: Convention = W2C_OPENCV
     images: np.ndarray | None = None
     order: str = "auto"
+    lenses: tuple[Lens | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -67,8 +70,9 @@ def make_camera_file(
     sizes: Sequence[tuple[int, int]],
     names: Sequence[str],
     images: np.ndarray | None = None,
+    lenses: Sequence[Lens | None] = (),
 ) -> CameraFile:
-    """Translate poses to the one convention and check that they are poses of pinhole cameras.
+    """Translate poses to the one convention and check that they are poses.
 
     Args:
         path: The file, for messages.
@@ -79,6 +83,7 @@ def make_camera_file(
         sizes: (width, height) of each camera, pixels; 0 where unknown.
         names: Image names.
         images: ``[c,h,w,3]`` uint8, if the file holds them.
+        lenses: None for a pinhole; empty for pinholes throughout.
 
     Raises:
         SceneError: If there is no camera, a number is not finite, a rotation is none, or a focal length not positive.
@@ -107,6 +112,7 @@ def make_camera_file(
         source=source,
         convention=convention,
         images=images,
+        lenses=tuple(lenses) if any(lenses) else (),
     )
 
 
@@ -156,6 +162,7 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     """The named views, in that order."""
     ids = list(view_ids)
+    lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     return replace(
         cameras,
         viewmats=cameras.viewmats[ids],
@@ -164,6 +171,7 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
         heights=cameras.heights[ids],
         names=tuple(cameras.names[i] for i in ids),
         images=None if cameras.images is None else cameras.images[ids],
+        lenses=lenses if any(lenses) else (),
     )
 
 
@@ -182,8 +190,15 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
             the file's size.
 
     Raises:
-        SceneError: If no size is given and the file's cameras have none, or several.
+        SceneError: If no size is given and the file's cameras have none, or several; or a lens is no pinhole.
     """
+    if camera_file.lenses:
+        name, lens = next((n, x) for n, x in zip(camera_file.names, camera_file.lenses, strict=True) if x is not None)
+        raise SceneError(
+            camera_file.path,
+            f"view {name}: expected a pinhole camera, found {lens.name} with lens distortion",
+            "undistort the images first",
+        )
     found = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
     if size is None:
         if len(found) > 1:
