@@ -23,6 +23,7 @@ from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes
 from gsmerge.io.loose import looks_like_a_grid
 from gsmerge.io.mismatch import count_problem, misaligned, other_grid
+from gsmerge.io.nerfstudio import seen_in_dataparser
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
@@ -232,13 +233,8 @@ def _loose(
     if clues.scale is not None:
         scaled = Frame(np.eye(3), clues.scale, np.zeros(3))
         cameras = with_poses(cameras, scaled.move_cameras(clues.viewmats))
-    poses, seen, said = seen_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
-    if not seen.ok:
-        raise SceneError(ply.info.path, f"{problem}; {seen.words}", remedy)
-    notes += (said,) if said else ()
-    if poses is not None:
-        notes += (poses_note(poses, camera_file.convention),)
-        cameras, camera_file = with_poses(cameras, poses.viewmats), reread(camera_file, poses.convention)
+    cameras, camera_file, said = _seen(ply, files, camera_file, cameras, images, (problem, remedy))
+    notes += said
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
     gaussians = ply.gaussians[ply.valid]
@@ -247,6 +243,32 @@ def _loose(
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
     return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, lost))
+
+
+def _seen(
+    ply: PlyScene,
+    files: SceneFiles,
+    camera_file: CameraFile,
+    cameras: Cameras,
+    images: Tensor | None,
+    problem: tuple[str, str],
+) -> tuple[Cameras, CameraFile, tuple[str, ...]]:
+    """Cameras that see Gaussians without pixels: as they stand, moved as nerfstudio does, or read in another way.
+
+    Raises:
+        SceneError: If none of these does; says why there are no pixels.
+    """
+    moved = seen_in_dataparser(files, ply.gaussians, ply.valid, cameras, images)
+    if moved is not None:
+        there, _, note = moved
+        return there, replace(camera_file, viewmats=there.viewmats), (note,)
+    poses, seen, said = seen_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
+    if not seen.ok:
+        raise SceneError(ply.info.path, f"{problem[0]}; {seen.words}", problem[1])
+    if poses is None:
+        return cameras, camera_file, (said,) if said else ()
+    note = poses_note(poses, camera_file.convention)
+    return with_poses(cameras, poses.viewmats), reread(camera_file, poses.convention), (note,)
 
 
 def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> SceneLoad:
