@@ -16,6 +16,8 @@ from gsmerge.io.mismatch import ASPECT_TOLERANCE
 from gsmerge.io.ply import PlyInfo
 from gsmerge.types import Cameras
 
+_MOST_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
+
 Photos = Sequence[np.ndarray] | np.ndarray
 
 
@@ -92,10 +94,24 @@ def mapped(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator
                 yield Fit(whole, mapping, (f"{note}; the intrinsics are those of the result",), likely)
 
 
+def small_photos(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+    """Why photos do not do where the rows are as many as the cameras have pixels, but of another size."""
+    own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
+    if size is None or own is None or own == size:
+        return None
+    return SceneError(
+        camera_file.path,
+        f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}",
+        "give the images that the backbone saw, or their originals",
+    )
+
+
 def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[Fit]:
     """Photos brought to the cameras' size, or cameras of uncropped pictures brought to the photos'."""
     cameras = to_cameras(camera_file, own)
     for mapping in (stretch(size, own), cover(size, own)):
+        if max(mapping.scale_x, mapping.scale_y) > _MOST_ENLARGED:
+            continue  # previews: a fit to them would blur the Gaussians
         note = f"photos of {size[0]} x {size[1]} are {mapping.words}, the cameras' and the Gaussian grid's size"
         yield Fit(cameras, mapping, (note,))
     if not _alike(own, size):

@@ -186,3 +186,14 @@ def test_sizes_that_fit_in_no_way(tmp_path: Path, tiny: Tiny) -> None:
     write_cameras(folder, tiny, tiny.K, (60, 14))
     with pytest.raises(SceneError, match="expected cameras of the images' size 20 x 14 or a multiple of it"):
         load_scene(folder)
+
+
+def test_previews_are_refused(tmp_path: Path) -> None:
+    SMOOTH.save(tmp_path, images=False)
+    write_photos(tmp_path, SMOOTH, [cv2.resize(image, (24, 18)) for image in SMOOTH.images])
+    with pytest.raises(
+        SceneError, match="expected images of the Gaussian grid's size 48 x 36 or larger, found 24 x 18"
+    ):
+        load_scene(tmp_path)
+    write_photos(tmp_path, SMOOTH, [cv2.resize(image, (44, 33)) for image in SMOOTH.images])
+    assert load_scene(tmp_path).pixel_scene().images.shape == (3, 36, 48, 3)
