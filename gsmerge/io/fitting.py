@@ -16,7 +16,7 @@ from gsmerge.io.grid import Fit, Photos, as_is, mapped, photo_size, small_photos
 from gsmerge.io.images import as_tensor, natural_key
 from gsmerge.io.ply import PlyScene
 from gsmerge.io.poses import aligned_poses, poses_note, reread, with_poses
-from gsmerge.io.recover import MARGIN, Clues, Recovery, recover
+from gsmerge.io.recover import MARGIN, Clues, Recovery, color_error, recover
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid that only the photos' colours can tell apart
@@ -55,7 +55,7 @@ def fit_cameras(
     Raises:
         SceneError: If sizes do not agree, or several conventions fit.
     """
-    clues_of = partial(_clues, ply, camera_file, photos, order, scale)
+    clues_of = partial(_clues, ply, camera_file, photos=photos, order=order, scale=scale)
     size = photo_size(photos)
     try:
         plain, problem = as_is(camera_file, size), None
@@ -93,7 +93,7 @@ def _is_large(ply: PlyScene, plain: Fit) -> bool:
 
 
 def _clues(
-    ply: PlyScene, camera_file: CameraFile, photos: Photos | None, order: str, scale: float | None, one: Fit
+    ply: PlyScene, camera_file: CameraFile, one: Fit, *, photos: Photos | None, order: str, scale: float | None
 ) -> Clues:
     brought = photos if photos is None or one.mapping is None else one.mapping.photos(photos)
     images = None if brought is None else as_tensor(brought)
@@ -107,22 +107,24 @@ def _labellings(names: Sequence[str]) -> list[list[int]]:
 
 
 def _other_size(
-    ply: PlyScene, camera_file: CameraFile, size: tuple[int, int] | None, clues_of: Callable[[Fit], Clues]
+    ply: PlyScene, camera_file: CameraFile, size: tuple[int, int] | None, clues_of: Callable[..., Clues]
 ) -> tuple[Clues, Recovery, Fit] | None:
     """The fit at another size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
 
     Those that only the number of rows speaks for are tried in the frame of the cameras first: there may be many.
     """
-    found: list[tuple[Clues, Recovery, Fit]] = []
+    found: list[tuple[Fit, Recovery]] = []
     guesses: list[Fit] = []
     for one in mapped(ply.info, camera_file, size):
-        if not one.likely:
+        if found and one.rank > found[0][0].rank:
+            break
+        if one.guessed:
             guesses.append(one)
-        if (recovery := recover(clues := clues_of(one), exact_frames=not one.likely)) is not None:
-            found.append((clues, recovery, one))
+        recovery = recover(clues_of(one, photos=None), exact_frames=one.guessed)
+        found += [] if recovery is None else [(one, recovery)]
     for one in guesses[:_MOST] if not found else []:
-        if (recovery := recover(clues := clues_of(one))) is not None:
-            found.append((clues, recovery, one))
+        recovery = recover(clues_of(one, photos=None))
+        found += [] if recovery is None else [(one, recovery)]
     if not found:
         return None
     best = min(found, key=lambda f: f[1].best.worst_px)
@@ -132,8 +134,11 @@ def _other_size(
         return None
     near = max(_ALIKE * px, px + _ALIKE_PX)
     alike = [f for f in found if _grid(f) == _grid(best) and f[1].best.worst_px <= near]
-    return min(alike, key=lambda f: np.nan_to_num(f[1].best.color_error, nan=1.0))
+    brought = [(clues_of(one), recovery, one) for one, recovery in alike]
+    if len(brought) == 1:
+        return brought[0]
+    return min(brought, key=lambda f: np.nan_to_num(color_error(f[0], f[1].best.layout), nan=1.0))
 
 
-def _grid(found: tuple[Clues, Recovery, Fit]) -> tuple[int, int]:
+def _grid(found: tuple[Fit, Recovery]) -> tuple[int, int]:
     return found[0].cameras.width, found[0].cameras.height

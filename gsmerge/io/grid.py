@@ -29,13 +29,19 @@ class Fit:
         cameras: At the grid's size.
         mapping: What is done to the photos; None: nothing.
         notes: What it is, for people.
-        likely: Whether files say so, and not only the number of rows.
+        rank: What speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
+            of rows alone (2); a network's habit (3).
     """
 
     cameras: Cameras
     mapping: Mapping | None
     notes: tuple[str, ...]
-    likely: bool = True
+    rank: int = 0
+
+    @property
+    def guessed(self) -> bool:
+        """Whether it is one of many that the number of rows allows."""
+        return self.rank in (1, 2)
 
 
 def photo_size(photos: Photos | None) -> Size | None:
@@ -83,15 +89,14 @@ def mapped(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator
     cameras = to_cameras(camera_file, base)
     patches = patched(base) if ply.sh_degree == 0 and ply.opacity_encoding == "logit" else iter(())
     what = "photos and cameras" if size is not None else "cameras"
-    for likely, mappings in ((False, counted(ply.count, len(camera_file), base)), (True, patches)):
-        for mapping in mappings:
-            if likely and ply.count >= len(camera_file) * mapping.width * mapping.height:
-                continue  # a network's size without dropped pixels is counted already
-            note = f"{what} of {base[0]} x {base[1]} are {mapping.words}, the Gaussian grid's size"
-            yield Fit(_moved(cameras, mapping.intrinsics(cameras.Ks), mapping), mapping, (note,), likely)
-            if not known and mapping.words != stretch(base, (mapping.width, mapping.height)).words:
-                whole = to_cameras(camera_file, (mapping.width, mapping.height))
-                yield Fit(whole, mapping, (f"{note}; the intrinsics are those of the result",), likely)
+    for rank, mapping in [(1 if m.is_whole else 2, m) for m in counted(ply.count, len(camera_file), base)] + [
+        (3, m) for m in patches if ply.count < len(camera_file) * m.width * m.height
+    ]:
+        note = f"{what} of {base[0]} x {base[1]} are {mapping.words}, the Gaussian grid's size"
+        yield Fit(_moved(cameras, mapping.intrinsics(cameras.Ks), mapping), mapping, (note,), rank)
+        if not known and not mapping.is_whole:
+            whole = to_cameras(camera_file, (mapping.width, mapping.height))
+            yield Fit(whole, mapping, (f"{note}; the intrinsics are those of the result",), rank)
 
 
 def small_photos(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:

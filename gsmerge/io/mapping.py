@@ -19,7 +19,7 @@ Size = tuple[int, int]  # width, height
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to
-_MIN_KEPT = 0.4  # of a photo's area, when it is cropped
+_MIN_KEPT = 0.5  # of a photo's area, when it is cropped
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,14 @@ class Mapping:
     top: int = 0
 
     @property
+    def is_whole(self) -> bool:
+        """Whether nothing is cut off."""
+        return not (self.left or self.top)
+
+    @property
     def words(self) -> str:
         """What is done to a photo."""
-        cropped = self.left or self.top
-        return f"resized{' and centre-cropped' if cropped else ''} to {self.width} x {self.height}"
+        return f"resized{'' if self.is_whole else ' and centre-cropped'} to {self.width} x {self.height}"
 
     def intrinsics(self, Ks: Tensor) -> Tensor:
         """``[c,3,3]`` intrinsics of the result."""
@@ -103,7 +107,7 @@ def counted(count: int, views: int, size: Size) -> Iterator[Mapping]:
                 is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
                 if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
                     crops.append(cover(size, to))
-    yield from (crop for crop in crops if crop.left or crop.top)
+    yield from (crop for crop in crops if not crop.is_whole)
 
 
 def _grids(pixels: int, trim: int, size: Size) -> Iterator[Size]:

@@ -202,6 +202,12 @@ def sightings(clues: Clues, layout: Layout, *, colored: bool = True) -> tuple[Si
     return Sightings(points, np.stack([x, y], 1) + 0.5, views, blocks), colors
 
 
+def color_error(clues: Clues, layout: Layout) -> float:
+    """Mean distance of the base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
+    _, colors = sightings(clues, thinned(layout, max(MIN_SAMPLES, SAMPLES // len(layout.views))))
+    return math.nan if colors is None or not len(colors) else float(colors.mean())
+
+
 def _evidence(clues: Clues, layout: Layout, frame: Frame, seen: Sightings, colors: np.ndarray | None) -> Evidence:
     errors = pixel_errors(seen, frame.move_cameras(clues.viewmats), clues.Ks)
     bounds = np.concatenate([[0], np.cumsum(np.bincount(seen.blocks, minlength=len(layout.views)))])
@@ -278,4 +284,4 @@ def _shuffled_px(clues: Clues, best: Evidence) -> float:
     return float(np.median(errors))
 
 
-__all__ = ["MARGIN", "Clues", "Evidence", "Recovery", "recover", "sightings"]
+__all__ = ["MARGIN", "Clues", "Evidence", "Recovery", "color_error", "recover", "sightings"]
