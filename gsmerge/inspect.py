@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 
+from gsmerge.allocate import file_bytes
 from gsmerge.errors import SceneError
+from gsmerge.extents import Coverage, Extents, coverage, extents
+from gsmerge.grouping import usual_count
 from gsmerge.io import (
     Alignment,
     PlyScene,
     Reading,
     SceneFiles,
+    SceneLoad,
     align_scene,
     find_scene_files,
     ply_notes,
@@ -22,12 +27,16 @@ from gsmerge.io import (
     read_told,
 )
 from gsmerge.io.dialects import dialect_words, recognise
+from gsmerge.io.loose import Sight, sight
 from gsmerge.io.ply import OpacityChoice
 from gsmerge.io.reading import make_reading
-from gsmerge.types import Gaussians
+from gsmerge.options import CompactOptions
+from gsmerge.report import plan_document
+from gsmerge.threads import available_threads
+from gsmerge.types import LooseScene, PixelScene
 
-_MAX_EXTENT_SAMPLES = 200_000
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # below one step of an 8-bit image; where optical depth is capped
+_SATURATED = 1e-6  # no logit beyond it comes back from float32 as it was
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,7 @@ class Inspection:
         extra_elements: Elements beside ``vertex``.
         sh_degree: 0 to 4.
         opacity_encoding: "logit" or "raw".
+        extents: How far the Gaussians reach, outliers, and how large they are.
         box_low: 1 % quantile of the positions per axis, world units.
         box_high: 99 % quantile of the same.
         num_nonfinite: Rows with NaN or inf.
@@ -52,6 +62,7 @@ class Inspection:
         num_zero_quats: Gaussians without a rotation.
         num_opaque: Gaussians with an opacity of at least 0.995.
         num_transparent: Finite Gaussians with an opacity below 1/255.
+        num_saturated: Finite Gaussians with an opacity of 0 or 1, but for 1e-6.
         num_views: Cameras, 0 where none were found.
         width: Of the Gaussian grid, pixels; 0 while it is not verified.
         height: The same.
@@ -62,6 +73,13 @@ class Inspection:
         alignment_problem: Why the scene is not known to have one Gaussian per pixel; None if it has.
         dialect: The exporters that may have written the file.
         rows: Which reading of the rows won, and by how much; None while there is none.
+        alignment_score: Share of the Gaussians at most one pixel from their pixels' centres; None without pixels.
+        alignment_margin: How many times nearer they are than under the next reading; None without pixels.
+        sight: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
+            cameras that fit.
+        coverage: What every view shows.
+        estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``
+            and ``memory_bytes``; right within a factor of about two. None where it would refuse the scene.
         notes: What was adapted or looks odd, one sentence each.
     """
 
@@ -75,6 +93,7 @@ class Inspection:
     extra_elements: tuple[str, ...]
     sh_degree: int
     opacity_encoding: str
+    extents: Extents
     box_low: tuple[float, ...]
     box_high: tuple[float, ...]
     num_nonfinite: int
@@ -82,6 +101,7 @@ class Inspection:
     num_zero_quats: int
     num_opaque: int
     num_transparent: int
+    num_saturated: int
     num_views: int
     width: int
     height: int
@@ -92,6 +112,11 @@ class Inspection:
     alignment_problem: str | None
     dialect: str
     rows: str | None
+    alignment_score: float | None
+    alignment_margin: float | None
+    sight: Sight | None
+    coverage: tuple[Coverage, ...]
+    estimate: dict[str, float] | None
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -139,7 +164,7 @@ def _plain(value: Any) -> Any:
 def _of_ply(ply: PlyScene) -> dict[str, Any]:
     info = ply.info
     opacities = ply.gaussians.opacities[ply.valid]
-    low, high = _box(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians)
+    found = extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians)
     return {
         "path": info.path,
         "layout": info.layout,
@@ -151,20 +176,16 @@ def _of_ply(ply: PlyScene) -> dict[str, Any]:
         "extra_elements": info.extra_elements,
         "sh_degree": info.sh_degree,
         "opacity_encoding": info.opacity_encoding,
-        "box_low": low,
-        "box_high": high,
+        "extents": found,
+        "box_low": found.box_low,
+        "box_high": found.box_high,
         "num_nonfinite": info.num_nonfinite,
         "num_clipped_scales": info.num_clipped_scales,
         "num_zero_quats": info.num_zero_quats,
         "num_opaque": int((opacities >= _OPAQUE).sum()),
         "num_transparent": int((opacities < _TRANSPARENT).sum()),
+        "num_saturated": int(((opacities <= _SATURATED) | (opacities >= 1 - _SATURATED)).sum()),
     }
-
-
-def _box(gaussians: Gaussians) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    step = -(-len(gaussians) // _MAX_EXTENT_SAMPLES)
-    low, high = np.percentile(gaussians.means[::step].numpy(), (1, 99), axis=0)
-    return tuple(map(float, low)), tuple(map(float, high))
 
 
 def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, Any]:
@@ -179,6 +200,11 @@ def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, A
         "alignment_problem": None,
         "dialect": dialect_words(recognise(ply.info, None, None, None)),
         "rows": None,
+        "alignment_score": None,
+        "alignment_margin": None,
+        "sight": None,
+        "coverage": (),
+        "estimate": None,
         "notes": ply_notes(ply.info),
     }
     camera_file = None
@@ -191,7 +217,42 @@ def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, A
         return found | {"alignment_problem": str(error)}
     found |= {"dialect": dialect_words(load.dialects), "notes": load.notes}
     found |= {"num_views": len(load.scene.cameras), "camera_format": load.cameras and load.cameras.source}
-    if load.recovery is None:
+    found |= {"coverage": coverage(load.scene), "estimate": estimate(load.scene), "sight": _sight(load)}
+    if load.recovery is None or load.alignment is None:
         return found | {"alignment_problem": load.problem}
+    found |= {"alignment_score": load.alignment.share_within_1px, "alignment_margin": load.recovery.margin}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
     return found | size | {"alignment": load.alignment, "rows": load.recovery.words}
+
+
+def _sight(load: SceneLoad) -> Sight | None:
+    scene = load.scene
+    if len(scene) == 0:
+        return None
+    everything = torch.ones(len(scene.gaussians), dtype=torch.bool)
+    valid = scene.valid.reshape(-1) if isinstance(scene, PixelScene) else everything
+    return sight(scene.gaussians, valid, scene.cameras, scene.images)
+
+
+def estimate(scene: PixelScene | LooseScene) -> dict[str, float]:
+    """What ``compact`` would make of a scene by default: Gaussians, their share, bytes, seconds and bytes of memory."""
+    options = CompactOptions()
+    plan = plan_document(
+        {},
+        (len(scene), scene.cameras.height, scene.cameras.width),
+        options.to_dict(),
+        output_path=Path(),
+        per_view=0,
+        photos=scene.images is not None,
+        threads=available_threads(),
+        fit_steps=options.fit.steps,
+        usual=usual_count(scene, options),
+        count=scene.num_gaussians,
+    )
+    count = plan["output"]["num_gaussians_at_most"]
+    return {
+        "num_gaussians": count,
+        "ratio": count / max(1, scene.num_gaussians),
+        "bytes": file_bytes(count, scene.gaussians.sh_degree),
+        **plan["estimate"],
+    }

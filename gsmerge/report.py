@@ -281,15 +281,17 @@ def inspection_lines(found: Mapping[str, Any]) -> list[str]:
     extras = [*found["extra_columns"], *(f"element {name}" for name in found["extra_elements"])]
     low, high = (" ".join(f"{value:.4g}" for value in found[key]) for key in ("box_low", "box_high"))
     cameras = found["cameras"] and f"{found['cameras']}: {found['num_views']} ({found['camera_format']})"
-    alignment = found["alignment"]
+    alignment, size = found["alignment"], found["extents"]
     lines = [
         f"file       {found['path']}: {human_bytes(found['bytes'])} ({parts})",
         f"layout     {found['layout']}, {found['format']}; opacity stored {_ENCODINGS[found['opacity_encoding']]}",
         f"dialect    {found['dialect']}",
         f"ignored    {', '.join(extras)}" if extras else "",
         f"Gaussians  {found['count']:,}: {found['num_nonfinite']} not finite, {found['num_transparent']:,} transparent,"
-        f" {found['num_opaque']:,} opaque",
-        f"extent     {low}  to  {high}  (1 % to 99 %)",
+        f" {found['num_opaque']:,} opaque, {found['num_saturated']:,} of opacity 0 or 1",
+        f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.2g} % beyond ten times that box",
+        f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"
+        f" {size['diagonal']:.3g}; {100 * size['share_huge']:.2g} % above a tenth of it",
         f"cameras    {cameras or 'none found'}",
         f"images     {found['images'] or 'none found'}",
     ]
@@ -298,9 +300,38 @@ def inspection_lines(found: Mapping[str, Any]) -> list[str]:
     elif alignment is not None:
         lines.append(
             f"alignment  one Gaussian per pixel, {found['num_views']} x {found['height']} x {found['width']}"
-            f" ({found['rows']}); median offset {max(alignment['median_px']):.2f} px in the worst view"
+            f" ({found['rows']}); median offset {max(alignment['median_px']):.2f} px in the worst view,"
+            f" {100 * found['alignment_score']:.1f} % within 1 px"
         )
+    lines += _view_lines(found) + _estimate_lines(found)
     return [line for line in lines if line] + [f"note       {note}" for note in found["notes"]]
+
+
+def _view_lines(found: Mapping[str, Any]) -> list[str]:
+    """What the views show, and which shows least."""
+    views, seen = found["coverage"], found["sight"]
+    if not views or seen is None:
+        return []
+    colors = "" if seen["color_ratio"] is None else f"; colours {seen['color_ratio']:.2f} times as far as any others'"
+    pixelwise = views[0]["share_of_pixels"] is not None
+    key, what = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
+    shares = [view[key] for view in views]
+    least = views[shares.index(min(shares))]["name"]
+    return [
+        f"coverage   {100 * min(shares):.0f} to {100 * max(shares):.0f} % of the {what} per view, least in {least};"
+        f" {100 * seen['share_seen']:.0f} % of the Gaussians seen{colors}"
+    ]
+
+
+def _estimate_lines(found: Mapping[str, Any]) -> list[str]:
+    guess = found["estimate"]
+    if guess is None:
+        return []
+    return [
+        f"compact    would give about {guess['num_gaussians']:,} Gaussians ({100 * guess['ratio']:.1f} %),"
+        f" {human_bytes(guess['bytes'])}, in about {guess['seconds']:.0f} s with"
+        f" {human_bytes(guess['memory_bytes'])} of memory"
+    ]
 
 
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}

@@ -35,13 +35,18 @@ def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
     Raises:
         SceneError: If an image is missing or cannot be read, or two differ in size.
     """
+    return as_tensor(decode_images(source, names))
+
+
+def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]:
+    """:func:`read_images` as c arrays ``[h,w,3]`` uint8."""
     paths = match_images(source, names)
     decoded = parallel_map(_decode, paths)
     for path, image in zip(paths, decoded, strict=True):
         if image.shape != decoded[0].shape:
             (h0, w0), (h, w) = decoded[0].shape[:2], image.shape[:2]
             raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
-    return as_tensor(decoded)
+    return decoded
 
 
 def as_tensor(images: Sequence[np.ndarray] | np.ndarray) -> Tensor:

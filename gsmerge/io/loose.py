@@ -33,6 +33,11 @@ class Sight:
     ok: bool
 
     @property
+    def score(self) -> float:
+        """0 to 1, to compare cameras by: the share that is seen, less where the colours are any others' as well."""
+        return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
+
+    @property
     def words(self) -> str:
         """The figures in one sentence."""
         seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"

@@ -109,16 +109,21 @@ class Clues:
         return np.asarray(self.cameras.Ks.double().numpy())
 
 
-def recover(clues: Clues) -> Recovery | None:
-    """The reading under which every Gaussian projects into its own pixel; None where none stands out."""
+def recover(clues: Clues, *, exact_frames: bool = False) -> Recovery | None:
+    """The reading under which every Gaussian projects into its own pixel; None where none stands out.
+
+    Args:
+        clues: What there is.
+        exact_frames: Only look where the cameras stand where their file has them and no pixel is missing: quick.
+    """
     if clues.order == "none":
         return None
     layouts = list(_exact(clues))
     found: list[Evidence] = []
-    for effort in (0, 1, 2):
+    for effort in (0,) if exact_frames else (0, 1, 2):
         if not any(evidence.ok for evidence in found):
             found += [evidence for layout in layouts for evidence in _measured(clues, layout, effort)]
-    if not any(evidence.ok for evidence in found) and clues.order in ("auto", "view-major"):
+    if not (exact_frames or any(evidence.ok for evidence in found)) and clues.order in ("auto", "view-major"):
         found += _pruned(clues)
     found.sort(key=lambda evidence: (not evidence.ok, evidence.worst_px))
     if not found or not found[0].ok:
@@ -197,6 +202,12 @@ def sightings(clues: Clues, layout: Layout, *, colored: bool = True) -> tuple[Si
     return Sightings(points, np.stack([x, y], 1) + 0.5, views, blocks), colors
 
 
+def color_error(clues: Clues, layout: Layout) -> float:
+    """Mean distance of the base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
+    _, colors = sightings(clues, thinned(layout, max(MIN_SAMPLES, SAMPLES // len(layout.views))))
+    return math.nan if colors is None or not len(colors) else float(colors.mean())
+
+
 def _evidence(clues: Clues, layout: Layout, frame: Frame, seen: Sightings, colors: np.ndarray | None) -> Evidence:
     errors = pixel_errors(seen, frame.move_cameras(clues.viewmats), clues.Ks)
     bounds = np.concatenate([[0], np.cumsum(np.bincount(seen.blocks, minlength=len(layout.views)))])
@@ -273,4 +284,4 @@ def _shuffled_px(clues: Clues, best: Evidence) -> float:
     return float(np.median(errors))
 
 
-__all__ = ["MARGIN", "Clues", "Evidence", "Recovery", "recover", "sightings"]
+__all__ = ["MARGIN", "Clues", "Evidence", "Recovery", "color_error", "recover", "sightings"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +14,26 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignment
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
-from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.fill import fill_from_depths
+from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
-from gsmerge.io.images import natural_key
-from gsmerge.io.loose import looks_like_a_grid, sight
+from gsmerge.io.grid import as_pinholes
+from gsmerge.io.loose import looks_like_a_grid
+from gsmerge.io.mismatch import count_problem, misaligned, other_grid
+from gsmerge.io.nerfstudio import seen_in_dataparser
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
+from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
 from gsmerge.io.recover import Clues, Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.io.views import cameras_of, read_photos
+from gsmerge.io.views import cameras_of, stored_photos
 from gsmerge.types import Cameras, LooseScene, PixelScene
 
-_ASPECT_TOLERANCE = 0.04  # backbones round each side to a multiple of 14 by itself
 _MIN_CORRELATION = 0.5
 
 
@@ -146,22 +147,21 @@ def align_scene(
     if camera_file is None and files.cameras is None and reading.order == "none":
         return _without_cameras(ply, files, reading)
     read = cameras_of(ply, files) if camera_file is None else camera_file
-    images = read_photos(files, read)
-    cameras, notes = _fit_grid(ply.info, files, read, images)
     told = find_dialect(reading.dialect)
     known = told.order if told is not None else read.order
     order = known if reading.order == "auto" else reading.order
-    orders, depths = _labellings(read.names), partial(read_depths, Path(read.path))
-    clues = Clues(ply.gaussians, ply.valid, cameras, images, orders, depths, order, reading.scene_scale)
-    recovery = recover(clues)
+    read, photos, notes = as_pinholes(read, stored_photos(files, read))
+    fitted = fit_cameras(ply, read, photos, order=order, scale=reading.scene_scale)
+    clues, recovery, read = fitted.clues, fitted.recovery, fitted.camera_file
+    notes += fitted.notes
     if recovery is None:
         return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
     best = recovery.best
     dialects = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
-    moved = torch.from_numpy(best.frame.move_cameras(clues.viewmats))
-    in_frame = cameras if best.frame is SAME else replace(cameras, viewmats=moved)
-    scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, images, read.names)
-    scene, filled = _filled(scene, recovery, depths)
+    moved = with_poses(clues.cameras, best.frame.move_cameras(clues.viewmats))
+    in_frame = clues.cameras if best.frame is SAME else moved
+    scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, clues.images, read.names)
+    scene, filled = _filled(scene, recovery, clues.depths)
     scene, turned = _with_rotations(scene, reading, dialects)
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
@@ -197,11 +197,6 @@ def _with_rotations(scene: PixelScene, reading: Reading, dialects: Sequence[Dial
     return read_rotations(scene, choice), [words] if words else []
 
 
-def _labellings(names: Sequence[str]) -> list[list[int]]:
-    """Orders that the views may be in: that of the camera file, and that of the images' names."""
-    return [list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))]
-
-
 def _layout_notes(recovery: Recovery, clues: Clues) -> list[str]:
     """How the pixels were found, unless the file was simply in order."""
     layout, frame = recovery.best.layout, recovery.best.frame
@@ -225,22 +220,21 @@ def _loose(
     """
     cameras, images = clues.cameras, clues.images
     views, width, height = len(cameras), cameras.width, cameras.height
-    problem, remedy = _count_problem(ply.info, views, width, height), _other_grid(ply.info.count, views, width, height)
+    problem, remedy = count_problem(ply.info, views, width, height), other_grid(ply.info.count, views, width, height)
     if clues.order != "none":
         if len(ply.gaussians) == views * width * height:
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
             if reason or looks_like_a_grid(ply.gaussians, ply.valid, cameras):
-                raise _misaligned(camera_file, alignment, reason)
+                raise misaligned(camera_file, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.info.count} rows that are in no known order"
         if _lacks_cameras(clues):
             raise SceneError(ply.info.path, problem, remedy)
     if clues.scale is not None:
         scaled = Frame(np.eye(3), clues.scale, np.zeros(3))
-        cameras = replace(cameras, viewmats=torch.from_numpy(scaled.move_cameras(clues.viewmats)))
-    seen = sight(ply.gaussians, ply.valid, cameras, images)
-    if not seen.ok:
-        raise SceneError(ply.info.path, f"{problem}; {seen.words}", remedy)
+        cameras = with_poses(cameras, scaled.move_cameras(clues.viewmats))
+    cameras, camera_file, said = _seen(ply, files, camera_file, cameras, images, (problem, remedy))
+    notes += said
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
     gaussians = ply.gaussians[ply.valid]
@@ -249,6 +243,32 @@ def _loose(
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
     return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, lost))
+
+
+def _seen(
+    ply: PlyScene,
+    files: SceneFiles,
+    camera_file: CameraFile,
+    cameras: Cameras,
+    images: Tensor | None,
+    problem: tuple[str, str],
+) -> tuple[Cameras, CameraFile, tuple[str, ...]]:
+    """Cameras that see Gaussians without pixels: as they stand, moved as nerfstudio does, or read in another way.
+
+    Raises:
+        SceneError: If none of these does; says why there are no pixels.
+    """
+    moved = seen_in_dataparser(files, ply.gaussians, ply.valid, cameras, images)
+    if moved is not None:
+        there, _, note = moved
+        return there, replace(camera_file, viewmats=there.viewmats), (note,)
+    poses, seen, said = seen_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
+    if not seen.ok:
+        raise SceneError(ply.info.path, f"{problem[0]}; {seen.words}", problem[1])
+    if poses is None:
+        return cameras, camera_file, (said,) if said else ()
+    note = poses_note(poses, camera_file.convention)
+    return with_poses(cameras, poses.viewmats), reread(camera_file, poses.convention), (note,)
 
 
 def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> SceneLoad:
@@ -271,74 +291,6 @@ def _lacks_cameras(clues: Clues) -> bool:
         return False
     first = replace(clues, gaussians=clues.gaussians[:pixels], valid=clues.valid[:pixels], order="view-major")
     return recover(first) is not None
-
-
-def _fit_grid(
-    ply: PlyInfo, files: SceneFiles, camera_file: CameraFile, images: Tensor | None
-) -> tuple[Cameras, list[str]]:
-    """Cameras of the size of the Gaussian grid: the images' size, which the camera file's must agree with."""
-    sizes = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
-    if images is None:
-        return to_cameras(camera_file), []
-    height, width = images.shape[1:3]
-    views = len(camera_file)
-    if ply.count != views * height * width:
-        grid = next((s for s in sizes if ply.count == views * s[0] * s[1]), None)
-        if grid is not None:
-            raise SceneError(
-                files.images or camera_file.path,
-                f"expected images of the Gaussian grid's size {grid[0]} x {grid[1]}, found {width} x {height}",
-                "give the images that the backbone saw, or resize these",
-            )
-    for w, h in sizes:
-        if w and h and abs(w * height / (h * width) - 1) > _ASPECT_TOLERANCE:
-            swapped = (w, h) == (height, width)
-            raise SceneError(
-                camera_file.path,
-                f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}",
-                "width and height are swapped" if swapped else "crop cameras and images alike",
-            )
-    other = [s for s in sizes if s != (width, height) and 0 not in s]
-    notes = [f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other]
-    return to_cameras(camera_file, (width, height)), notes
-
-
-def _count_problem(ply: PlyInfo, views: int, width: int, height: int) -> str:
-    pixels = width * height
-    return (
-        f"expected one Gaussian per pixel, {views} x {height} x {width} = {views * pixels} (views x height x width), "
-        f"found {ply.count}"
-    )
-
-
-def _other_grid(count: int, views: int, width: int, height: int) -> str:
-    """Which simple reading the number of Gaussians has instead."""
-    pixels = width * height
-    if count % (views * pixels) == 0:
-        return f"that is {count // (views * pixels)} Gaussians per pixel"
-    if count % pixels == 0:
-        return f"that is {count // pixels} views of this size: give the cameras of just those"
-    if count == views * (width - 16) * (height - 16):
-        return f"that is {height - 16} x {width - 16} per view: 8 pixels were trimmed at every border"
-    each = count / views
-    guess = round((each * width / height) ** 0.5)
-    for w in range(max(1, guess - 14), guess + 15):
-        h = each / w
-        if h == round(h) and h and abs(w * height / (h * width) - 1) < _ASPECT_TOLERANCE:
-            return f"that is {round(h)} x {w} per view: give cameras and images of that size"
-    if count < views * pixels:
-        return "pixels were dropped or merged by the exporter, which is not supported"
-    return "give the cameras and images that belong to it"
-
-
-def _misaligned(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
-    measured = (
-        f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
-        f"found a median of up to {alignment.worst_px:.1f} px and "
-        f"{100 * alignment.share_in_front:.0f} % in front of their camera"
-    )
-    unknown = "no other convention fits either: give the cameras that belong to the .ply"
-    return SceneError(camera_file.path, measured, f"{reason}: convert one to the other" if reason else unknown)
 
 
 def _colour_notes(scene: PixelScene) -> list[str]:

@@ -12,8 +12,10 @@ from gsmerge.io.cameras.da3 import read_da3
 from gsmerge.io.cameras.estimate import estimate_cameras
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
 from gsmerge.io.cameras.sharp import SOURCE as SHARP
-from gsmerge.io.cameras.sharp import read_sharp, stretched
-from gsmerge.io.images import as_tensor, find_image, image_size, list_images, read_images
+from gsmerge.io.cameras.sharp import read_sharp
+from gsmerge.io.grid import Photos, photo_size
+from gsmerge.io.images import as_tensor, decode_images, find_image, image_size, list_images
+from gsmerge.io.mapping import stretch
 from gsmerge.io.ply import PlyScene
 from gsmerge.io.scene_files import SceneFiles
 
@@ -55,23 +57,30 @@ def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
     Raises:
         SceneError: As :func:`gsmerge.io.read_images`.
     """
-    images = _stored_photos(files, camera_file)
-    if images is not None and camera_file.source == SHARP:
-        return stretched(images, int(camera_file.widths[0]), int(camera_file.heights[0]))
-    return images
+    photos = stored_photos(files, camera_file)
+    return None if photos is None else as_tensor(photos)
 
 
-def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
+def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
+    """:func:`read_photos` as c arrays ``[h,w,3]`` uint8."""
+    photos = _stored_photos(files, camera_file)
+    size = int(camera_file.widths[0]), int(camera_file.heights[0])
+    if photos is None or camera_file.source != SHARP or photo_size(photos) == size:
+        return photos
+    return stretch((photos[0].shape[1], photos[0].shape[0]), size).photos(photos)
+
+
+def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
     if files.images is None:
         folder = Path(camera_file.path).parent
         found = [find_image(folder, name) for name in camera_file.names]
         paths = [f for f in found if f is not None]
-        return read_images(paths, camera_file.names) if len(paths) == len(found) else None
+        return decode_images(paths, camera_file.names) if len(paths) == len(found) else None
     if files.images.suffix != ".npz":
-        return read_images(files.images, camera_file.names)
+        return decode_images(files.images, camera_file.names)
     own = files.cameras is not None and files.cameras.resolve() == files.images.resolve()
     stored = camera_file.images if own else read_da3(files.images).images
     if stored is None or len(stored) != len(camera_file):
         found_count = 0 if stored is None else len(stored)
         raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {found_count}")
-    return as_tensor(stored)
+    return stored

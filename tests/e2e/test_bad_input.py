@@ -68,13 +68,9 @@ def all_nan(scene: Path) -> list[object]:
     return []
 
 
-def flipped_cameras(scene: Path) -> list[object]:
-    """Camera-to-world with OpenCV axes in a file that promises OpenGL ones."""
+def unknown_lens(scene: Path) -> list[object]:
     path = scene / "transforms.json"
-    data = json.loads(path.read_text())
-    for frame in data["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])).tolist()
-    path.write_text(json.dumps(data))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"camera_model": "EQUIRECTANGULAR"}))
     return []
 
 
@@ -156,7 +152,7 @@ CASES: dict[str, tuple[Spoil, int, list[str]]] = {
     "missing columns": (missing_columns, 3, ["scene.ply", "scale_1", "rot_3"]),
     "zero Gaussians": (no_gaussians, 3, ["scene.ply", "at least one Gaussian", "0"]),
     "all NaN": (all_nan, 3, ["scene.ply", "NaN", "30720"]),
-    "wrong convention": (flipped_cameras, 3, ["transforms.json", "OpenCV"]),
+    "unknown lens": (unknown_lens, 3, ["transforms.json", "EQUIRECTANGULAR", "undistort"]),
     "image size": (resized_images, 3, ["96 x 64", "48 x 32"]),
     "fewer images than cameras": (lost_image, 3, ["images", "expected 5", "found 4", "view_03"]),
     "unreadable image": (unreadable_image, 3, ["view_03.png"]),

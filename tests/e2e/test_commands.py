@@ -127,6 +127,36 @@ def test_inspect(made_scene: Path, run: Run) -> None:
     assert (document["count"], document["num_views"], document["width"]) == (30720, VIEWS, WIDTH)
     assert document["opacity_encoding"] == "logit"
     assert document["alignment"]["ok"] is True
+    assert document["alignment_score"] > 0.9
+    assert [view["share_of_pixels"] for view in document["coverage"]] == [1.0] * VIEWS
+    assert "would give about" in outcome.out
+    planned = json.loads(run("compact", made_scene, "--dry-run", "--json").out)
+    assert document["estimate"]["num_gaussians"] == planned["output"]["num_gaussians_at_most"]
+    assert document["estimate"]["memory_bytes"] == planned["estimate"]["memory_bytes"]
+
+
+def test_photos_as_they_were_taken_and_poses_in_another_convention(scene_copy: Path, run: Run) -> None:
+    """Photos of twice the grid's size; poses world-to-camera: found, told, and as good as the usual ones."""
+    path = scene_copy / "transforms.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = np.linalg.inv(np.array(frame["transform_matrix"])).tolist()
+        frame.update({key: 2 * frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h") if key in frame})
+    data.update({key: 2 * data[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h") if key in data})
+    path.write_text(json.dumps(data))
+    outcome = run("compact", scene_copy, *SMALL, "-o", scene_copy / "a.ply")
+    assert outcome.code == 0, outcome.err
+    assert "the poses fit when read as world-to-camera matrices with OpenGL axes" in outcome.err
+    for photo in (scene_copy / "images").iterdir():
+        cv2.imwrite(str(photo), cv2.resize(cv2.imread(str(photo)), (2 * WIDTH, 2 * HEIGHT)))
+    for frame in data["frames"]:
+        frame["transform_matrix"] = np.linalg.inv(np.array(frame["transform_matrix"])).tolist()
+    path.write_text(json.dumps(data))
+    outcome = run("compact", scene_copy, *SMALL, "-o", scene_copy / "b.ply")
+    assert outcome.code == 0, outcome.err
+    assert f"are resized to {WIDTH} x {HEIGHT}, the Gaussian grid's size" in outcome.err
+    counts = [len(gsmerge.read_ply(scene_copy / name).gaussians) for name in ("a.ply", "b.ply")]
+    assert abs(counts[0] - counts[1]) < 0.1 * counts[0]
 
 
 def test_inspect_of_an_unaligned_file_is_no_error(scene_copy: Path, run: Run) -> None:

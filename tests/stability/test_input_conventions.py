@@ -43,14 +43,15 @@ def with_values(folder: Path, change: Callable[[dict], dict]) -> None:
         (np.linalg.inv, "world-to-camera matrices with OpenGL axes"),
     ],
 )
-def test_a_swapped_convention_is_named(
+def test_a_swapped_convention_is_read_and_named(
     scene_copy: Path, change: Callable[[np.ndarray], np.ndarray], reading: str
 ) -> None:
     # world-to-camera with OpenCV axes is FLIP inv(c2w OpenGL); the made scene's own is camera-to-world with OpenGL axes
+    usual = read_scene(scene_copy).cameras.viewmats
     with_poses(scene_copy, change)
-    with pytest.raises(SceneError, match=f"the poses fit when read as {reading}") as error:
-        read_scene(scene_copy)
-    assert "\n" not in str(error.value)
+    loaded = load_scene(scene_copy)
+    assert np.allclose(loaded.scene.cameras.viewmats, usual)
+    assert any(f"the poses fit when read as {reading}" in note for note in loaded.notes)
 
 
 def test_wrong_poses_are_measured(scene_copy: Path) -> None:
@@ -76,10 +77,21 @@ def test_cameras_of_the_original_photos(scene_copy: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [(192, 128), (84, 56), (96, 60)])
-def test_images_of_another_size_name_both(scene_copy: Path, size: tuple[int, int]) -> None:
+def test_images_of_another_size_are_brought_to_the_grid(scene_copy: Path, size: tuple[int, int]) -> None:
+    usual = read_scene(scene_copy).images
     for path in (scene_copy / "images").iterdir():
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), size))
-    with pytest.raises(SceneError, match=f"Gaussian grid's size 96 x 64, found {size[0]} x {size[1]}"):
+    loaded = load_scene(scene_copy)
+    assert float((loaded.scene.images - usual).abs().mean()) < 0.05
+    assert loaded.notes == (
+        f"photos of {size[0]} x {size[1]} are resized to 96 x 64, the cameras' and the Gaussian grid's size",
+    )
+
+
+def test_previews_name_both_sizes(scene_copy: Path) -> None:
+    for path in (scene_copy / "images").iterdir():
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (48, 32)))
+    with pytest.raises(SceneError, match="Gaussian grid's size 96 x 64 or larger, found 48 x 32"):
         read_scene(scene_copy)
 
 

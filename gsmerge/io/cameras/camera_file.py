@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.cameras.lens import Lens
 from gsmerge.types import Cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
+
+MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
 
 # How a format stores poses: direction of the matrix, and the camera's axes.
 Convention = tuple[str, str]
@@ -26,19 +29,20 @@ CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
 @dataclass(frozen=True)
 class CameraFile:
-    """c pinhole cameras in the order of their file.
+    """c cameras in the order of their file.
 
     Args:
         path: The file or folder.
         viewmats: ``[c,4,4]`` world to camera, OpenCV axes, float64.
         Ks: ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5).
-        widths: ``[c]`` int64, pixels; 0 where unknown.
-        heights: ``[c]`` int64, pixels; 0 where unknown.
+        widths: ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it.
+        heights: The same.
         names: Image names as the file gives them.
         source: The format's name.
         convention: How the format stores poses.
         images: ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves.
         order: Order of the Gaussians' rows where the file names it, otherwise "auto".
+        lenses: Of each camera where one of them is no pinhole; empty where all are.
     """
 
     path: str
@@ -51,6 +55,7 @@ class CameraFile:
     convention: Convention = W2C_OPENCV
     images: np.ndarray | None = None
     order: str = "auto"
+    lenses: tuple[Lens | None, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -65,18 +70,20 @@ def make_camera_file(
     sizes: Sequence[tuple[int, int]],
     names: Sequence[str],
     images: np.ndarray | None = None,
+    lenses: Sequence[Lens | None] = (),
 ) -> CameraFile:
-    """Translate poses to the one convention and check that they are poses of pinhole cameras.
+    """Translate poses to the one convention and check that they are poses.
 
     Args:
         path: The file, for messages.
         source: The format's name.
         convention: How ``poses`` are stored.
         poses: c matrices, 3x4 or 4x4.
-        Ks: c matrices 3x3, pixels.
+        Ks: c matrices 3x3, pixels, or all of them divided by the image's size.
         sizes: (width, height) of each camera, pixels; 0 where unknown.
         names: Image names.
         images: ``[c,h,w,3]`` uint8, if the file holds them.
+        lenses: None for a pinhole; empty for pinholes throughout.
 
     Raises:
         SceneError: If there is no camera, a number is not finite, a rotation is none, or a focal length not positive.
@@ -94,6 +101,7 @@ def make_camera_file(
     negative = next((f"{w} x {h}" for w, h in sizes if w < 0 or h < 0), None)
     if negative is not None:
         raise SceneError(path, f"expected a positive image size, found {negative}")
+    K, sizes = _in_pixels(K, sizes)
     return CameraFile(
         path=str(path),
         viewmats=torch.from_numpy(to_viewmats(full, convention)),
@@ -104,7 +112,21 @@ def make_camera_file(
         source=source,
         convention=convention,
         images=images,
+        lenses=tuple(lenses) if any(lenses) else (),
     )
+
+
+def _in_pixels(Ks: np.ndarray, sizes: Sequence[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """Intrinsics that are divided by the image's size, multiplied by it; where it is unknown, that of 1 x 1 pixels."""
+    known = [w > 0 and h > 0 for w, h in sizes]
+    small = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
+    small &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
+    if not small.all() or any(ok and min(size) <= MAX_NORMALISED_FOCAL for ok, size in zip(known, sizes, strict=True)):
+        return Ks, list(sizes)
+    scale = [(w, h, 1) if ok else (1, 1, 1) for ok, (w, h) in zip(known, sizes, strict=True)]
+    return Ks * np.array(scale, np.float64)[:, :, None], [
+        s if ok else (1, 1) for ok, s in zip(known, sizes, strict=True)
+    ]
 
 
 def _check(path: str | os.PathLike[str], poses: np.ndarray, Ks: np.ndarray, names: Sequence[str]) -> None:
@@ -140,6 +162,7 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     """The named views, in that order."""
     ids = list(view_ids)
+    lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     return replace(
         cameras,
         viewmats=cameras.viewmats[ids],
@@ -148,7 +171,14 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
         heights=cameras.heights[ids],
         names=tuple(cameras.names[i] for i in ids),
         images=None if cameras.images is None else cameras.images[ids],
+        lenses=lenses if any(lenses) else (),
     )
+
+
+def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
+    """All (width, height) that the file's cameras are known to have."""
+    found = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
+    return [(w, h) for w, h in found if min(w, h) > 0 and (w, h) != (1, 1)]
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
@@ -160,15 +190,22 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
             the file's size.
 
     Raises:
-        SceneError: If no size is given and the file's cameras have none, or several.
+        SceneError: If no size is given and the file's cameras have none, or several; or a lens is no pinhole.
     """
+    if camera_file.lenses:
+        name, lens = next((n, x) for n, x in zip(camera_file.names, camera_file.lenses, strict=True) if x is not None)
+        raise SceneError(
+            camera_file.path,
+            f"view {name}: expected a pinhole camera, found {lens.name} with lens distortion",
+            "undistort the images first",
+        )
     found = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
     if size is None:
         if len(found) > 1:
             sizes = " and ".join(f"{w} x {h}" for w, h in found[:2])
             raise SceneError(camera_file.path, f"expected cameras of one image size, found {sizes}")
         size = found[0]
-        if 0 in size:
+        if 0 in size or size == (1, 1):
             raise SceneError(camera_file.path, "expected the image size (w, h) of the cameras, found none")
     known = (camera_file.widths > 0) & (camera_file.heights > 0)
     scale = torch.ones(len(camera_file), 3, dtype=torch.float64)

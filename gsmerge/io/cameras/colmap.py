@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+from gsmerge.io.cameras.lens import Lens, fisheye, perspective
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -18,10 +19,11 @@ _MODELS = (
 )  # fmt: skip
 _NAMES = {number: name for number, name, _ in _MODELS}
 _NUM_PARAMS = {name: count for _, name, count in _MODELS}
-_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}
-_PERSPECTIVE = {*_ONE_FOCAL, "PINHOLE", "OPENCV", "FULL_OPENCV"}  # pinhole cameras if all distortion is zero
+_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
-_Camera = tuple[np.ndarray, tuple[int, int]]  # K [3,3], (width, height)
+_Camera = tuple[np.ndarray, tuple[int, int], Lens | None]  # K [3,3], (width, height)
 _Image = tuple[str, int, list[float]]  # name, camera id, quaternion wxyz and translation
 
 
@@ -34,7 +36,7 @@ def read_colmap(folder: Path) -> CameraFile:
     """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes.
 
     Raises:
-        SceneError: If a file is missing or damaged, or a lens is distorted.
+        SceneError: If a file is missing or damaged, or a lens of an unknown kind.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"
@@ -61,6 +63,7 @@ def read_colmap(folder: Path) -> CameraFile:
         [cameras[camera][0] for _, camera, _ in images],
         [cameras[camera][1] for _, camera, _ in images],
         [name for name, _, _ in images],
+        lenses=[cameras[camera][2] for _, camera, _ in images],
     )
 
 
@@ -76,19 +79,17 @@ def _pose(numbers: list[float]) -> np.ndarray:
 
 
 def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> _Camera:
-    if model not in _PERSPECTIVE:
+    if model not in _PERSPECTIVE | _FISHEYE:
         raise SceneError(
-            path, f"camera {camera_id}: expected a pinhole camera, found {model}", "undistort the images first"
+            path,
+            f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}",
+            "undistort the images first",
         )
     one = model in _ONE_FOCAL
     fx, fy, cx, cy = (params[0], params[0], *params[1:3]) if one else params[:4]
-    if any(params[3 if one else 4 : _NUM_PARAMS[model]]):
-        raise SceneError(
-            path,
-            f"camera {camera_id}: expected a pinhole camera, found {model} with lens distortion",
-            "undistort the images first",
-        )
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size
+    bent = params[3 if one else 4 : _NUM_PARAMS[model]]
+    lens = fisheye(model, bent) if model in _FISHEYE else perspective(model, bent)
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size, lens
 
 
 def _binary_cameras(path: Path, data: bytes) -> dict[int, _Camera]:

@@ -51,9 +51,6 @@ def read_dump(path: Path) -> CameraFile:
         raise SceneError(path, f"expected c2w [v,4,4] and K [v,3,3], found {poses.shape} and {Ks.shape}")
     images = as_images(path, arrays["images"], len(poses))
     height, width = images.shape[1:3]
-    Ks = Ks.astype(np.float64)
-    normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2)
-    Ks[normalised] *= np.array([[width], [height], [1.0]])
     order = str(arrays["order"]) if "order" in arrays else "auto"
     if order not in ORDERS:
         raise SceneError(path, f"expected 'order' to be one of {', '.join(ORDERS)}, found {order[:40]!r}")

@@ -58,7 +58,7 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
 
     Raises:
-        SceneError: If there are no cameras, a file is damaged or incomplete, or a lens is distorted.
+        SceneError: If there are no cameras, a file is damaged or incomplete, or a lens of an unknown kind.
     """
     path = Path(path)
     if not os.path.exists(path):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
 from plyfile import PlyData, PlyParseError
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
@@ -44,14 +41,3 @@ def read_sharp(path: Path) -> CameraFile | None:
         intrinsic = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
     K = intrinsic.reshape(3, 3) * np.array([[side / size[0]], [side / size[1]], [1.0]])
     return make_camera_file(path, SOURCE, W2C_OPENCV, [extrinsic.reshape(-1, 4)], [K], [(side, side)], [path.stem])
-
-
-def stretched(images: Tensor, width: int, height: int) -> Tensor:
-    """``[v,h,w,3]`` photos stretched to another size."""
-    if tuple(images.shape[1:3]) == (height, width):
-        return images
-    shrinks = images.shape[1] * images.shape[2] > width * height
-    kind = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return torch.from_numpy(
-        np.stack([cv2.resize(image, (width, height), interpolation=kind) for image in images.numpy()])
-    )

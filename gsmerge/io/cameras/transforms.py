@@ -11,10 +11,13 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, CameraFile, make_camera_file
+from gsmerge.io.cameras.lens import Lens, fisheye, perspective
 from gsmerge.io.images import find_image, image_size
 
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-_PINHOLE = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE", "RADIAL", "SIMPLE_RADIAL"}
+_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
+_BENT = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_BENT}
+_UNDISTORT = "undistort the images first"
 
 
 def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFile:
@@ -25,20 +28,21 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
     view. ``applied_transform`` is not applied: poses are as the Gaussians' world has them.
 
     Raises:
-        SceneError: If a pose or an intrinsic is missing, or a lens is distorted.
+        SceneError: If a pose or an intrinsic is missing, or a lens of an unknown kind.
     """
     bare = isinstance(data, list)
     common: Mapping[str, Any] = {} if isinstance(data, list) else data
     frames = data if isinstance(data, list) else data["frames"]
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
-    poses, Ks, sizes, names = [], [], [], []
+    poses, Ks, sizes, names, lenses = [], [], [], [], []
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path") or frame.get("image_path") or frame.get("name") or f"view {i}")
         if "transform_matrix" not in frame:
             raise SceneError(path, f"view {name}: expected 'transform_matrix', found none")
         try:
             poses.append(np.array(frame["transform_matrix"], np.float64))
+            lenses.append(_lens(path, name, {**common, **frame}))
             K, size = _intrinsics(path, name, {**common, **frame})
         except (TypeError, ValueError, ArithmeticError) as error:
             raise SceneError(path, f"view {name}: expected numbers ({error})") from error
@@ -46,12 +50,12 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
         Ks.append(K)
         sizes.append(size)
     source = "frame list" if bare else "transforms.json"
-    return make_camera_file(path, source, C2W_OPENCV if bare else C2W_OPENGL, poses, Ks, sizes, names)
+    convention = C2W_OPENCV if bare else C2W_OPENGL
+    return make_camera_file(path, source, convention, poses, Ks, sizes, names, lenses=lenses)
 
 
 def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
     """Intrinsics [3,3] and (width, height) of one frame, its own values before the global ones."""
-    _refuse_distortion(path, name, values)
     width, height = float(values.get("w") or 0), float(values.get("h") or 0)
     has_focal = any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
     if has_focal and not (width and height) and not {"fl_x", "cx", "cy"} <= values.keys():
@@ -82,10 +86,21 @@ def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
     return 0.0
 
 
-def _refuse_distortion(path: Path, name: str, values: Mapping[str, Any]) -> None:
+def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
+    """The lens of one frame, None for a pinhole."""
     model = str(values.get("camera_model", "PINHOLE")).upper()
-    coefficients = [float(values.get(key) or 0) for key in _DISTORTION]
-    coefficients += [float(value) for value in values.get("distortion_params") or ()]
-    if model not in _PINHOLE or values.get("is_fisheye") or any(coefficients):
-        what = f"camera model {model}" if model not in _PINHOLE else "lens distortion"
-        raise SceneError(path, f"view {name}: expected a pinhole camera, found {what}", "undistort the images first")
+    found = {key: float(values.get(key) or 0) for key in (*_PARAMS, "k5", "k6")}
+    listed = [float(value) for value in values.get("distortion_params") or ()]
+    if not any(found.values()):
+        found |= dict(zip(_PARAMS, listed, strict=False))
+    if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
+        return fisheye("OPENCV_FISHEYE", [found[key] for key in ("k1", "k2", "k3", "k4")])
+    odd = next((key for key in ("k4", "k5", "k6") if found[key]), None)
+    if model not in _PERSPECTIVE or odd is not None:
+        what = (
+            f"camera model {model}" if odd is None else f"lens distortion {odd}, which formats understand differently"
+        )
+        raise SceneError(
+            path, f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {what}", _UNDISTORT
+        )
+    return perspective(model if model in _BENT else "OPENCV", [found[key] for key in ("k1", "k2", "p1", "p2", "k3")])

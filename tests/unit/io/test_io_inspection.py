@@ -6,11 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from exports import smooth_scene
 from tiny_scene import Tiny
 
+from gsmerge import compact, read_scene
 from gsmerge.errors import SceneError
+from gsmerge.extents import extents
 from gsmerge.inspect import inspect
 from gsmerge.io import write_ply
+from gsmerge.report import inspection_lines
 
 
 def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
@@ -83,3 +87,83 @@ def test_an_unreadable_ply_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "scene.ply").write_text("hello")
     with pytest.raises(SceneError, match="does not start with the line 'ply'"):
         inspect(tmp_path)
+
+
+def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> None:
+    means, scales = tiny.gaussians.means.clone(), tiny.gaussians.scales.clone()
+    means[:7] += 1000
+    scales[:21, 1] = 50
+    write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, means=means, scales=scales), overwrite=True)
+    found = inspect(tiny_folder).extents
+    assert found.share_outliers == pytest.approx(7 / 840)
+    assert found.share_huge == pytest.approx(21 / 840)
+    assert found.scale_max == pytest.approx(50)
+    assert 0.01 < found.scale_median < 0.11
+    low, high = (torch.tensor(side) for side in (found.box_low, found.box_high))
+    assert found.diagonal == pytest.approx(float((high - low).norm()))
+
+
+def test_an_empty_or_single_point_has_extents(tiny: Tiny) -> None:
+    assert extents(tiny.gaussians[:0]).share_outliers == 0
+    one = extents(tiny.gaussians[:1])
+    assert one.diagonal == 0
+    assert one.share_outliers == 0
+
+
+def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
+    opacities = tiny.gaussians.opacities.clone()
+    opacities[280:350] = 0
+    write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, opacities=opacities), overwrite=True)
+    found = inspect(tiny_folder)
+    assert [view.share_of_pixels for view in found.coverage] == [1, 0.75, 1]
+    assert [view.name for view in found.coverage] == [f"images/{name}" for name in tiny.names]
+    for view, w2c in zip(found.coverage, tiny.w2c, strict=True):
+        image = (tiny.gaussians.means.double().numpy() @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
+        xy = image[:, :2] / image[:, 2:]
+        inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < (20, 14)).all(1)
+        assert view.share_of_gaussians == pytest.approx(inside.mean())
+    assert found.alignment_score == 1
+    assert found.alignment_margin is not None
+    assert found.alignment_margin > 2
+    assert found.num_saturated == 70
+    assert found.sight is not None
+    assert found.sight.share_seen == 1
+
+
+def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
+    found = inspect(tiny_folder)
+    assert found.estimate is not None
+    result = compact(read_scene(tiny_folder), fit="none")
+    assert found.estimate["num_gaussians"] == pytest.approx(len(result.gaussians), abs=3)
+    write_ply(tmp_path / "small.ply", result.gaussians)
+    assert found.estimate["bytes"] == pytest.approx((tmp_path / "small.ply").stat().st_size, abs=3 * 68)
+    assert found.estimate["ratio"] == found.estimate["num_gaussians"] / 840
+    assert found.estimate["seconds"] > 0
+    assert found.estimate["memory_bytes"] > 1e8
+
+
+def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
+    smooth = smooth_scene(40, 30)
+    some = torch.randperm(3600, generator=torch.Generator().manual_seed(0))[:2400]
+    folder = replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
+    found = inspect(folder)
+    assert found.alignment_score is None
+    assert found.sight is not None
+    assert found.sight.ok
+    assert [view.share_of_pixels for view in found.coverage] == [None] * 3
+    assert min(view.share_of_gaussians for view in found.coverage) > 0.2
+    assert found.estimate is not None
+    lines = "\n".join(inspection_lines(found.to_dict()))
+    assert "of the Gaussians per view, least in images/" in lines
+    assert "compact    would give about" in lines
+    alone = inspect(folder / "scene.ply", cameras=folder / "transforms.json", order="none")
+    assert alone.estimate is not None
+    (folder / "transforms.json").unlink()
+    alone = inspect(folder, order="none")
+    assert alone.coverage == ()
+    assert alone.sight is None
+    assert alone.estimate is not None
+    assert "coverage" not in "\n".join(inspection_lines(alone.to_dict()))
+    none = inspect(folder)
+    assert none.estimate is None
+    assert "compact" not in "\n".join(inspection_lines(none.to_dict()))

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -158,13 +157,6 @@ def test_missing_cameras_are_counted(tmp_path: Path, tiny: Tiny) -> None:
         read_scene(folder)
 
 
-def test_images_that_are_not_the_grid_s(tiny_folder: Path, tiny: Tiny) -> None:
-    for name, image in zip(tiny.names, tiny.images, strict=True):
-        cv2.imwrite(str(tiny_folder / "images" / name), cv2.resize(image, (40, 28)))
-    with pytest.raises(SceneError, match="images: expected images of the Gaussian grid's size 20 x 14, found 40 x 28"):
-        read_scene(tiny_folder)
-
-
 def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
     with pytest.raises(SceneError, match=r"expected cameras of the images' size 20 x 14 .* found 30 x 14; crop"):
@@ -192,19 +184,6 @@ def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path)
     write_npz(tmp_path / "two.npz", tiny, image=tiny.images[:2], **two)
     with pytest.raises(SceneError, match="expected 3 images, one per camera, found 2"):
         read_scene(tiny_folder, images=tmp_path / "two.npz")
-
-
-def test_the_wrong_convention_says_which_would_fit(tiny_folder: Path, tiny: Tiny) -> None:
-    def opencv(data: dict) -> None:
-        for frame, pose in zip(data["frames"], tiny.c2w, strict=True):
-            frame["transform_matrix"] = pose.tolist()
-
-    rewrite(tiny_folder / "transforms.json", opencv)
-    with pytest.raises(SceneError) as error:
-        read_scene(tiny_folder)
-    assert "own pixels, found a median of up to inf px and" in str(error.value)
-    assert "the poses fit when read as camera-to-world matrices with OpenCV axes" in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder: Path, tiny: Tiny) -> None:

@@ -1,0 +1,144 @@
+"""Cameras, photos and rows brought together: as they stand, at another size, or with the poses read in another way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.grid import Fit, Photos, as_is, mapped, photo_size, small_photos
+from gsmerge.io.images import as_tensor, natural_key
+from gsmerge.io.ply import PlyScene
+from gsmerge.io.poses import aligned_poses, poses_note, reread, with_poses
+from gsmerge.io.recover import MARGIN, Clues, Recovery, color_error, recover
+
+_LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
+_ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid that only the photos' colours can tell apart
+_MOST = 6  # fits that only the number of rows speaks for and that are tried with all frames
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What was found.
+
+    Args:
+        clues: The cameras and photos at the size of the grid.
+        recovery: Which row is which pixel; None where the rows belong to no pixels that could be found.
+        camera_file: The cameras as they were read in the end.
+        notes: What was adapted.
+    """
+
+    clues: Clues
+    recovery: Recovery | None
+    camera_file: CameraFile
+    notes: list[str]
+
+
+def fit_cameras(
+    ply: PlyScene, camera_file: CameraFile, photos: Photos | None, *, order: str = "auto", scale: float | None = None
+) -> Fitted:
+    """Find the size, the mapping of the photos and the convention of the poses under which the rows are pixels.
+
+    Args:
+        ply: The Gaussians.
+        camera_file: The cameras.
+        photos: c uint8 photos of one size, or None.
+        order: Of the rows, where it is told.
+        scale: Of the Gaussians' world in units of the cameras', where it is told.
+
+    Raises:
+        SceneError: If sizes do not agree, or several conventions fit.
+    """
+    clues_of = partial(_clues, ply, camera_file, photos=photos, order=order, scale=scale)
+    size = photo_size(photos)
+    try:
+        plain, problem = as_is(camera_file, size), None
+    except SceneError as error:
+        plain, problem = None, error
+    searched = order == "none"
+    if not searched and (plain is None or _is_large(ply, plain)):
+        searched = True
+        found = _other_size(ply, camera_file, size, clues_of)
+        if found is not None:
+            return Fitted(found[0], found[1], camera_file, list(found[2].notes))
+    if plain is None:
+        raise problem or SceneError(camera_file.path, "expected the image size of the cameras, found none")
+    clues, notes = clues_of(plain), list(plain.notes)
+    recovery = recover(clues)
+    if recovery is None and not searched:
+        found = _other_size(ply, camera_file, size, clues_of)
+        if found is not None:
+            return Fitted(found[0], found[1], camera_file, list(found[2].notes))
+    other = aligned_poses(clues, camera_file) if recovery is None else None
+    if other is not None:
+        poses, recovery = other
+        notes.append(poses_note(poses, camera_file.convention))
+        clues = replace(clues, cameras=with_poses(clues.cameras, poses.viewmats))
+        camera_file = reread(camera_file, poses.convention)
+    small = small_photos(ply.info, camera_file, size) if recovery is None and order != "none" else None
+    if small is not None:
+        raise small
+    return Fitted(clues, recovery, camera_file, notes)
+
+
+def _is_large(ply: PlyScene, plain: Fit) -> bool:
+    pixels = len(plain.cameras) * plain.cameras.width * plain.cameras.height
+    return pixels > _LARGE * len(ply.gaussians)
+
+
+def _clues(
+    ply: PlyScene, camera_file: CameraFile, one: Fit, *, photos: Photos | None, order: str, scale: float | None
+) -> Clues:
+    brought = photos if photos is None or one.mapping is None else one.mapping.photos(photos)
+    images = None if brought is None else as_tensor(brought)
+    depths: Callable[[], np.ndarray | None] = partial(read_depths, Path(camera_file.path))
+    return Clues(ply.gaussians, ply.valid, one.cameras, images, _labellings(camera_file.names), depths, order, scale)
+
+
+def _labellings(names: Sequence[str]) -> list[list[int]]:
+    """Orders that the views may be in: that of the camera file, and that of the images' names."""
+    return [list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))]
+
+
+def _other_size(
+    ply: PlyScene, camera_file: CameraFile, size: tuple[int, int] | None, clues_of: Callable[..., Clues]
+) -> tuple[Clues, Recovery, Fit] | None:
+    """The fit at another size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
+
+    Those that only the number of rows speaks for are tried in the frame of the cameras first: there may be many.
+    """
+    found: list[tuple[Fit, Recovery]] = []
+    guesses: list[Fit] = []
+    for one in mapped(ply.info, camera_file, size):
+        if found and one.rank > found[0][0].rank:
+            break
+        if one.guessed:
+            guesses.append(one)
+        recovery = recover(clues_of(one, photos=None), exact_frames=one.guessed)
+        found += [] if recovery is None else [(one, recovery)]
+    for one in guesses[:_MOST] if not found else []:
+        recovery = recover(clues_of(one, photos=None))
+        found += [] if recovery is None else [(one, recovery)]
+    if not found:
+        return None
+    best = min(found, key=lambda f: f[1].best.worst_px)
+    px = best[1].best.worst_px
+    exact = best[1].best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
+    if exact and any(_grid(f) != _grid(best) and f[1].best.worst_px < MARGIN * max(px, 1e-3) for f in found):
+        return None
+    near = max(_ALIKE * px, px + _ALIKE_PX)
+    alike = [f for f in found if _grid(f) == _grid(best) and f[1].best.worst_px <= near]
+    brought = [(clues_of(one), recovery, one) for one, recovery in alike]
+    if len(brought) == 1:
+        return brought[0]
+    return min(brought, key=lambda f: np.nan_to_num(color_error(f[0], f[1].best.layout), nan=1.0))
+
+
+def _grid(found: tuple[Fit, Recovery]) -> tuple[int, int]:
+    return found[0].cameras.width, found[0].cameras.height
