@@ -21,7 +21,7 @@ SECONDS = 10
 BYTES = 2**30
 
 COMPACTED = ("one position 1e30", "half of the positions NaN", "colours 1e38", "opacities 1e38", "scales 1e38",
-             "scales -inf", "rotations 1e38")  # fmt: skip
+             "rotations 1e38")  # fmt: skip
 COMPACTED = tuple(f"ply: {name}" for name in COMPACTED)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
@@ -99,7 +99,7 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, ru
     assert case.named in outcome.err
 
 
-@pytest.mark.parametrize("name", list(CASES)[::8])
+@pytest.mark.parametrize("name", list(CASES)[::12])
 def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> None:
     arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
     with limits():

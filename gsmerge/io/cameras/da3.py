@@ -30,7 +30,7 @@ def read_da3(path: Path) -> CameraFile:
     if poses is None or Ks is None:
         missing = [names[0] for names, a in ((_EXTRINSICS, poses), (_INTRINSICS, Ks)) if a is None]
         raise SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
-    check_poses(path, poses, Ks, ("extrinsics", "intrinsics"))
+    check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
     images, depths = _first(arrays, _IMAGES), _first(arrays, _DEPTHS)
     if images is not None:
         images = as_images(path, images, len(poses))
@@ -69,7 +69,13 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 
 
 def check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str, str]) -> None:
-    """Refuse poses and intrinsics that are not v matrices of finite numbers.
+    """Refuse poses and intrinsics that are not as many matrices of finite numbers.
+
+    Args:
+        path: The file, for messages.
+        poses: What should be ``[c,3,4]`` or ``[c,4,4]``.
+        Ks: What should be ``[c,3,3]``.
+        names: What to call the two, with their shapes.
 
     Raises:
         SceneError: If they are not.
@@ -78,9 +84,7 @@ def check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str,
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
     if poses.ndim != 3 or len(poses) == 0 or Ks.shape != (len(poses), 3, 3):
-        raise SceneError(
-            path, f"expected {names[0]} [v,4,4] and {names[1]} [v,3,3], found {poses.shape} and {Ks.shape}"
-        )
+        raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
     if not (
         np.isfinite(poses).all() and np.isfinite(Ks).all() and np.abs(Ks.astype(np.float64)).max() < _MAX_INTRINSIC
     ):

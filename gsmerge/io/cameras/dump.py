@@ -37,7 +37,7 @@ def read_dump(path: Path) -> CameraFile:
     if missing:
         raise SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
     poses, Ks = arrays["c2w"], arrays["K"]
-    check_poses(path, poses, Ks, ("c2w", "K"))
+    check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
     images = as_images(path, arrays["images"], len(poses))
     height, width = images.shape[1:3]
     Ks = Ks.astype(np.float64)

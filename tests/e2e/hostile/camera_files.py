@@ -52,7 +52,6 @@ def _transforms() -> dict[str, Case]:
     cases |= {f"position {word}": Case(edit_json(name, set_pose(v)), EITHER) for word, v in NUMBERS.items()}
     cases |= {f"pose of {w}": Case(edit_json(name, set_first("transform_matrix", v))) for w, v in poses.items()}
     cases |= {f"with {word}": Case(write(name, json.dumps(data))) for word, data in contents.items()}
-    cases |= {f"path {w}": Case(edit_json(name, all_places(v)), EITHER) for w, v in places.items()}
     cases |= {f"path {w}, no images": Case(without_images(all_places(v)), EITHER) for w, v in places.items()}
     cases["path with line breaks and no pose"] = Case(edit_json(name, no_pose("a\nb\r\n\x1b[2Jc")))
     return {f"transforms: {word}": Case(c.spoil, c.codes, name) for word, c in cases.items()} | _raw_json(name)

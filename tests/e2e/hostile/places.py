@@ -95,7 +95,7 @@ def in_images(make: Callable[[Path], object]) -> Spoil:
 
 
 def many_images(folder: Path) -> None:
-    for i in range(3000):
+    for i in range(500):
         (folder / "images" / f"other_{i}.png").write_bytes(b"")
 
 
@@ -108,7 +108,7 @@ NAMES = {
 
 CASES = {f"folder with {word}": Case(renamed(name), READ) for word, name in NAMES.items()}
 CASES["folder with a dash"] = Case(lambda folder: [folder.rename(folder.parent / "-scene")], READ)
-CASES |= {f"ply with {word}": Case(named_ply(name[:240] + ".ply"), READ) for word, name in NAMES.items()}
+CASES |= {f"ply with {word}": Case(named_ply(name[:240] + ".ply"), READ) for word, name in list(NAMES.items())[:5]}
 CASES |= {
     f"images with {word}": Case(images_named(name), READ)
     for word, name in {"spaces": "a b  %d", "Unicode": "\u00e4\u6f22 %d", "many digits": "1" * 200 + "%d"}.items()
@@ -129,7 +129,7 @@ CASES |= {
     "images in an endless folder": Case(replaced("images", endless), EITHER),
     "an endless folder beside the images": Case(given(make=lambda folder: endless(folder / "images" / "more")), READ),
     "a path of 2000 letters": Case(deep, READ),
-    "3000 empty images": Case(given(make=many_images), READ),
+    "500 empty images": Case(given(make=many_images), READ),
     "a device as the scene": Case(lambda folder: ["/dev/zero"]),
     "nothing as the scene": Case(lambda folder: ["/dev/null"]),
     "a device as cameras": Case(given("--cameras", "/dev/zero")),
