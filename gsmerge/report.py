@@ -298,9 +298,10 @@ def inspection_lines(found: Mapping[str, Any]) -> list[str]:
     if found["alignment_problem"] is not None:
         lines.append(f"alignment  not one Gaussian per pixel: {found['alignment_problem']}")
     elif alignment is not None:
+        worst = max(m for m in alignment["median_px"] if m is not None)
         lines.append(
             f"alignment  one Gaussian per pixel, {found['num_views']} x {found['height']} x {found['width']}"
-            f" ({found['rows']}); median offset {max(alignment['median_px']):.2f} px in the worst view,"
+            f" ({found['rows']}); median offset {worst:.2f} px in the worst view,"
             f" {100 * found['alignment_score']:.1f} % within 1 px"
         )
     lines += _view_lines(found) + _estimate_lines(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
 
@@ -15,6 +16,7 @@ def main(args: Sequence[str] | None = None) -> int:
         0 done, 1 something unforeseen, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
         130 interrupted.
     """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what it has to say about a damaged image is said by us
     from gsmerge.cli.app import run
 
     return run(args)

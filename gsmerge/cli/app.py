@@ -11,7 +11,7 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli.compact import compact
-from gsmerge.cli.console import plain_warnings
+from gsmerge.cli.console import one_line, plain_warnings
 from gsmerge.cli.inspect import inspect
 from gsmerge.cli.options import debug_wanted, set_debug
 from gsmerge.cli.preview import preview
@@ -50,7 +50,7 @@ def root(
 def _fail(message: str, code: int) -> int:
     if debug_wanted():
         traceback.print_exc()
-    print(f"{PROGRAM}: error: {message}", file=sys.stderr)
+    print(one_line(f"{PROGRAM}: error: {message}"), file=sys.stderr)
     return code
 
 

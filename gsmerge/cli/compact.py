@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
+from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, default_output, input_files, level_output
 from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
 from gsmerge.errors import TargetError
@@ -179,7 +179,7 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        print("\n".join(summary_lines(document)))
+        print("\n".join(map(one_line, summary_lines(document))))
 
 
 def _print_plan(
@@ -213,4 +213,4 @@ def _print_plan(
     if as_json:
         sys.stdout.write(to_json(document))
     else:
-        print("\n".join(plan_lines(document)))
+        print("\n".join(map(one_line, plan_lines(document))))

@@ -12,11 +12,19 @@ from typing import Any
 
 Progress = Callable[[str, int, int], None]
 
+MAX_LINE = 5000  # characters
+
+
+def one_line(text: str) -> str:
+    """Text from files or names as one line that does nothing to a terminal: what cannot be printed is escaped."""
+    clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
+
 
 def say(message: str, *, quiet: bool = False) -> None:
     """Print one status line on stderr unless ``quiet``."""
     if not quiet:
-        print(message, file=sys.stderr, flush=True)
+        print(one_line(message), file=sys.stderr, flush=True)
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from gsmerge.cli import options as opt
+from gsmerge.cli.console import one_line
 from gsmerge.cli.settings import reading_of
 
 
@@ -30,4 +31,4 @@ def inspect(
     if json:
         sys.stdout.write(to_json({**document_head(), **found}))
     elif not quiet:
-        print("\n".join(inspection_lines(found)))
+        print("\n".join(map(one_line, inspection_lines(found))))

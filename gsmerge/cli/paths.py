@@ -36,10 +36,11 @@ def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
     """
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
-    target = output.resolve()
-    if any(path.resolve() in (target, target.parent if _is_photo(target) else target) for path in inputs):
+    target = Path(os.path.realpath(output))
+    refused = (str(target), str(target.parent if _is_photo(target) else target))
+    if any(os.path.realpath(path) in refused for path in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
-    if output.exists() and not overwrite:
+    if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
     if not output.parent.is_dir():
         raise SceneError(output, f"expected a folder to write to, found no {output.parent}", "make it first")
@@ -78,7 +79,7 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
         occupied = there == folder and next(folder.iterdir(), None) is not None
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})", "name another with --output") from error
-    if any(folder.resolve() == path.resolve() for path in inputs):
+    if any(os.path.realpath(folder) == os.path.realpath(path) for path in inputs):
         raise UsageError(f"{folder}: expected an output other than the input; name another folder with --output")
     if not os.access(there, os.W_OK | os.X_OK):
         raise SceneError(folder, f"cannot be written: no permission for {there}", "name another with --output")

@@ -38,12 +38,12 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         SceneError: If chunks are missing or lack a column.
     """
     vertex, chunk = data["vertex"], data["chunk"]
-    for element, needed in ((vertex, PACKED), (chunk, _RANGES)):
-        plain = {p.name for p in element.properties if not isinstance(p, PlyListProperty)}
-        missing = [name for name in needed if name not in plain]
-        if missing:
-            where = f"in element '{element.name}' of a compressed file"
-            raise SceneError(path, f"expected {missing[0]} {where}, found none")
+    for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, _RANGES, ("f4", "f8"))):
+        found = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
+        odd = next((name for name in needed if found.get(name) not in types), None)
+        if odd is not None:
+            where, kind = f"in element '{element.name}' of a compressed file", found.get(odd, "none")
+            raise SceneError(path, f"expected {odd} {where} as {types[0]}, found {kind}")
     count = vertex.count
     if count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
@@ -52,7 +52,9 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
             path, f"expected {-(-count // CHUNK)} chunks for {count} Gaussians, found {chunk.count}", "export it again"
         )
     ids = np.arange(count) // CHUNK
-    ranges = {p.name: np.asarray(chunk[p.name], np.float32)[ids] for p in chunk.properties}
+    colors = [p.name for p in chunk.properties if p.name in _COLORS and p.val_dtype in ("f4", "f8")]
+    with np.errstate(all="ignore"):  # what is not finite is set aside later
+        ranges = {name: np.asarray(chunk[name], np.float32)[ids] for name in (*_RANGES, *colors)}
     num_rest = _num_rest(path, data, count)
     names = [*REQUIRED, *(f"f_rest_{i}" for i in range(num_rest))]
     rows = np.empty(count, [(name, "<f4") for name in names])
@@ -71,7 +73,7 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
 def _num_rest(path: Path, data: PlyData, count: int) -> int:
     if "sh" not in data:
         return 0
-    names = {p.name for p in data["sh"].properties}
+    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}
     number = len(names)
     if number not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(number)} or data["sh"].count != count:
         raise SceneError(path, f"expected 9, 24 or 45 harmonics for {count} Gaussians in element 'sh', found others")
@@ -85,7 +87,8 @@ def _fill_vectors(
     for name, axis, shift, bits in zip(names, "xyz", (21, 11, 0), (11, 10, 11), strict=True):
         part = ((words >> np.uint32(shift)) & np.uint32(2**bits - 1)) / np.float32(2**bits - 1)
         low, high = ranges[f"min_{prefix}{axis}"], ranges[f"max_{prefix}{axis}"]
-        rows[name] = low * (1 - part) + high * part
+        with np.errstate(all="ignore"):
+            rows[name] = low * (1 - part) + high * part
 
 
 def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
@@ -112,5 +115,7 @@ def _fill_colors(rows: np.ndarray, words: np.ndarray, ranges: dict[str, np.ndarr
     for name, channel, shift in zip(SH0, "rgb", (24, 16, 8), strict=True):
         color = ((words >> np.uint32(shift)) & np.uint32(255)) / 255.0
         if all(key in ranges for key in _COLORS):
-            color = ranges[f"min_{channel}"] * (1 - color) + ranges[f"max_{channel}"] * color
+            low, high = ranges[f"min_{channel}"], ranges[f"max_{channel}"]
+            with np.errstate(all="ignore"):
+                color = low * (1 - color) + high * color
         rows[name] = (color - 0.5) / SH_C0

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.image_header import stored_size
 from gsmerge.threads import parallel_map
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
@@ -41,12 +42,12 @@ def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
 def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]:
     """:func:`read_images` as c arrays ``[h,w,3]`` uint8."""
     paths = match_images(source, names)
-    decoded = parallel_map(_decode, paths)
-    for path, image in zip(paths, decoded, strict=True):
-        if image.shape != decoded[0].shape:
-            (h0, w0), (h, w) = decoded[0].shape[:2], image.shape[:2]
+    sizes = [stored_size(path) for path in paths]
+    for path, (w, h) in zip(paths, sizes, strict=True):
+        if (w, h) != sizes[0]:
+            w0, h0 = sizes[0]
             raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
-    return decoded
+    return parallel_map(_decode, paths)
 
 
 def as_tensor(images: Sequence[np.ndarray] | np.ndarray) -> Tensor:
@@ -94,22 +95,20 @@ def list_images(folder: Path) -> list[Path]:
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key that puts "view 2" before "view 10"."""
-    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"([0-9]+)", name) if p]
+    parts = [(p, p.lstrip("0")) for p in re.split(r"([0-9]+)", name) if p]
+    return [(0, len(digits), digits) if p[0] in "0123456789" else (1, 0, p) for p, digits in parts]
 
 
 def find_image(folder: Path, name: str) -> Path | None:
     """The image that a camera file beside it names, with or without its extension; None where there is none."""
-    path = folder / name
-    if path.is_file():
-        return path
-    candidates = [path.with_name(path.name + suffix) for suffix in sorted(IMAGE_SUFFIXES)]
-    return next((c for c in candidates if c.is_file()), None)
+    path = os.path.join(folder, name)
+    candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
+    return next((Path(c) for c in candidates if os.path.isfile(c)), None)
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of an image, pixels."""
-    height, width = _decode(path).shape[:2]
-    return width, height
+    return stored_size(path)
 
 
 def _index(relative: Sequence[Path], files: Sequence[Path]) -> dict[str, list[Path]]:
@@ -125,7 +124,7 @@ def _index(relative: Sequence[Path], files: Sequence[Path]) -> dict[str, list[Pa
 
 
 def _lookup(root: Path, keys: dict[str, list[Path]], name: str) -> Path | None:
-    parts = PurePosixPath(name.replace("\\", "/")).parts
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
     for i in range(len(parts)):
         ending = PurePosixPath(*parts[i:])
         for key in (str(ending), str(ending.with_suffix(""))):
@@ -139,12 +138,18 @@ def _lookup(root: Path, keys: dict[str, list[Path]], name: str) -> Path | None:
 
 def _decode(path: Path) -> np.ndarray:
     """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
+    width, height = stored_size(path)
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if len(data) else None
+    try:
+        image = cv2.imdecode(data, flags) if len(data) else None
+    except cv2.error:
+        image = None
     if image is None:
         raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
+    if image.shape != (height, width, 3):
+        raise SceneError(path, f"expected {width} x {height} pixels as its header says, found others", "replace it")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)

@@ -95,13 +95,13 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
     """
     index = np.arange(count, dtype=np.int64)
     for box in boxes(width, height):
-        grid = box.pixels(width, height)
+        size = (height - 2 * box.top) * (width - 2 * box.left)
         for per_pixel in PER_PIXEL:
-            blocks = count / (grid.size * per_pixel)
-            if blocks != int(blocks) or not 1 <= blocks <= views:
+            blocks, rest = divmod(count, size * per_pixel)
+            if rest or not 1 <= blocks <= views:
                 continue
-            chosen = every_nth(views, int(blocks)) or tuple(range(int(blocks)))
-            yield from _orders(index, box, grid, per_pixel, chosen, width, height)
+            chosen = every_nth(views, blocks) or tuple(range(blocks))
+            yield from _orders(index, box, box.pixels(width, height), per_pixel, chosen, width, height)
 
 
 def _orders(

@@ -9,13 +9,15 @@ from typing import Literal
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io.compressed import is_compressed, unpack
+from gsmerge.io.ply_file import open_ply
 from gsmerge.io.ply_layout import (
     BLOCK_BYTES,
     LOGIT_COMMENT,
+    MAX_HARMONIC,
     MAX_LOG_SCALE,
     MEANS,
     NORMALS,
@@ -54,7 +56,7 @@ class PlyInfo:
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
         opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
         num_nonfinite: Rows with NaN or inf, set aside.
-        num_clipped_scales: Gaussians with a log scale beyond +-30, clipped.
+        num_clipped_scales: Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped.
         num_zero_quats: Gaussians without a rotation, taken as the identity.
     """
 
@@ -97,7 +99,7 @@ def ply_notes(info: PlyInfo) -> tuple[str, ...]:
     """What was adapted or looks odd in a PLY file, one sentence each, without a full stop."""
     counted = {
         "row(s) with NaN or inf, set aside": info.num_nonfinite,
-        "Gaussian(s) with extreme scales, clipped": info.num_clipped_scales,
+        "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
         "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
     }
     raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
@@ -120,7 +122,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
-    data = _open(path)
+    data = open_ply(path)
     compressed = is_compressed(data)
     rows = unpack(path, data) if compressed else np.asarray(_vertex(path, data).data)
     names = tuple(rows.dtype.names or ())
@@ -160,39 +162,12 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
 
 
-def _open(path: Path) -> PlyData:
-    if os.path.isdir(path):
-        raise SceneError(path, "expected a .ply file, found a folder")
-    try:
-        with path.open("rb") as file:
-            start = file.read(4)
-        if start[:3] != b"ply" or start[3:] not in (b"\n", b"\r"):
-            raise SceneError(
-                path, "expected a PLY file, found one that does not start with the line 'ply'", "name the .ply"
-            )
-        return PlyData.read(str(path), mmap="r")
-    except FileNotFoundError as error:
-        raise SceneError(path, "no such file") from error
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
-    except PlyElementParseError as error:
-        element, row = error.element, error.row
-        promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
-        raise SceneError(
-            path,
-            f"truncated or damaged: expected {promise}, found {row or 0} whole ones ({error.message})",
-            "copy or export it again",
-        ) from error
-    except (PlyParseError, ValueError, MemoryError) as error:
-        raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
-
-
 def _vertex(path: Path, data: PlyData) -> PlyElement:
     if "vertex" not in data:
         found = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
         raise SceneError(path, f"expected an element 'vertex', found {found}")
     vertex = data["vertex"]
-    columns = {p.name for p in vertex.properties if not isinstance(p, PlyListProperty)}
+    columns = {p.name for p in vertex.properties}
     missing = [name for name in REQUIRED if name not in columns]
     if missing:
         remedy = "this is no Gaussian splat"
@@ -250,13 +225,22 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
         for j, name in enumerate(MEANS):
             column = take(name)
             out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
+        clipped = np.zeros(len(rows), np.bool_)
+
+        def take_harmonic(name: str) -> np.ndarray:
+            column = take(name)
+            size = np.abs(column)
+            if not size.max() <= MAX_HARMONIC:
+                np.logical_or(clipped, size > MAX_HARMONIC, out=clipped)
+                np.clip(column, -MAX_HARMONIC, MAX_HARMONIC, out=column)
+            return column
+
         for j, name in enumerate(SH0):
-            out["sh0"][:, 0, j] = take(name)
+            out["sh0"][:, 0, j] = take_harmonic(name)
         num_higher = out["shN"].shape[1]
         for channel in range(3):
             for j in range(num_higher):
-                out["shN"][:, j, channel] = take(f"f_rest_{channel * num_higher + j}")
-        clipped = np.zeros(len(rows), np.bool_)
+                out["shN"][:, j, channel] = take_harmonic(f"f_rest_{channel * num_higher + j}")
         for j, name in enumerate(SCALES):
             column = take(name)
             clipped |= np.abs(column) > MAX_LOG_SCALE

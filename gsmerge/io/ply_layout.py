@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
+MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
 

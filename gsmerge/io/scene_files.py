@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.da3 import holds_images
 from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.images import list_images
@@ -55,9 +56,9 @@ def find_scene_files(
     """
     path = Path(path)
     ply = _find_ply(path) if os.path.isdir(path) else path
-    if not os.path.exists(ply):
-        raise SceneError(ply, "no such file")
-    roots = list(dict.fromkeys(root.resolve() for root in [path if ply != path else ply.parent, *_roots(ply)]))
+    check_file(ply)
+    given = path if ply != path else ply.parent
+    roots = list(dict.fromkeys(Path(os.path.realpath(root)) for root in (given, *_roots(ply))))
     camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
     image_path = _named(images)
     if image_path is None and camera_path is not None and camera_path.suffix == ".npz" and holds_images(camera_path):
@@ -73,11 +74,13 @@ def _named(path: str | os.PathLike[str] | None) -> Path | None:
         return None
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
+    if not os.path.isdir(path):
+        check_file(Path(path))
     return Path(path)
 
 
 def _roots(ply: Path) -> list[Path]:
-    folder = ply.parent.resolve()
+    folder = Path(os.path.realpath(ply.parent))
     if folder.name == "gs_ply":
         return [folder, folder.parent]
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from torch import Tensor
@@ -78,7 +79,7 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
         return decode_images(paths, camera_file.names) if len(paths) == len(found) else None
     if files.images.suffix != ".npz":
         return decode_images(files.images, camera_file.names)
-    own = files.cameras is not None and files.cameras.resolve() == files.images.resolve()
+    own = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = camera_file.images if own else read_da3(files.images).images
     if stored is None or len(stored) != len(camera_file):
         found_count = 0 if stored is None else len(stored)

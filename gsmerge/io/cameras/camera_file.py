@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.cameras.lens import Lens
 from gsmerge.types import Cameras
 
+_MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # what no camera has, and would overflow later
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
@@ -90,6 +92,8 @@ def make_camera_file(
     """
     if len(poses) == 0:
         raise SceneError(path, "expected at least one camera, found none")
+    if len(poses) > MAX_VIEWS:
+        raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found {len(poses)}")
     full = np.tile(np.eye(4), (len(poses), 1, 1))
     for i, pose in enumerate(poses):
         pose = np.asarray(pose, np.float64)
@@ -98,9 +102,9 @@ def make_camera_file(
         full[i, :3] = pose[:3]
     K = np.asarray(Ks, np.float64).reshape(-1, 3, 3)
     _check(path, full, K, names)
-    negative = next((f"{w} x {h}" for w, h in sizes if w < 0 or h < 0), None)
-    if negative is not None:
-        raise SceneError(path, f"expected a positive image size, found {negative}")
+    odd = next(((w, h) for w, h in sizes if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE)), None)
+    if odd is not None:
+        raise SceneError(path, f"expected a positive image size, found {odd[0]:.6g} x {odd[1]:.6g}")
     K, sizes = _in_pixels(K, sizes)
     return CameraFile(
         path=str(path),
@@ -133,6 +137,9 @@ def _check(path: str | os.PathLike[str], poses: np.ndarray, Ks: np.ndarray, name
     for name, pose, K in zip(names, poses, Ks, strict=True):
         if not (np.isfinite(pose).all() and np.isfinite(K).all()):
             raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
+        largest = max(np.abs(pose).max(), np.abs(K).max())
+        if largest > _MAX_NUMBER:
+            raise SceneError(path, f"view {name}: expected numbers up to {_MAX_NUMBER:g}, found {largest:g}")
         rotation = pose[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 0.02:
             raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
@@ -140,8 +147,10 @@ def _check(path: str | os.PathLike[str], poses: np.ndarray, Ks: np.ndarray, name
             raise SceneError(
                 path, f"view {name}: expected a rotation, found a mirrored (left-handed) one", "negate one axis"
             )
-        if K[0, 0] <= 0 or K[1, 1] <= 0:
+        if K[0, 0] < _MIN_FOCAL or K[1, 1] < _MIN_FOCAL:
             raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
+        if np.abs(K[2] - (0, 0, 1)).max() > 1e-3 or abs(K[1, 0]) > 1e-3 * K[0, 0]:
+            raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
 
 
 def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
@@ -207,6 +216,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
         size = found[0]
         if 0 in size or size == (1, 1):
             raise SceneError(camera_file.path, "expected the image size (w, h) of the cameras, found none")
+    check_pixels(camera_file.path, *size)
     known = (camera_file.widths > 0) & (camera_file.heights > 0)
     scale = torch.ones(len(camera_file), 3, dtype=torch.float64)
     scale[:, 0] = torch.where(known, size[0] / camera_file.widths.clamp_min(1), 1.0)

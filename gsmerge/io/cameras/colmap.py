@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
 from gsmerge.io.cameras.lens import Lens, fisheye, perspective
 
@@ -22,6 +26,8 @@ _NUM_PARAMS = {name: count for _, name, count in _MODELS}
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+
+MAX_NAME = 1 << 16  # bytes of an image's name
 
 _Camera = tuple[np.ndarray, tuple[int, int], Lens | None]  # K [3,3], (width, height)
 _Image = tuple[str, int, list[float]]  # name, camera id, quaternion wxyz and translation
@@ -43,11 +49,14 @@ def read_colmap(folder: Path) -> CameraFile:
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
         if binary:
-            cameras = _binary_cameras(camera_path, camera_path.read_bytes())
-            images = _binary_images(image_path.read_bytes())
+            with _mapped(camera_path) as data:
+                cameras = _binary_cameras(camera_path, data)
+            with _mapped(image_path) as data:
+                images = _binary_images(data)
         else:
-            cameras = _text_cameras(camera_path, camera_path.read_text())
-            images = _text_images(image_path.read_text())
+            cameras = _text_cameras(camera_path, read_text(camera_path))
+            images = _text_images(read_text(image_path, MAX_MODEL_BYTES))
+        poses = [_pose(numbers) for _, _, numbers in images]
     except (struct.error, ValueError, IndexError) as error:
         raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
     except OSError as error:
@@ -59,7 +68,7 @@ def read_colmap(folder: Path) -> CameraFile:
         folder,
         f"COLMAP {'binary' if binary else 'text'}",
         W2C_OPENCV,
-        [_pose(numbers) for _, _, numbers in images],
+        poses,
         [cameras[camera][0] for _, camera, _ in images],
         [cameras[camera][1] for _, camera, _ in images],
         [name for name, _, _ in images],
@@ -67,9 +76,19 @@ def read_colmap(folder: Path) -> CameraFile:
     )
 
 
+@contextmanager
+def _mapped(path: Path) -> Iterator[mmap.mmap]:
+    """A file as bytes that are only read where they are looked at; an empty one raises ValueError."""
+    check_file(path)
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        yield data
+
+
 def _pose(numbers: list[float]) -> np.ndarray:
-    quat = np.array(numbers[:4])
-    w, x, y, z = quat / max(np.linalg.norm(quat), 1e-12)
+    if not np.isfinite(numbers).all():
+        raise ValueError("a pose that is not finite")
+    quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
+    w, x, y, z = quat / max(float(np.linalg.norm(quat)), 1e-12)
     rotation = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -92,7 +111,7 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size, lens
 
 
-def _binary_cameras(path: Path, data: bytes) -> dict[int, _Camera]:
+def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, _Camera]:
     (count,) = struct.unpack_from("<Q", data)
     position, cameras = 8, {}
     for _ in range(count):
@@ -105,19 +124,23 @@ def _binary_cameras(path: Path, data: bytes) -> dict[int, _Camera]:
     return cameras
 
 
-def _binary_images(data: bytes) -> list[_Image]:
+def _binary_images(data: mmap.mmap) -> list[_Image]:
     (count,) = struct.unpack_from("<Q", data)
     position, images = 8, []
     for _ in range(count):
         _, *numbers, camera = struct.unpack_from("<i7di", data, position)
         position += 64
-        end = data.index(b"\0", position)
+        end = data.find(b"\0", position, position + MAX_NAME)
+        if end < 0:
+            raise ValueError("a name without an end")
         name = data[position:end].decode("utf-8")
         (num_points,) = struct.unpack_from("<Q", data, end + 1)
         position = end + 9 + 24 * num_points
         if position > len(data):
             raise ValueError("early end of file")
         images.append((name, camera, numbers))
+        if len(images) > MAX_VIEWS:
+            break  # which is refused as too many
     return images
 
 
@@ -142,6 +165,8 @@ def _text_images(text: str) -> list[_Image]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         _, *numbers, camera, name = line.split(maxsplit=9)
+        if len(numbers) != 7:
+            raise ValueError("expected a rotation and a position")
         images.append((name.strip(), int(camera), [float(x) for x in numbers]))
         next(lines, None)
     return images

@@ -7,29 +7,21 @@ order of the rows of the ``.ply``, where it is known.
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.cameras.da3 import as_images
+from gsmerge.io.cameras.da3 import as_images, check_poses
 from gsmerge.io.layouts import ORDERS
+from gsmerge.io.npz import array_names, read_arrays
 
 SOURCE = "dump of a model"
 
 
 def is_dump(path: Path) -> bool:
     """Whether an npz holds camera-to-world poses under the name ``c2w``; False if it cannot be read."""
-    if not zipfile.is_zipfile(path):
-        return False
-    try:
-        with path.open("rb") as file, np.load(file) as stored:
-            return "c2w" in stored.files
-    except (OSError, ValueError, zipfile.BadZipFile):
-        return False
+    return "c2w" in array_names(path)
 
 
 def read_dump(path: Path) -> CameraFile:
@@ -38,17 +30,12 @@ def read_dump(path: Path) -> CameraFile:
     Raises:
         SceneError: If the file cannot be read, lacks an array, or one has another shape than it should.
     """
-    try:
-        with path.open("rb") as file, np.load(file) as stored:
-            arrays = {name: stored[name] for name in ("c2w", "K", "images", "order") if name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error
+    arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "K", "images") if name not in arrays]
     if missing:
         raise SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
     poses, Ks = arrays["c2w"], arrays["K"]
-    if poses.ndim != 3 or Ks.shape != (len(poses), 3, 3):
-        raise SceneError(path, f"expected c2w [v,4,4] and K [v,3,3], found {poses.shape} and {Ks.shape}")
+    check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
     images = as_images(path, arrays["images"], len(poses))
     height, width = images.shape[1:3]
     order = str(arrays["order"]) if "order" in arrays else "auto"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import read_text
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
 
 CHOSEN, MOVED, SCALED = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
@@ -36,9 +37,11 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
         names.append(name)
     chosen = _numbers(path.with_name(CHOSEN))
     ids = range(len(names)) if chosen is None else [round(value) for value in chosen.reshape(-1)]
-    if any(not 0 <= i < len(names) for i in ids):
-        raise SceneError(path.with_name(CHOSEN), f"expected frames 0 to {len(names) - 1}, found {max(ids)}")
-    moved = _moved(path, np.array([poses[i] for i in ids]).reshape(-1, 4, 4))
+    odd = next((i for i in ids if not 0 <= i < len(names)), None)
+    if odd is not None:
+        raise SceneError(path.with_name(CHOSEN), f"expected frames 0 to {len(names) - 1}, found {odd:.6g}")
+    with np.errstate(all="ignore"):  # what overflows is refused with the cameras
+        moved = _moved(path, np.array([poses[i] for i in ids]).reshape(-1, 4, 4))
     return make_camera_file(
         path, "Long-LRM", W2C_OPENCV, moved, [Ks[i] for i in ids], [sizes[i] for i in ids], [names[i] for i in ids]
     )
@@ -50,7 +53,10 @@ def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
     if move is not None:
         if move.size != 16:
             raise SceneError(path.with_name(MOVED), f"expected 16 numbers, found {move.size}")
-        viewmats = viewmats @ np.linalg.inv(move.reshape(4, 4))
+        try:
+            viewmats = viewmats @ np.linalg.inv(move.reshape(4, 4))
+        except np.linalg.LinAlgError as error:
+            raise SceneError(path.with_name(MOVED), "expected a matrix that can be inverted") from error
     if scale is not None:
         if scale.size != 1 or not scale.reshape(-1)[0] > 0:
             raise SceneError(path.with_name(SCALED), "expected one positive number")
@@ -63,8 +69,8 @@ def _numbers(path: Path) -> np.ndarray | None:
     if not path.is_file():
         return None
     try:
-        values = np.array(path.read_text().replace(",", " ").split(), np.float64)
-    except (OSError, ValueError) as error:
+        values = np.array(read_text(path).replace(",", " ").split(), np.float64)
+    except ValueError as error:
         raise SceneError(path, f"expected numbers ({error})") from error
     if not np.isfinite(values).all():
         raise SceneError(path, "expected finite numbers, found NaN or inf")

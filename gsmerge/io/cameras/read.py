@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import check_file, read_text
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
 from gsmerge.io.cameras.da3 import read_da3
@@ -70,6 +71,7 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
         path = found
     if path.is_dir():
         return read_colmap(path)
+    check_file(path)
     if path.suffix in (".bin", ".txt"):
         if is_trajectory(path):
             return read_trajectory(path)
@@ -84,11 +86,10 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
 
 
 def _read_json(path: Path) -> CameraFile:
+    text = read_text(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
-    except ValueError as error:
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise SceneError(path, f"expected JSON, found something else ({error})") from error
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+from gsmerge.io.ply_file import open_ply
 
 SOURCE = "SHARP"
+_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
 LAYERS = 2  # Gaussians per cell: a front and a back layer
 
 
@@ -22,15 +24,14 @@ def read_sharp(path: Path) -> CameraFile | None:
     Raises:
         SceneError: If the numbers are damaged.
     """
-    try:
-        data = PlyData.read(str(path), mmap="r")
-    except (PlyParseError, ValueError, OSError):
-        return None  # the reader of the Gaussians says what is wrong
-    if not all(name in data for name in ("vertex", "extrinsic", "intrinsic", "image_size")):
+    data = open_ply(path)
+    if "vertex" not in data or not all(name in data for name in _ELEMENTS):
         return None
-    extrinsic, intrinsic, size = (
-        np.asarray([row[0] for row in data[name].data], np.float64) for name in ("extrinsic", "intrinsic", "image_size")
-    )
+    if any(data[name].count > 16 or len(data[name].properties) != 1 for name in _ELEMENTS):
+        return None
+    if any(isinstance(data[name].properties[0], PlyListProperty) for name in _ELEMENTS):
+        return None
+    extrinsic, intrinsic, size = (np.asarray([row[0] for row in data[name].data], np.float64) for name in _ELEMENTS)
     side = round((data["vertex"].count / LAYERS) ** 0.5)
     if LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None

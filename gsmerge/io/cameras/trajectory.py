@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import MAX_VIEWS, read_text
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, CameraFile, make_camera_file
 
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
-MAX_VIEWS = 1_000_000
 
 
 def read_trajectory(path: Path) -> CameraFile:
@@ -48,11 +48,7 @@ def is_trajectory(path: Path) -> bool:
 
 def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
     rows = []
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError) as error:
-        raise SceneError(path, f"cannot be read as text ({error})") from error
-    for number, line in enumerate(lines[: MAX_VIEWS + 1], 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         if not line.strip():
             continue
         try:
@@ -63,4 +59,6 @@ def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
             wanted = " or ".join(map(str, lengths))
             raise SceneError(path, f"line {number}: expected {wanted} numbers, found {len(row)}")
         rows.append(row)
+        if len(rows) > MAX_VIEWS:
+            raise SceneError(path, f"expected at most {MAX_VIEWS} views, found more")
     return rows

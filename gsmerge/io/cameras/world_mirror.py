@@ -41,7 +41,7 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     for entry in entries:
         try:
             name, matrix = str(entry["camera_id"]), np.array(entry["matrix"], np.float64)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise SceneError(path, f"{key}: expected entries of 'camera_id' and 'matrix' ({error})") from error
         if matrix.shape not in ((side, side), (3, side)):
             raise SceneError(path, f"{key} of {name}: expected {side}x{side} numbers, found shape {matrix.shape}")

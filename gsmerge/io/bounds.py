@@ -1,0 +1,63 @@
+"""What a file may ask for: checked before anything is read from it or allocated for it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+
+MAX_TEXT_BYTES = 32 << 20  # of a camera file: some hundred thousand numbers a view would not fill it
+MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which lists the points of every image as well
+MAX_VIEWS = 10_000
+MAX_PIXELS = 1 << 26  # of one image
+
+
+def check_file(path: Path) -> int:
+    """The size of a file, bytes.
+
+    Raises:
+        SceneError: If there is none, or it is a folder, a pipe or a device, which could block or never end.
+    """
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError) as error:
+        missing = isinstance(error, FileNotFoundError)
+        reason = "no such file" if missing else f"cannot be read ({getattr(error, 'strerror', error)})"
+        raise SceneError(path, reason) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise SceneError(path, "expected a file, found a folder")
+    if not stat.S_ISREG(status.st_mode):
+        raise SceneError(path, "expected a file, found a pipe or a device", "write its content to a file first")
+    return status.st_size
+
+
+def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
+    """The text of a small file in UTF-8.
+
+    Raises:
+        SceneError: If it cannot be read, is no text, or has more than ``limit`` bytes.
+    """
+    size = check_file(path)
+    if size > limit:
+        raise SceneError(path, f"expected a text file of at most {limit >> 20} MiB, found {size >> 20} MiB")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise SceneError(path, f"cannot be read as text ({error})") from error
+
+
+def check_pixels(path: str | os.PathLike[str], width: int, height: int) -> None:
+    """Refuse an image size that no image of Gaussians has.
+
+    Raises:
+        SceneError: If it is not positive, or has too many pixels.
+    """
+    if width < 1 or height < 1:
+        raise SceneError(path, f"expected a positive image size, found {width} x {height}")
+    if width * height > MAX_PIXELS:
+        millions = MAX_PIXELS // 1_000_000
+        raise SceneError(path, f"expected at most {millions} million pixels an image, found {width} x {height}")

@@ -1,0 +1,131 @@
+"""Every hostile input ends in a result or in one clear line: in bounded time and memory, and nothing is executed."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from .conftest import Run
+from .hostile import CASES, MARKER
+
+SECONDS = 10
+BYTES = 2**30
+
+COMPACTED = ("one position 1e30", "half of the positions NaN", "colours 1e38", "opacities 1e38", "scales 1e38",
+             "rotations 1e38")  # fmt: skip
+COMPACTED = tuple(f"ply: {name}" for name in COMPACTED)
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
+
+
+class TooLong(BaseException):
+    """The time is over; no reader can take this for an error of its own."""
+
+
+@contextmanager
+def limits() -> Iterator[None]:
+    """A block that may take so many seconds, and so much memory on top of what is in use."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+
+    def stop(*_: object) -> None:
+        raise TooLong
+
+    handler = signal.signal(signal.SIGALRM, stop)
+    resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, before[1]))
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+        signal.signal(signal.SIGALRM, handler)
+
+
+@pytest.fixture(scope="module")
+def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three views of 24 x 16 with cameras and images. Read only."""
+    folder = make_scene(tmp_path_factory.mktemp("small") / "scene", num_views=3, width=24, height=16)
+    shutil.rmtree(folder / "targets")
+    return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def warm(small_scene: Path) -> None:
+    """What is loaded once is loaded before memory is limited."""
+    from gsmerge.cli import main
+
+    assert main(["compact", str(small_scene), "--dry-run"]) == 0
+
+
+@pytest.fixture
+def scene(small_scene: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small_scene, tmp_path / "scene"))
+
+
+def one_line(err: str) -> None:
+    assert err.startswith("gsmerge: error: ")
+    assert err.endswith("\n")
+    assert err.count("\n") == 1
+    assert err[:-1].isprintable()
+    assert len(err) < 6000
+    assert "unexpected" not in err.split(":")[2]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, run: Run) -> None:
+    case = CASES[name]
+    arguments = [str(argument) for argument in case.spoil(scene) or [scene]]
+    if arguments[0].startswith("-"):
+        arguments.insert(0, "--")
+    with limits():
+        outcome = run("compact", "--dry-run", *arguments)
+    assert outcome.code in case.codes, outcome.err
+    assert not list(scene.parent.rglob(MARKER))
+    if outcome.code == 0:
+        assert "gsmerge: warning" not in outcome.err
+        return
+    assert outcome.out == ""
+    one_line(outcome.err)
+    assert case.named in outcome.err
+
+
+@pytest.mark.parametrize("name", list(CASES)[::12])
+def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> None:
+    arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
+    with limits():
+        found = run("inspect", "--", arguments[0])
+    assert found.code in (0, 3), found.err
+    if found.code:
+        one_line(found.err)
+    assert not list(scene.parent.rglob(MARKER))
+
+
+@pytest.mark.parametrize("name", COMPACTED)
+def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
+    CASES[name].spoil(scene)
+    outcome = run("compact", scene, "-o", scene / "small.ply", "--fit-steps", 2, "--quiet")
+    assert outcome.code == 0, outcome.err
+    assert "gsmerge: warning" not in outcome.err
+    found = run("inspect", scene / "small.ply", "--json").out
+    assert json.loads(found)["num_nonfinite"] == 0
+
+
+def test_the_corpus_is_large() -> None:
+    assert len(CASES) >= 200
+
+
+def test_limits_hold() -> None:
+    with pytest.raises(MemoryError), limits():
+        bytearray(2 * BYTES)
+    with limits():
+        assert len(os.urandom(16)) == 16
