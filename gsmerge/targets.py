@@ -14,7 +14,7 @@ LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians tha
 RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured
 AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
 SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
-KNEE = 0.25  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
+KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
 SLOPE = 1.0  # dB per doubling of the count, until two counts have been tried
 CLOSE = 1.15  # counts this near to each other are one
 MAX_RUNS = 6
@@ -138,7 +138,7 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
 def curve_knee(points: Sequence[CurvePoint]) -> int:
     """The count beyond which more Gaussians are not worth it, by PSNR and structure together.
 
-    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.25 dB per doubling, on
+    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB per doubling, on
     a straight line between the slopes that lie midway between the points.
 
     Args:

@@ -174,7 +174,7 @@ def _text() -> dict[str, Case]:
     cases = {"COLMAP text as it is": Case(model(lambda c, i: (c, i), text=True), READ)}
     lines = {
         "no numbers": b"1 PINHOLE a b c d e f", "too few": b"1 PINHOLE", "NaN": b"1 PINHOLE 24 16 nan nan nan nan",
-        "an unknown model": b"1 MAGIC 24 16 1 2 3 4", "distortion": b"1 OPENCV 24 16 20 20 12 8 .1 0 0 0",
+        "an unknown model": b"1 MAGIC 24 16 1 2 3 4", "a distorted number": b"1 OPENCV 24 16 20 20 12 8 .1. 0 0 0",
         "a size of 10^30": b"1 PINHOLE 1%s 16 20 20 12 8" % (b"0" * 30), "a size of 5000 digits": b"1 PINHOLE "
         + b"9" * 5000 + b" 16 20 20 12 8", "bytes": bytes(range(256)), "nothing": b"", "half a size": b"1 PINHOLE 24.5 "
         b"16 20 20 12 8", "a negative size": b"1 PINHOLE -24 -16 20 20 12 8",
@@ -195,6 +195,8 @@ def _text() -> dict[str, Case]:
             sparse(folder / "sparse" / "0" / name, 2**33)
 
         cases[f"{name} of 8 GB of zeros"] = Case(spoil)
+    lens = b"1 OPENCV 24 16 20 20 12 8 .1 0 0 0"
+    cases["cameras.txt with a lens"] = Case(model(lambda c, i: (lens, i), text=True), READ)
     return cases
 
 
