@@ -22,7 +22,7 @@ from gsmerge.targets import CurvePoint
 from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
-STEPS = 60  # of half-size photos: the order of the counts is then that of long fits
+SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' blocks
 NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
 PERCEPTUAL_SIDE = 64  # pixels, at least
@@ -33,6 +33,7 @@ def measure_curve(
     canvas: Canvas,
     tree: RegionTree,
     options: CompactOptions,
+    steps: int,
     counts: Sequence[int],
     journal: Journal,
 ) -> list[CurvePoint]:
@@ -45,10 +46,11 @@ def measure_curve(
         canvas: Its pictures.
         tree: What superpixels are cut from.
         options: All settings; the fit's own length does not matter.
+        steps: Length of the fits.
         counts: Numbers of Gaussians, each within the canvas' limits.
         journal: Told the progress.
     """
-    short = FitOptions(fit="full", fit_steps=STEPS, coarse=1.0, holdout=HOLDOUT, rates=options.fit.rates)
+    short = FitOptions(fit="full", fit_steps=steps, coarse=1.0, holdout=HOLDOUT, rates=options.fit.rates)
     quick = replace(options, fit=short)
     whole = replace(canvas, share=1.0)  # so short a fit does not grow
     photos = scene_photos(source.scene)

@@ -11,7 +11,7 @@ import torch
 from gsmerge.allocate import RegionTree
 from gsmerge.build import Source, build
 from gsmerge.canonical import Frame
-from gsmerge.curve import measure_curve
+from gsmerge.curve import LONG, SHORT, measure_curve
 from gsmerge.errors import UsageError
 from gsmerge.grouping import Canvas, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
 from gsmerge.journal import STAGES, Journal, Progress
@@ -172,7 +172,8 @@ def _decided(work: _Work, journal: Journal) -> int | None:
         return knee_count(work.tree, canvas, options)
     with journal.stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, canvas.usual, canvas.least, canvas.most)
-        points = measure_curve(work.source, canvas, work.tree, options, counts, journal)
+        steps = SHORT if drop is None else LONG
+        points = measure_curve(work.source, canvas, work.tree, options, steps, counts, journal)
     count = curve_knee(points) if drop is None else count_within(points, drop)
     journal.choices["curve"] = [asdict(point) for point in points]
     return count
