@@ -84,16 +84,18 @@ def measure(scene: Path, name: str, max_views: int, cache: Path, quality: bool) 
     row["aligned"] = isinstance(loaded.scene, PixelScene)
     row["at home"] = share_at_home(loaded, true_pixels(scene, style, max_views or None))
     row["margin"] = loaded.recovery.margin if loaded.recovery else float("nan")
-    if quality and isinstance(loaded.scene, PixelScene) and loaded.recovery is not None:
+    if quality:
         result = gsmerge.compact(loaded.scene, k=1)
         row["kept"] = len(result.gaussians) / loaded.scene.num_gaussians
         row["psnr"] = score(result.gaussians, _targets(scene, loaded.recovery, nested))[0]
     return row
 
 
-def _targets(scene: Path, recovery: Recovery, nested: float) -> Targets:
+def _targets(scene: Path, recovery: Recovery | None, nested: float) -> Targets:
     """The held-out views in the frame of the Gaussians."""
     targets = read_targets(scene)
+    if recovery is None:
+        return targets
     viewmats = targets.cameras.viewmats.numpy().copy()
     viewmats[:, :3, 3] *= nested  # into the world of the exported cameras
     moved = torch.from_numpy(recovery.best.frame.move_cameras(viewmats))
