@@ -149,11 +149,11 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
         canonical, frame, options = ready.scene, ready.frame, ready.options
         journal.notes += ready.notes
         canvas = scene_canvas(canonical, options)
-        source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
     before = None
     if scene.images is not None:
         with journal.stage("input"):
             before = input_psnr(scene.gaussians, scene_photos(scene), NEAR * frame.unit)
+    source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
     plain = not target.searches and options.decode.k != "auto" and canvas.exact is None and canvas.usual <= canvas.most
     tree = None
     if not plain or target.levels > 1:

@@ -119,13 +119,17 @@ def _run(
     """Read, compact and write; returns the report."""
     from gsmerge import pipeline
     from gsmerge.io import atomic_output, load_files, write_ply
+    from gsmerge.memory import release_memory
     from gsmerge.report import report_document
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
         loaded = load_files(files, opacity=opacity, reading=reading)
-        if len(loaded.scene):
-            superpixels_per_view(settings.segment, loaded.scene.cameras.width, loaded.scene.cameras.height)
+        recognised, notes, scene = _recognised(loaded), loaded.notes, loaded.scene
+        del loaded  # which knows the row of every pixel
+        release_memory()
+        if len(scene):
+            superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
         read = perf_counter()
         with (
             announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
@@ -138,7 +142,7 @@ def _run(
                 if progress is not None:
                     progress(stage, done, total)
 
-            result = pipeline.compact(loaded.scene, settings, progress=moved)
+            result = pipeline.compact(scene, settings, progress=moved)
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
@@ -152,8 +156,8 @@ def _run(
         seconds_before={"import": imported - start, "read": read - imported},
         seconds_after={"write": perf_counter() - compacted},
         coarser=[(path, level.report) for path, level in coarser],
-        recognised=_recognised(loaded),
-        notes=loaded.notes,
+        recognised=recognised,
+        notes=notes,
         hashed=hashed,
     )
 
