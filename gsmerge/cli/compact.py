@@ -13,7 +13,7 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, default_output, input_files, level_output
 from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
-from gsmerge.errors import TargetError
+from gsmerge.errors import SceneError, TargetError
 
 if TYPE_CHECKING:
     from gsmerge.io import Reading, SceneFiles, SceneLoad
@@ -143,6 +143,9 @@ def _run(
                     progress(stage, done, total)
 
             result = pipeline.compact(scene, settings, progress=moved)
+        if len(result.gaussians) == 0:
+            problem = "expected Gaussians that show something, found none that is left once they are merged"
+            raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
         write_ply(temporary, result.gaussians, overwrite=True)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]

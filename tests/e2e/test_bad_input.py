@@ -6,11 +6,15 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
+
+import gsmerge
 
 from .conftest import Run, listing
 
@@ -231,3 +235,14 @@ def test_occupied_folders_are_refused(command: str, made_scene: Path, tmp_path: 
     assert outcome.code == 2
     assert "--overwrite" in outcome.err
     assert listing(tmp_path) == {"out/mine.txt": 8}
+
+
+def test_nothing_left_is_bad_input(scene_copy: Path, run: Run) -> None:
+    """Points without any size: no file of nothing is written."""
+    gaussians = gsmerge.read_ply(scene_copy / "scene.ply").gaussians
+    points = replace(gaussians, scales=torch.full_like(gaussians.scales, 1e-30))
+    gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
+    outcome = run("compact", scene_copy, "--fit", "none", "--no-robust")
+    assert outcome.code == 3
+    assert "found none that is left" in outcome.err
+    assert not (scene_copy / "scene.compact.ply").exists()
