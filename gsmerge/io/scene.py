@@ -17,6 +17,7 @@ from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignmen
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
+from gsmerge.io.dialects.voxels import is_padding
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
@@ -32,7 +33,7 @@ from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.views import cameras_of, stored_photos
-from gsmerge.types import Cameras, LooseScene, PixelScene
+from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 _MIN_CORRELATION = 0.5
 
@@ -237,12 +238,20 @@ def _loose(
     notes += said
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
-    gaussians = ply.gaussians[ply.valid]
-    if reading.quats == "xyzw":
-        gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
+    gaussians, padding = _loose_rows(ply, reading)
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
-    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, lost))
+    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost))
+
+
+def _loose_rows(ply: PlyScene, reading: Reading) -> tuple[Gaussians, list[str]]:
+    """The finite rows without those that only fill a file up to its size; and a note of these."""
+    keep = ply.valid & ~is_padding(ply.gaussians)
+    count = int(ply.valid.sum()) - int(keep.sum())
+    gaussians = ply.gaussians[keep]
+    if reading.quats == "xyzw":
+        gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
+    return gaussians, [f"{count:,} rows that only fill the file up are left out"] if count else []
 
 
 def _seen(
@@ -276,12 +285,10 @@ def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> Scen
     none = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, "")
-    gaussians = ply.gaussians[ply.valid]
-    if reading.quats == "xyzw":
-        gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
+    gaussians, padding = _loose_rows(ply, reading)
     scene = LooseScene(gaussians, none, None, ())
     problem = "expected one Gaussian per pixel, found no cameras that have any"
-    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, ply_notes(ply.info))
+    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, (*ply_notes(ply.info), *padding))
 
 
 def _lacks_cameras(clues: Clues) -> bool:
