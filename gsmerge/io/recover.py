@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsmerge.io.alignment import pixel_limit
 from gsmerge.io.frame import SAME, Frame, Sightings, candidate_frames, explains, pixel_errors
+from gsmerge.io.interleaved import interleaved_layout
 from gsmerge.io.layouts import Layout, depth_layout, exact_layouts, relabelled, thinned
 from gsmerge.io.pruned import pruned_layout, refined_scale, rough_frames
 from gsmerge.types import SH_C0, Cameras, Gaussians
@@ -125,6 +126,8 @@ def recover(clues: Clues, *, exact_frames: bool = False) -> Recovery | None:
             found += [evidence for layout in layouts for evidence in _measured(clues, layout, effort)]
     if not (exact_frames or any(evidence.ok for evidence in found)) and clues.order in ("auto", "view-major"):
         found += _pruned(clues)
+    if not (exact_frames or any(evidence.ok for evidence in found)) and clues.order in ("auto", "view-fastest"):
+        found += _interleaved(clues)
     found.sort(key=lambda evidence: (not evidence.ok, evidence.worst_px))
     if not found or not found[0].ok:
         return None
@@ -263,6 +266,22 @@ def _pruned(clues: Clues) -> list[Evidence]:
         if out and out[-1].ok:
             break
     return out
+
+
+def _interleaved(clues: Clues) -> list[Evidence]:
+    """The reading of a file that lacks pixels and has the views of one pixel side by side."""
+    cameras = clues.cameras
+    valid = np.flatnonzero(clues.valid.numpy())
+    if len(clues.gaussians) >= len(cameras) * cameras.width * cameras.height:
+        return []
+    frame = SAME if clues.scale is None else Frame(np.eye(3), clues.scale, np.zeros(3), "scaled, as told", "scaled")
+    points = clues.gaussians.means.double().numpy()[valid]
+    layout = interleaved_layout(points, frame.move_cameras(clues.viewmats), clues.Ks, cameras.width, cameras.height)
+    if layout is None:
+        return []
+    layout = replace(layout, rows=tuple(valid[rows] for rows in layout.rows))
+    seen, colors = sightings(clues, thinned(layout, max(MIN_SAMPLES, SAMPLES // len(layout.views))))
+    return [_evidence(clues, layout, frame, seen, colors)]
 
 
 def _differs(one: Layout, other: Layout) -> bool:
