@@ -34,7 +34,7 @@ def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_floor(settings: dict, floor: float, made: Path, tmp_path: Path, target_psnr: Measure) -> None:
     scene = read_scene(made, order="none")
-    result = gsmerge.compact(scene, **settings)
+    result = gsmerge.compact(scene, fit_steps=300, **settings)
     assert len(result.gaussians) <= 0.044 * settings.get("k", 1) * len(scene.gaussians)
     out = tmp_path / "small.ply"
     gsmerge.write_ply(out, result.gaussians)
