@@ -11,8 +11,8 @@ from typing import Any
 from gsmerge.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
-RELEASED = ("input", "encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
-STAGES = ("prepare", "input", "segment", "curve", "members", "encode", "robust", "match", "decode", "fit", "score")
+RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
+STAGES = ("prepare", "segment", "curve", "members", "encode", "robust", "match", "decode", "fit", "score", "input")
 
 
 @dataclass

@@ -89,7 +89,6 @@ class _Work:
     options: CompactOptions
     canvas: Canvas
     tree: RegionTree | None
-    before: float | None
     kept: Gaussians | None
     settings: CompactOptions
 
@@ -126,10 +125,25 @@ def compact(
         else:
             result = _built(work, _decided(work, journal), journal)
         counts = level_counts(len(result.gaussians), options.target.levels, work.canvas.least)
-        coarser = tuple(_built(work, count, Journal(progress)) for count in counts)
+        results = [result, *(_built(work, count, Journal(progress)) for count in counts)]
+        near = NEAR * work.frame.unit
+        del work
+        if scene.images is not None:  # last, when the kernels are there and the rest is gone
+            ending = Journal(progress)
+            with ending.stage("input"):
+                before = input_psnr(scene.gaussians, scene_photos(scene), near)
+            results = [_compared(one, before, ending.seconds if i == 0 else {}) for i, one in enumerate(results)]
     if progress:
         progress("done", len(STAGES), len(STAGES))
-    return replace(result, coarser=coarser)
+    return replace(results[0], coarser=tuple(results[1:]))
+
+
+def _compared(result: CompactResult, before: float, seconds: dict[str, float]) -> CompactResult:
+    """A result that knows how good the input was, and the seconds that it took to find out."""
+    report, peak = result.report, peak_memory()
+    return replace(
+        result, report=replace(report, psnr_before=before, seconds=report.seconds | seconds, peak_memory_bytes=peak)
+    )
 
 
 def _settled(options: CompactOptions) -> CompactOptions:
@@ -149,17 +163,13 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
         canonical, frame, options = ready.scene, ready.frame, ready.options
         journal.notes += ready.notes
         canvas = scene_canvas(canonical, options)
-    before = None
-    if scene.images is not None:
-        with journal.stage("input"):
-            before = input_psnr(scene.gaussians, scene_photos(scene), NEAR * frame.unit)
     source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
     plain = not target.searches and options.decode.k != "auto" and canvas.exact is None and canvas.usual <= canvas.most
     tree = None
     if not plain or target.levels > 1:
         with journal.stage("segment"):
             tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
-    return _Work(scene, frame, source, options, canvas, tree, before, ready.kept, settings)
+    return _Work(scene, frame, source, options, canvas, tree, ready.kept, settings)
 
 
 def _decided(work: _Work, journal: Journal) -> int | None:
@@ -223,7 +233,7 @@ def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
     counts = work.scene.num_gaussians, len(gaussians)
     settings = work.settings.to_dict() | {"fit_steps": options.fit.steps}
     report = CompactReport(
-        *counts, journal.seconds, work.before, after, journal.choices, journal.notes, settings, peak_memory()
+        *counts, journal.seconds, None, after, journal.choices, journal.notes, settings, peak_memory()
     )
     return CompactResult(gaussians, report)
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
-STEPS = {"fast": 30, "default": 250, "best": 1000}  # of the full fit, by effort
+STEPS = {"fast": 30, "default": 280, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
