@@ -60,6 +60,11 @@ class Canvas:
     exact: int | None
 
     @property
+    def limit(self) -> int | None:
+        """The number that a budget, a size or a preset sets; None where density and K do."""
+        return _limit(self.usual, self.most, self.exact)
+
+    @property
     def least(self) -> int:
         """Fewest Gaussians that a scene can be cut to: one for each view."""
         return len(self.pictures)
@@ -74,12 +79,8 @@ def scene_canvas(scene: PixelScene | LooseScene, options: CompactOptions) -> Can
     asked, pixels = asked_per_view(scene, options), scene.pixels_per_view
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
-    most = most_allowed(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
-    if most < min(len(scene), scene.num_gaussians):
-        raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
+    usual, most, exact = _counts(scene, options)
     share = start_share(options.fit) if scene.images is not None else 1.0
-    usual = usual_count(scene, options)
-    exact = exact_count(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
     return Canvas(scene_pictures(scene), uses_robust(scene, options), share, asked, usual, most, exact)
 
 
@@ -98,12 +99,20 @@ def limit_of(scene: PixelScene | LooseScene, options: CompactOptions) -> int | N
     Raises:
         UsageError: If it leaves fewer than one for each view.
     """
+    return _limit(*_counts(scene, options))
+
+
+def _counts(scene: PixelScene | LooseScene, options: CompactOptions) -> tuple[int, int, int | None]:
+    """What density and K ask for, the most that is allowed, and what a budget or a size asks for."""
     num_input, degree = scene.num_gaussians, scene.gaussians.sh_degree
     most = most_allowed(options.target, num_input, degree)
-    if most < min(len(scene), scene.num_gaussians):
+    if most < min(len(scene), num_input):
         raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {most}")
-    exact = exact_count(options.target, num_input, degree)
-    return exact if exact is not None else most if usual_count(scene, options) > most else None
+    return usual_count(scene, options), most, exact_count(options.target, num_input, degree)
+
+
+def _limit(usual: int, most: int, exact: int | None) -> int | None:
+    return exact if exact is not None else most if usual > most else None
 
 
 def group_scene(canvas: Canvas, options: CompactOptions) -> Grouping:

@@ -154,7 +154,7 @@ def _settled(options: CompactOptions) -> CompactOptions:
 
 
 def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> _Work:
-    """The scene in its own frame, how good it is as it came, and its superpixels if they are to be cut to a number."""
+    """The scene in its own frame, and its superpixels if they are to be cut to a number."""
     target = settings.target
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
@@ -164,7 +164,7 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
         journal.notes += ready.notes
         canvas = scene_canvas(canonical, options)
     source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
-    plain = not target.searches and options.decode.k != "auto" and canvas.exact is None and canvas.usual <= canvas.most
+    plain = not target.searches and options.decode.k != "auto" and canvas.limit is None
     tree = None
     if not plain or target.levels > 1:
         with journal.stage("segment"):
@@ -176,7 +176,7 @@ def _decided(work: _Work, journal: Journal) -> int | None:
     """The number of Gaussians, as the options and the scene's own curve have it; None: as density and K say."""
     canvas, options, drop = work.canvas, work.options, work.options.target.max_drop
     if drop is None and options.decode.k != "auto":
-        return canvas.exact if canvas.exact is not None else canvas.most if canvas.usual > canvas.most else None
+        return canvas.limit
     assert work.tree is not None
     if work.scene.images is None:
         return knee_count(work.tree, canvas, options)
@@ -212,7 +212,8 @@ def _searched(work: _Work, target: float, journal: Journal) -> CompactResult:
             f" with {len(result.gaussians)} Gaussians"
         )
     choices = result.report.choices | {"search": asdict(search)}
-    return replace(result, report=replace(result.report, choices=choices, seconds=seconds, unmet=unmet))
+    notes = [*journal.notes, *result.report.notes]
+    return replace(result, report=replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet))
 
 
 def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:

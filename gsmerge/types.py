@@ -124,6 +124,13 @@ class Cameras:
         return -(rotation.transpose(1, 2) @ shift[:, :, None])[:, :, 0]
 
 
+def _expect_views(cameras: Cameras, images: Tensor | None, names: tuple[str, ...]) -> None:
+    if images is not None:
+        _expect("images", images, (len(cameras), cameras.height, cameras.width, 3))
+    if len(names) != len(cameras):
+        raise ValueError(f"expected {len(cameras)} view names, got {len(names)}")
+
+
 @dataclass(frozen=True)
 class PixelScene:
     """A scene with one Gaussian per pixel and view, in view-major, row-major order.
@@ -154,10 +161,7 @@ class PixelScene:
         if len(self.gaussians) != v * h * w:
             raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
         _expect("valid", self.valid, (v, h, w))
-        if self.images is not None:
-            _expect("images", self.images, (v, h, w, 3))
-        if len(self.names) != v:
-            raise ValueError(f"expected {v} view names, got {len(self.names)}")
+        _expect_views(self.cameras, self.images, self.names)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -193,11 +197,7 @@ class LooseScene:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
-        if self.images is not None:
-            _expect("images", self.images, (v, h, w, 3))
-        if len(self.names) != v:
-            raise ValueError(f"expected {v} view names, got {len(self.names)}")
+        _expect_views(self.cameras, self.images, self.names)
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsmerge import Cameras, Gaussians, PixelScene, compact, render
 from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.photos import Photos, scene_photos
 from gsmerge.pipeline import CompactReport, CompactResult
 from gsmerge.types import SH_C0, FeatureGaussians
 
@@ -280,6 +281,18 @@ def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
     gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
     images = images_of(gaussians, scene.cameras)[0].clip(0, 1)
     return replace(scene, images=torch.from_numpy(images).float()), gaussians
+
+
+def pair_of(scene: PixelScene) -> tuple[Photos, Photos]:
+    """The photos at full and at half size, as the fit takes them."""
+    return scene_photos(scene), scene_photos(scene, 2)
+
+
+def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
+    """Photos of noise: nothing that is learned of one block holds in another."""
+    rng = np.random.default_rng(0)
+    made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
+    return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
 
 
 def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:

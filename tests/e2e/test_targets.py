@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import loose
 import pytest
 import scenes
 
@@ -98,3 +99,12 @@ def test_a_device_is_a_limit(scene: PixelScene, monkeypatch: pytest.MonkeyPatch)
 def test_quality_needs_photos(scene: PixelScene, settings: dict[str, float]) -> None:
     with pytest.raises(UsageError, match="needs photos"):
         compact(replace(scene, images=None), **settings)
+
+
+def test_a_search_keeps_what_reading_had_to_say(scene: PixelScene) -> None:
+    whole = loose.loosened(scene)
+    means = whole.gaussians.means.clone()
+    means[0] = float("nan")
+    spoilt = replace(whole, gaussians=replace(whole.gaussians, means=means))
+    found = compact(spoilt, fit_steps=8, target_psnr=10.0)
+    assert any("not finite" in note for note in found.report.notes)

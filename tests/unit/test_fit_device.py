@@ -20,7 +20,7 @@ from gsmerge.fit.grow import grow_to
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.options import Rates
 from gsmerge.fit.state import State, start_state
-from gsmerge.photos import Photos, scene_photos
+from gsmerge.photos import Photos
 from gsmerge.render import cuda as cuda_module
 
 Pair = tuple[Photos, Photos]
@@ -31,10 +31,6 @@ gpu = pytest.mark.skipif(
 PULLS = FitOptions(fit_steps=8, holdout=0.2)
 # Without the pulls: where they are the whole gradient, Adam turns its last bit into a full step.
 QUICK = replace(PULLS, opacity_pull=0.0, size_pull=0.0)
-
-
-def pair_of(scene: PixelScene) -> Pair:
-    return scene_photos(scene), scene_photos(scene, 2)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +45,7 @@ def start() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def photos(scene: PixelScene) -> Pair:
-    return pair_of(scene)
+    return scenes.pair_of(scene)
 
 
 def run(gaussians: Gaussians, photos: Pair, options: FitOptions, engine: Engine, grown: int = 0) -> tuple[State, list]:
@@ -103,7 +99,7 @@ def test_pulls_are_the_kernels(start: Gaussians, photos: Pair, pulls: dict[str, 
 @pytest.mark.parametrize("degree", [1, 3])
 def test_steps_are_the_kernels_with_harmonics(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
-    found, wanted = (run(scenes.spoil(truth), pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS))
+    found, wanted = (run(scenes.spoil(truth), scenes.pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS))
     assert_same_state(found, wanted)
     np.testing.assert_array_equal(found.splats.shN, wanted.splats.shN)
 

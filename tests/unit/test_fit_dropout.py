@@ -14,7 +14,7 @@ from gsmerge.fit import full as full_module
 from gsmerge.fit.full import fit_full, plan_run
 from gsmerge.fit.options import LONG_STEPS
 from gsmerge.fit.state import start_state
-from gsmerge.photos import Photos, scene_photos
+from gsmerge.photos import Photos
 
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
@@ -27,8 +27,7 @@ def truth() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def photos() -> tuple[Photos, Photos]:
-    scene = scenes.self_made(0)[0]
-    return scene_photos(scene), scene_photos(scene, 2)
+    return scenes.pair_of(scenes.self_made(0)[0])
 
 
 def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> None:

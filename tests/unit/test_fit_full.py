@@ -16,17 +16,13 @@ from gsmerge.fit import FitOptions, Rates, start_share
 from gsmerge.fit import full as full_module
 from gsmerge.fit.full import affordable_steps, box_shares, fit_full, holdout_score, plan_run, step_sizes
 from gsmerge.fit.state import start_state
-from gsmerge.photos import Photos, scene_photos
+from gsmerge.photos import Photos
 from gsmerge.render import plan_view, splat_adjoint
 from gsmerge.threads import use_threads
 
 Pair = tuple[Photos, Photos]
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
-
-
-def pair_of(scene: PixelScene) -> Pair:
-    return scene_photos(scene), scene_photos(scene, 2)
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +37,12 @@ def truth() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def photos(scene: PixelScene) -> Pair:
-    return pair_of(scene)
+    return scenes.pair_of(scene)
 
 
 @pytest.fixture(scope="module")
 def noise(photos: Pair) -> Pair:
-    """Nothing that is learned of one block holds in another."""
-    rng = np.random.default_rng(0)
-    made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
-    return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
+    return scenes.noise_for(photos)
 
 
 # what it reaches
@@ -124,7 +117,7 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
 def test_single_photo_moves_less(truth: Gaussians) -> None:
     scene, _ = scenes.self_made(0, 1)
     start = scenes.spoil(truth)
-    result, report = fit_full(start, pair_of(scene), QUICK)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
     assert report.accepted
     rates = QUICK.rates
     unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
@@ -231,7 +224,7 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
     behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=torch.full((4, 1, 3), 4.0))
     start = Gaussians.concat([scenes.spoil(truth), behind])
-    result, report = fit_full(start, pair_of(scene), QUICK)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
     assert report.accepted
     for name in scenes.FIELDS:
         torch.testing.assert_close(getattr(result, name)[-4:], getattr(behind, name), rtol=1e-5, atol=1e-6)
@@ -244,7 +237,7 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
 def test_few_views(views: int) -> None:
     scene, truth = scenes.self_made(0, views)
     start = scenes.spoil(truth)
-    result, report = fit_full(start, pair_of(scene), QUICK)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
     assert report.accepted
     assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 2
 
@@ -253,7 +246,7 @@ def test_few_views(views: int) -> None:
 def test_harmonics_keep_their_degree_and_values(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
     start = scenes.spoil(truth)
-    result, report = fit_full(start, pair_of(scene), QUICK)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
     assert report.accepted
     assert result.sh_degree == degree
     assert torch.equal(result.shN, start.shN)
@@ -263,7 +256,7 @@ def test_harmonics_keep_their_degree_and_values(degree: int) -> None:
 def test_harmonics_are_inherited_by_grown_ones() -> None:
     scene, truth = scenes.self_made(1)
     start = scenes.spoil(truth)
-    result, report = fit_full(start, pair_of(scene), LONG, count=len(start) + 20)
+    result, report = fit_full(start, scenes.pair_of(scene), LONG, count=len(start) + 20)
     assert report.accepted
     assert len(result) == len(start) + 20
     assert torch.equal(result.shN[: len(start)], start.shN)
@@ -357,7 +350,7 @@ def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
 def test_tiny_photos(size: tuple[int, int]) -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
     start = replace(scene.gaussians, means=scene.gaussians.means.float())
-    result, report = fit_full(start, pair_of(scene), QUICK)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
     assert len(result) == len(start)
     assert np.isfinite([report.holdout_before, report.holdout_after]).all()
     for name in scenes.FIELDS:

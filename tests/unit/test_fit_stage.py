@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import scenes
 import torch
@@ -14,16 +13,12 @@ from gsmerge import Gaussians, PixelScene
 from gsmerge.fit import FitOptions, FitReport, fit
 from gsmerge.fit.color import draw, seen
 from gsmerge.fit.full import fit_full
-from gsmerge.photos import Photos, scene_photos
+from gsmerge.photos import Photos
 from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
-
-
-def pair_of(scene: PixelScene) -> Pair:
-    return scene_photos(scene), scene_photos(scene, 2)
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +33,12 @@ def truth() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def photos(scene: PixelScene) -> Pair:
-    return pair_of(scene)
+    return scenes.pair_of(scene)
 
 
 @pytest.fixture(scope="module")
 def noise(photos: Pair) -> Pair:
-    """Nothing that is learned of one block holds in another."""
-    rng = np.random.default_rng(0)
-    made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
-    return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])
+    return scenes.noise_for(photos)
 
 
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
