@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from enum import Enum
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import UsageError
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from gsmerge.io import Reading
     from gsmerge.io.layouts import Order
     from gsmerge.io.reading import QuatChoice
+    from gsmerge.options import CompactOptions
     from gsmerge.segment import SegmentOptions
 
 
@@ -52,3 +54,12 @@ def told_as_usage() -> Iterator[None]:
         yield
     except ValueError as error:
         raise UsageError(str(error)) from error
+
+
+def settings_of(chosen: Mapping[str, Any]) -> CompactOptions:
+    """The library's options with those that were given."""
+    from gsmerge.options import CompactOptions
+
+    given = {name: value.value if isinstance(value, Enum) else value for name, value in chosen.items()}
+    with told_as_usage():
+        return CompactOptions().with_settings({name: value for name, value in given.items() if value is not None})
