@@ -12,11 +12,12 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.evidence import Clues, color_error
 from gsmerge.io.grid import Fit, Photos, as_is, mapped, photo_size, small_photos
 from gsmerge.io.images import as_tensor, natural_key
 from gsmerge.io.ply import PlyScene
 from gsmerge.io.poses import aligned_poses, poses_note, reread, with_poses
-from gsmerge.io.recover import MARGIN, Clues, Recovery, color_error, recover
+from gsmerge.io.recover import MARGIN, Recovery, recover
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid that only the photos' colours can tell apart

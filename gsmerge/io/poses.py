@@ -11,8 +11,9 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, Convention, from_viewmats, to_viewmats
+from gsmerge.io.evidence import Clues
 from gsmerge.io.loose import Sight, sight
-from gsmerge.io.recover import MARGIN, Clues, Recovery, recover
+from gsmerge.io.recover import MARGIN, Recovery, recover
 from gsmerge.types import Cameras, Gaussians
 
 _AS_GOOD = 0.98  # of a sight's score: no difference

@@ -18,6 +18,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.dialects.voxels import is_padding
+from gsmerge.io.evidence import Clues
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
@@ -28,7 +29,7 @@ from gsmerge.io.nerfstudio import seen_in_dataparser
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
-from gsmerge.io.recover import Clues, Recovery, recover
+from gsmerge.io.recover import Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
