@@ -102,6 +102,7 @@ class Order(str, Enum):
     view_fastest = "view-fastest"
     layer_major = "layer-major"
     column_major = "column-major"
+    unordered = "unordered"
     none = "none"
 
 

@@ -15,6 +15,7 @@ from gsmerge.io.cameras.da3 import read_depths
 from gsmerge.io.evidence import Clues, color_error
 from gsmerge.io.grid import Fit, Photos, as_is, mapped, photo_size, small_photos
 from gsmerge.io.images import as_tensor, natural_key
+from gsmerge.io.layouts import MAY_BE_LOOSE
 from gsmerge.io.ply import PlyScene
 from gsmerge.io.poses import aligned_poses, poses_note, reread, with_poses
 from gsmerge.io.recover import MARGIN, Recovery, recover
@@ -82,7 +83,7 @@ def fit_cameras(
         notes.append(poses_note(poses, camera_file.convention))
         clues = replace(clues, cameras=with_poses(clues.cameras, poses.viewmats))
         camera_file = reread(camera_file, poses.convention)
-    small = small_photos(ply.info, camera_file, size) if recovery is None and order != "none" else None
+    small = small_photos(ply.info, camera_file, size) if recovery is None and order not in MAY_BE_LOOSE else None
     if small is not None:
         raise small
     return Fitted(clues, recovery, camera_file, notes)

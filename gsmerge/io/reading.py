@@ -20,7 +20,8 @@ class Reading:
         dialect: Which exporter wrote it, a name of :data:`gsmerge.io.dialects.DIALECTS`; "auto": found out.
         quats: How rotations are stored: "wxyz", "xyzw", or "camera" (wxyz, relative to the own view's camera);
             "auto": as the dialect says, and checked against the surface where the pixels are known.
-        order: Order of the rows; "none": they belong to no pixels.
+        order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
+            pixels.
         scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
 
     Raises:

@@ -23,6 +23,7 @@ from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes
+from gsmerge.io.layouts import MAY_BE_LOOSE
 from gsmerge.io.loose import looks_like_a_grid
 from gsmerge.io.mismatch import count_problem, misaligned, other_grid
 from gsmerge.io.nerfstudio import seen_in_dataparser
@@ -223,7 +224,7 @@ def _loose(
     cameras, images = clues.cameras, clues.images
     views, width, height = len(cameras), cameras.width, cameras.height
     problem, remedy = count_problem(ply.info, views, width, height), other_grid(ply.info.count, views, width, height)
-    if clues.order != "none":
+    if clues.order not in MAY_BE_LOOSE:
         if len(ply.gaussians) == views * width * height:
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
