@@ -91,6 +91,7 @@ class Quats(str, Enum):
     auto = "auto"
     wxyz = "wxyz"
     xyzw = "xyzw"
+    xyzw_root = "xyzw-root"
     camera = "camera"
 
 

@@ -17,7 +17,13 @@ _STEP = 2  # pixels to the neighbours that span the surface
 _FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian says which way its surface faces
 _MIN_TESTED = 300
 _MIN_COSINE, _MIN_GAIN = 0.6, 0.15  # of the mean cosine between thinnest axis and normal, for another reading
+_MAX_LEFT = 0.5  # of what is missing to a cosine of 1: roots beside other readings with a second rotation, too
 _READINGS: tuple[QuatChoice, ...] = ("wxyz", "xyzw", "camera")
+_WORDS = {
+    "xyzw": "stored with w last",
+    "camera": "relative to each view's camera",
+    "xyzw-root": "stored with w last and each applied twice",
+}
 
 
 def read_rotations(scene: PixelScene, reading: QuatChoice) -> PixelScene:
@@ -25,13 +31,20 @@ def read_rotations(scene: PixelScene, reading: QuatChoice) -> PixelScene:
 
     Args:
         scene: Rotations as they stand in the file, read as wxyz, local to world.
-        reading: "wxyz": as they are; "xyzw": w comes last; "camera": wxyz, relative to the camera of the own view.
+        reading: "wxyz": as they are; "xyzw": w comes last; "xyzw-root": w comes last, and each is applied
+            twice: of its two square roots, the one whose thinnest axis follows the surface better; "camera": wxyz,
+            relative to the camera of the own view.
     """
     if reading in ("auto", "wxyz"):
         return scene
     quats = scene.gaussians.quats
     if reading == "xyzw":
         turned = from_xyzw(quats)
+    elif reading == "xyzw-root":
+        normals, thinnest = _every_normal(scene), scene.gaussians.scales.argmin(1)
+        roots = square_roots(from_xyzw(quats))
+        first, second = (_cosines(quat_to_rotmat(root), thinnest, normals) for root in roots)
+        turned = torch.where((second > first)[:, None], roots[1], roots[0])
     else:
         pose = _quats_of(scene.cameras.viewmats[:, :3, :3].transpose(1, 2)).float()
         turned = _multiply(pose.repeat_interleave(scene.pixels_per_view, 0), quats)
@@ -41,6 +54,17 @@ def read_rotations(scene: PixelScene, reading: QuatChoice) -> PixelScene:
 def from_xyzw(quats: Tensor) -> Tensor:
     """``[n,4]`` xyzw -> wxyz."""
     return quats[:, [3, 0, 1, 2]]
+
+
+def square_roots(quats: Tensor) -> tuple[Tensor, Tensor]:
+    """The two rotations that give those of ``quats [n,4]`` wxyz when applied twice: half the angle; half a turn more.
+
+    Where there is no angle, the second is half a turn about an arbitrary axis.
+    """
+    unit = torch.nn.functional.normalize(quats, dim=1)
+    unit = torch.where(unit[:, :1] < 0, -unit, unit)
+    half = torch.nn.functional.normalize(unit + unit.new_tensor([1.0, 0, 0, 0]), dim=1)
+    return half, _half_a_turn_more(half)
 
 
 def likely_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
@@ -60,24 +84,63 @@ def likely_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
     if len(rows) < _MIN_TESTED:
         return "wxyz", ""
     thinnest, quats = scene.gaussians.scales[rows].argmin(1), scene.gaussians.quats[rows]
-    poses = scene.cameras.viewmats[:, :3, :3].transpose(1, 2)[views].float()
-    rotations = {
+    poses = scene.cameras.viewmats[:, :3, :3].transpose(1, 2)
+    in_world = _multiply(_quats_of(poses).float()[views], quats)
+    as_xyzw = from_xyzw(quats)
+    turns = {
         "wxyz": quat_to_rotmat(quats),
-        "xyzw": quat_to_rotmat(from_xyzw(quats)),
-        "camera": poses @ quat_to_rotmat(quats),
+        "xyzw": quat_to_rotmat(as_xyzw),
+        "camera": quat_to_rotmat(in_world),
     }
-    cosine = {}
-    for name in _READINGS:
-        axes = rotations[name].gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
-        cosine[name] = float((axes * normals).sum(1).abs().mean())
+    cosine: dict[QuatChoice, float] = {
+        name: float(_cosines(turns[name], thinnest, normals).mean()) for name in _READINGS
+    }
     best = max(_READINGS, key=lambda name: cosine[name])
-    if best == "wxyz" or cosine[best] < _MIN_COSINE or cosine[best] < cosine["wxyz"] + _MIN_GAIN:
+    needed = cosine["wxyz"] + _MIN_GAIN
+    root = _better_of(square_roots(as_xyzw), thinnest, normals)
+    rival = max(_better_of(pair, thinnest, normals) for pair in _with_second(quats, as_xyzw, in_world))
+    if 1 - root <= _MAX_LEFT * (1 - rival):
+        best, cosine["xyzw-root"] = "xyzw-root", root
+    if best == "wxyz" or cosine[best] < max(_MIN_COSINE, needed):
         return "wxyz", ""
-    words = {"xyzw": "stored with w last", "camera": "relative to each view's camera"}[best]
     return best, (
-        f"rotations are {words}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the surface then,"
-        f" {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
+        f"rotations are {_WORDS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the surface"
+        f" then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
     )
+
+
+def _cosines(turns: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
+    """``[n]`` between the thinnest axes of Gaussians turned by ``[n,3,3]`` and the normals, 0 to 1."""
+    axes = turns.gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    return (axes * normals).sum(1).abs()
+
+
+def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor) -> float:
+    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``."""
+    first, second = (_cosines(quat_to_rotmat(quats), thinnest, normals) for quats in pair)
+    return float(torch.maximum(first, second).mean())
+
+
+def _with_second(quats: Tensor, *others: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """All other readings, each with a second rotation as the roots have it: half a turn more about the same axis."""
+    return [square_roots(quats), *((one, _half_a_turn_more(one)) for one in (quats, *others))]
+
+
+def _half_a_turn_more(quats: Tensor) -> Tensor:
+    """Rotations ``[n,4]`` with half a turn more about their own axes."""
+    length = quats[:, 1:].norm(dim=1, keepdim=True)
+    axis = torch.where(length > 0, quats[:, 1:] / length, quats.new_tensor([0.0, 0, 1]))
+    return torch.cat([-length, quats[:, :1] * axis], 1)
+
+
+def _every_normal(scene: PixelScene) -> Tensor:
+    """``[n,3]`` normals of the surface at all pixels; not to be trusted beside missing ones."""
+    v, h, w = scene.valid.shape
+    grid = scene.gaussians.means.reshape(v, h, w, 3)
+    x, y = torch.arange(w), torch.arange(h)
+    across = grid[:, :, (x + _STEP).clamp(max=w - 1)] - grid[:, :, (x - _STEP).clamp(min=0)]
+    down = grid[:, (y + _STEP).clamp(max=h - 1)] - grid[:, (y - _STEP).clamp(min=0)]
+    return torch.nn.functional.normalize(torch.linalg.cross(across.float(), down.float()).reshape(-1, 3), dim=1)
 
 
 def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:

@@ -31,5 +31,5 @@ YONOSPLAT = Dialect(
 VICASPLAT = Dialect("vicasplat", "VicaSplat", "logit", "unordered", ("pruned",), degrees=(0, 4))
 FLASH3D = Dialect("flash3d", "Flash3D", "raw", "layer-major", ("full",), _UPRIGHT, per_pixel=(2,))
 SPLATT3R = Dialect(
-    "splatt3r", "Splatt3R", "raw", "view-major", ("full",), ("same", "scaled", "shifted", "other"), quats="xyzw"
+    "splatt3r", "Splatt3R", "raw", "view-major", ("full",), ("same", "scaled", "shifted", "other"), quats="xyzw-root"
 )
