@@ -17,7 +17,9 @@ _STEP = 2  # pixels to the neighbours that span the surface
 _FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian says which way its surface faces
 _MIN_TESTED = 300
 _MIN_COSINE, _MIN_GAIN = 0.6, 0.15  # of the mean cosine between thinnest axis and normal, for another reading
-_MAX_LEFT = 0.5  # of what is missing to a cosine of 1: roots beside other readings with a second rotation, too
+_AROUND = 5  # pixels of the square over which means are averaged where roots are looked at
+_FOLLOWS = 0.95  # cosine above which an axis follows the surface
+_MAX_LEFT = 0.5  # share of Gaussians that follow under no root, over that under any other reading
 _READINGS: tuple[QuatChoice, ...] = ("wxyz", "xyzw", "camera")
 _WORDS = {
     "xyzw": "stored with w last",
@@ -41,7 +43,7 @@ def read_rotations(scene: PixelScene, reading: QuatChoice) -> PixelScene:
     if reading == "xyzw":
         turned = from_xyzw(quats)
     elif reading == "xyzw-root":
-        normals, thinnest = _every_normal(scene), scene.gaussians.scales.argmin(1)
+        normals, thinnest = _smooth_normals(scene), scene.gaussians.scales.argmin(1)
         roots = square_roots(from_xyzw(quats))
         first, second = (_cosines(quat_to_rotmat(root), thinnest, normals) for root in roots)
         turned = torch.where((second > first)[:, None], roots[1], roots[0])
@@ -95,13 +97,10 @@ def likely_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
     cosine: dict[QuatChoice, float] = {
         name: float(_cosines(turns[name], thinnest, normals).mean()) for name in _READINGS
     }
-    best = max(_READINGS, key=lambda name: cosine[name])
-    needed = cosine["wxyz"] + _MIN_GAIN
-    root = _better_of(square_roots(as_xyzw), thinnest, normals)
-    rival = max(_better_of(pair, thinnest, normals) for pair in _with_second(quats, as_xyzw, in_world))
-    if 1 - root <= _MAX_LEFT * (1 - rival):
-        best, cosine["xyzw-root"] = "xyzw-root", root
-    if best == "wxyz" or cosine[best] < max(_MIN_COSINE, needed):
+    best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
+    if _is_root(scene, rows, [quats, as_xyzw, in_world], thinnest, normals):
+        best, cosine["xyzw-root"] = "xyzw-root", _better_of(square_roots(as_xyzw), thinnest, normals, 0.0)
+    elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + _MIN_GAIN):
         return "wxyz", ""
     return best, (
         f"rotations are {_WORDS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the surface"
@@ -115,15 +114,33 @@ def _cosines(turns: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
     return (axes * normals).sum(1).abs()
 
 
-def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor) -> float:
-    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``."""
+def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Tensor, normals: Tensor) -> bool:
+    """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
+
+    The better of two is better by chance as well: every other reading is given a second rotation as the roots have it,
+    half a turn more about the same axis.
+
+    Args:
+        scene: As it stands.
+        rows: ``[t]`` Gaussians that are looked at.
+        single: ``[t,4]`` their rotations as read otherwise; as stored first, as xyzw next.
+        thinnest: ``[t]`` their thinnest axes.
+        normals: ``[t,3]`` of the surface there, roughly: a first look, which takes little time.
+    """
+    others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
+    roots = square_roots(single[1])
+    if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in others):
+        return False
+    smooth = _smooth_normals(scene)[rows]
+    rival = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in others)
+    return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - rival)
+
+
+def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor, least: float) -> float:
+    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``; share above ``least`` if not 0."""
     first, second = (_cosines(quat_to_rotmat(quats), thinnest, normals) for quats in pair)
-    return float(torch.maximum(first, second).mean())
-
-
-def _with_second(quats: Tensor, *others: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """All other readings, each with a second rotation as the roots have it: half a turn more about the same axis."""
-    return [square_roots(quats), *((one, _half_a_turn_more(one)) for one in (quats, *others))]
+    better = torch.maximum(first, second)
+    return float((better > least).float().mean() if least else better.mean())
 
 
 def _half_a_turn_more(quats: Tensor) -> Tensor:
@@ -133,14 +150,19 @@ def _half_a_turn_more(quats: Tensor) -> Tensor:
     return torch.cat([-length, quats[:, :1] * axis], 1)
 
 
-def _every_normal(scene: PixelScene) -> Tensor:
-    """``[n,3]`` normals of the surface at all pixels; not to be trusted beside missing ones."""
+def _smooth_normals(scene: PixelScene) -> Tensor:
+    """``[n,3]`` normals of the surface at all pixels, of means averaged over some pixels around."""
     v, h, w = scene.valid.shape
-    grid = scene.gaussians.means.reshape(v, h, w, 3)
+    weights = scene.valid.reshape(v, 1, h, w).float()
+    means = torch.where(weights > 0, scene.gaussians.means.reshape(v, h, w, 3).permute(0, 3, 1, 2).float(), 0.0)
+    middle = means.sum((0, 2, 3), keepdim=True) / weights.sum().clamp(min=1)
+    both = torch.cat([(means - middle) * weights, weights], 1)
+    around = torch.nn.functional.avg_pool2d(both, _AROUND, 1, _AROUND // 2)
+    grid = (around[:, :3] / around[:, 3:].clamp(min=1e-6)).permute(0, 2, 3, 1)
     x, y = torch.arange(w), torch.arange(h)
     across = grid[:, :, (x + _STEP).clamp(max=w - 1)] - grid[:, :, (x - _STEP).clamp(min=0)]
     down = grid[:, (y + _STEP).clamp(max=h - 1)] - grid[:, (y - _STEP).clamp(min=0)]
-    return torch.nn.functional.normalize(torch.linalg.cross(across.float(), down.float()).reshape(-1, 3), dim=1)
+    return torch.nn.functional.normalize(torch.linalg.cross(across, down).reshape(-1, 3), dim=1)
 
 
 def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
