@@ -135,8 +135,9 @@ def _distances(
         with np.errstate(invalid="ignore"):
             inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
         u, v = u[inside], v[inside]
-        distances[inside, view] = np.hypot((u + shift) % 1 - 0.5, (v + shift) % 1 - 0.5)
         pixels[inside, view] = v.astype(np.int32) * width + u.astype(np.int32)
+        du, dv = (x + shift - np.floor(x + shift) - 0.5 for x in (u, v))
+        distances[inside, view] = np.sqrt(du * du + dv * dv)
     return distances, pixels
 
 
