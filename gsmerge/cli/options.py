@@ -92,6 +92,7 @@ class Quats(str, Enum):
     auto = "auto"
     wxyz = "wxyz"
     xyzw = "xyzw"
+    xyzw_root = "xyzw-root"
     camera = "camera"
 
 
@@ -103,6 +104,7 @@ class Order(str, Enum):
     view_fastest = "view-fastest"
     layer_major = "layer-major"
     column_major = "column-major"
+    unordered = "unordered"
     none = "none"
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 from gsmerge.io.layouts import ORDERS, Order
 
-QuatChoice = Literal["auto", "wxyz", "xyzw", "camera"]
-QUATS: tuple[str, ...] = ("auto", "wxyz", "xyzw", "camera")
+QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
+QUATS: tuple[str, ...] = get_args(QuatChoice)
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,11 @@ class Reading:
 
     Args:
         dialect: Which exporter wrote it, a name of :data:`gsmerge.io.dialects.DIALECTS`; "auto": found out.
-        quats: How rotations are stored: "wxyz", "xyzw", or "camera" (wxyz, relative to the own view's camera);
+        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are taken,
+            where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
             "auto": as the dialect says, and checked against the surface where the pixels are known.
-        order: Order of the rows; "none": they belong to no pixels.
+        order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
+            pixels.
         scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
 
     Raises:

@@ -18,17 +18,19 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.dialects.voxels import is_padding
+from gsmerge.io.evidence import Clues
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes
+from gsmerge.io.layouts import MAY_BE_LOOSE
 from gsmerge.io.loose import looks_like_a_grid
 from gsmerge.io.mismatch import count_problem, misaligned, other_grid
 from gsmerge.io.nerfstudio import seen_in_dataparser
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
-from gsmerge.io.recover import Clues, Recovery, recover
+from gsmerge.io.recover import Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
@@ -222,7 +224,7 @@ def _loose(
     cameras, images = clues.cameras, clues.images
     views, width, height = len(cameras), cameras.width, cameras.height
     problem, remedy = count_problem(ply.info, views, width, height), other_grid(ply.info.count, views, width, height)
-    if clues.order != "none":
+    if clues.order not in MAY_BE_LOOSE:
         if len(ply.gaussians) == views * width * height:
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
