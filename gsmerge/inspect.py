@@ -210,7 +210,7 @@ def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, A
     camera_file = None
     try:
         if files.cameras is not None:
-            camera_file = read_cameras(files.cameras)
+            camera_file = read_cameras(files.cameras, scene=files.ply.stem)
             found |= {"num_views": len(camera_file), "camera_format": camera_file.source}
         load = align_scene(ply, files, camera_file, reading=reading)
     except SceneError as error:

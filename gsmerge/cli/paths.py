@@ -97,4 +97,4 @@ def cameras_of(files: SceneFiles) -> CameraFile:
 
     if files.cameras is None:
         raise SceneError(files.ply, "no cameras found beside it", "name them with --cameras")
-    return read_cameras(files.cameras)
+    return read_cameras(files.cameras, scene=files.ply.stem)
