@@ -230,7 +230,7 @@ def _sight(load: SceneLoad) -> Sight | None:
     if len(scene) == 0:
         return None
     everything = torch.ones(len(scene.gaussians), dtype=torch.bool)
-    valid = scene.valid.reshape(-1) if isinstance(scene, PixelScene) else everything
+    valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else everything
     return sight(scene.gaussians, valid, scene.cameras, scene.images)
 
 

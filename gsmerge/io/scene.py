@@ -169,7 +169,7 @@ def align_scene(
     if read.source == ESTIMATED:
         notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
     notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
-    alignment = check_alignment(scene.gaussians, scene.cameras, scene.valid)
+    alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
     return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
 
 
@@ -307,7 +307,7 @@ def _colour_notes(scene: PixelScene) -> list[str]:
     step = max(1, scene.pixels_per_view // 5000)
     colours = scene.gaussians.sh0.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
     photos = scene.images.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
-    valid = scene.valid.reshape(len(scene), -1)[:, ::step]
+    valid = scene.stored.reshape(len(scene), -1)[:, ::step]
     odd = [
         name
         for name, colour, photo, ok in zip(scene.names, colours, photos, valid, strict=True)

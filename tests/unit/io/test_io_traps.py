@@ -101,6 +101,9 @@ def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
     scene = load_scene(tmp_path / "gs_ply/0000.ply").pixel_scene()
     assert scene.valid.all()
     assert (scene.gaussians.means - tiny.gaussians.means).norm(dim=1).max() < 0.05
+    rows = torch.from_numpy(da3_rows(tiny))  # and is never taken for the file's own
+    assert torch.equal(torch.nonzero(scene.stored.reshape(-1))[:, 0], rows)
+    assert torch.equal(scene.file_gaussians.means, tiny.gaussians.means[rows])
 
 
 def test_rotations_are_never_changed(tmp_path: Path) -> None:
