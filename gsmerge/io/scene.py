@@ -39,6 +39,23 @@ _MIN_CORRELATION = 0.5
 
 
 @dataclass(frozen=True)
+class Views:
+    """All views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures.
+
+    Args:
+        cameras: The c cameras.
+        images: ``[c,h,w,3]`` photos, or None.
+        names: Names of the c views.
+        used: Which of them the scene has, each once, in its order.
+    """
+
+    cameras: Cameras
+    images: Tensor | None
+    names: tuple[str, ...]
+    used: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class SceneLoad:
     """A scene and how it came about.
 
@@ -52,6 +69,7 @@ class SceneLoad:
         problem: Why no pixels were found, in one sentence; None where they were.
         dialects: The exporters that may have written the file, or the one that was told.
         notes: What was adapted or looks odd, one sentence each, without a full stop.
+        views: All views that there are cameras of, also those that the scene does not have.
     """
 
     scene: PixelScene | LooseScene
@@ -63,6 +81,7 @@ class SceneLoad:
     problem: str | None
     dialects: tuple[Dialect, ...]
     notes: tuple[str, ...]
+    views: Views
 
     def pixel_scene(self) -> PixelScene:
         """The scene, for those who need one Gaussian per pixel.
@@ -132,7 +151,12 @@ def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlySce
 
 
 def align_scene(
-    ply: PlyScene, files: SceneFiles, camera_file: CameraFile | None = None, *, reading: Reading = AUTO
+    ply: PlyScene,
+    files: SceneFiles,
+    camera_file: CameraFile | None = None,
+    *,
+    reading: Reading = AUTO,
+    photos: bool = True,
 ) -> SceneLoad:
     """Put Gaussians, cameras and images together and find out which row belongs to which pixel.
 
@@ -141,6 +165,7 @@ def align_scene(
         files: Where the cameras and images are.
         camera_file: The cameras, if they are read already.
         reading: What is told instead of found.
+        photos: Whether to look for photos.
 
     Raises:
         SceneError: As :func:`read_scene`.
@@ -151,8 +176,8 @@ def align_scene(
     told = find_dialect(reading.dialect)
     known = told.order if told is not None else read.order
     order = known if reading.order == "auto" else reading.order
-    read, photos, notes = as_pinholes(read, stored_photos(files, read))
-    fitted = fit_cameras(ply, read, photos, order=order, scale=reading.scene_scale)
+    read, pictures, notes = as_pinholes(read, stored_photos(files, read) if photos else None)
+    fitted = fit_cameras(ply, read, pictures, order=order, scale=reading.scene_scale)
     clues, recovery, read = fitted.clues, fitted.recovery, fitted.camera_file
     notes += fitted.notes
     if recovery is None:
@@ -164,13 +189,15 @@ def align_scene(
     scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, clues.images, read.names)
     scene, filled = _filled(scene, recovery, clues.depths)
     scene, turned = _with_rotations(scene, reading, dialects)
+    views = Views(in_frame, clues.images, read.names, tuple(dict.fromkeys(best.layout.views)))
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
     if read.source == ESTIMATED:
         notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
     notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
-    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
+    said = (*ply_notes(ply.info), *notes)
+    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, said, views)
 
 
 def _filled(
@@ -241,7 +268,10 @@ def _loose(
     gaussians, padding = _loose_rows(ply, reading)
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
-    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost))
+    all_views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
+    return SceneLoad(
+        scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost), all_views
+    )
 
 
 def _loose_rows(ply: PlyScene, reading: Reading) -> tuple[Gaussians, list[str]]:
@@ -288,7 +318,8 @@ def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> Scen
     gaussians, padding = _loose_rows(ply, reading)
     scene = LooseScene(gaussians, none, None, ())
     problem = "expected one Gaussian per pixel, found no cameras that have any"
-    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, (*ply_notes(ply.info), *padding))
+    said = (*ply_notes(ply.info), *padding)
+    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, said, Views(none, None, (), ()))
 
 
 def _lacks_cameras(clues: Clues) -> bool:
