@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.image_header import stored_size, told_size
+from gsmerge.io.png import SIGNATURE, checked_png
 from gsmerge.threads import parallel_map
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
@@ -180,8 +181,9 @@ def _decoded(path: Path, data: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
     width, height = size
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    sound = checked_png(data) if data[: len(SIGNATURE)].tobytes() == SIGNATURE else data
     try:
-        image = cv2.imdecode(data, flags) if len(data) else None
+        image = cv2.imdecode(sound, flags) if sound is not None and len(sound) else None
     except cv2.error:
         image = None
     if image is None:
