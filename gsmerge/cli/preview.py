@@ -25,6 +25,7 @@ def preview(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
     json: opt.JsonOption = False,
@@ -33,7 +34,7 @@ def preview(
     debug: opt.DebugOption = False,
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files, place_views, ply_notes, read_ply, read_told
     from gsmerge.preview import contact_sheet, pick_views
     from gsmerge.threads import use_threads

@@ -14,6 +14,8 @@ from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
 from gsmerge.cli.paths import check_cameras, check_folder, input_files, source_of
 from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 
+MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
+
 if TYPE_CHECKING:
     from gsmerge.io import Placed, PlyScene, SceneFiles
     from gsmerge.types import Cameras, Gaussians
@@ -72,11 +74,12 @@ def render(
 
 def _placed(ply: PlyScene, like: SceneFiles) -> Placed:
     """The Gaussians, and the cameras as they stand for the scene of ``like``."""
-    from gsmerge.io import place_views, ply_notes, read_ply
+    from gsmerge.io import Reading, place_views, ply_notes, read_ply
 
+    reading = Reading(max_side=MAX_SIDE)
     if str(like.ply) == ply.info.path:
-        return place_views(ply, like, photos=False)
-    placed = place_views(read_ply(like.ply), like, photos=False)
+        return place_views(ply, like, reading=reading, photos=False)
+    placed = place_views(read_ply(like.ply), like, reading=reading, photos=False)
     return replace(placed, gaussians=ply.gaussians, notes=(*ply_notes(ply.info), *placed.notes))
 
 

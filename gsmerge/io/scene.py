@@ -22,6 +22,7 @@ from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes
+from gsmerge.io.large import lighter_photos, lighter_views
 from gsmerge.io.loose import looks_like_a_grid
 from gsmerge.io.mismatch import count_problem, misaligned, other_grid
 from gsmerge.io.nerfstudio import seen_in_dataparser
@@ -111,7 +112,8 @@ def read_scene(
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
-        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``.
+        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``,
+            ``max_side``.
 
     Returns:
         One Gaussian per pixel; a :class:`gsmerge.types.LooseScene` where the rows belong to no pixels.
@@ -177,6 +179,8 @@ def align_scene(
     known = told.order if told is not None else read.order
     order = known if reading.order == "auto" else reading.order
     read, pictures, notes = as_pinholes(read, stored_photos(files, read) if photos else None)
+    pictures, smaller = lighter_photos(pictures, len(ply.gaussians), reading.max_side, loose=order == "none")
+    notes += smaller
     fitted = fit_cameras(ply, read, pictures, order=order, scale=reading.scene_scale)
     clues, recovery, read = fitted.clues, fitted.recovery, fitted.camera_file
     notes += fitted.notes
@@ -266,6 +270,8 @@ def _loose(
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
     gaussians, padding = _loose_rows(ply, reading)
+    cameras, images, smaller = lighter_views(cameras, images, reading.max_side)
+    notes += tuple(smaller)
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
     all_views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
