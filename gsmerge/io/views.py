@@ -39,7 +39,7 @@ def cameras_of(ply: PlyScene, files: SceneFiles) -> CameraFile:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         raise SceneError(
             files.ply,
-            f"no cameras found beside it (looked for {places})",
+            f"no cameras found beside it (looked for {places}, one .torch chunk)",
             "name them with --cameras, or have views placed with --order none",
         )
     return found
