@@ -61,4 +61,5 @@ def subset(scene: PixelScene | LooseScene, view_ids: Sequence[int]) -> PixelScen
         images=images,
         valid=scene.valid[ids],
         names=names,
+        missing=None if scene.missing is None else scene.missing[ids],
     )

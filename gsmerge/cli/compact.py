@@ -29,6 +29,7 @@ def compact(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
     method: opt.MethodOption = None,
@@ -59,7 +60,7 @@ def compact(
 ) -> None:
     """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)

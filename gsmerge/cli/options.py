@@ -195,6 +195,15 @@ LpipsOption = Annotated[
         rich_help_panel=MEASURING,
     ),
 ]
+MaxSideOption = Annotated[
+    int | None,
+    typer.Option(
+        min=16,
+        help="Longest side of the views of Gaussians that belong to no pixels; larger photos are resized.",
+        show_default="1600",
+        rich_help_panel=INPUT,
+    ),
+]
 SuperpixelsOption = Annotated[
     int | None,
     typer.Option(min=1, help="Superpixels per view. Wins over --density.", rich_help_panel=SEGMENTATION),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,9 @@ def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> in
     return count
 
 
-def reading_of(dialect: str, quats: QuatChoice, order: Order, scene_scale: float | None) -> Reading:
+def reading_of(
+    dialect: str, quats: QuatChoice, order: Order, scene_scale: float | None, max_side: int | None = None
+) -> Reading:
     """What the command line tells about the file.
 
     Raises:
@@ -44,7 +47,8 @@ def reading_of(dialect: str, quats: QuatChoice, order: Order, scene_scale: float
 
     with told_as_usage():
         find_dialect(dialect)
-        return Reading(dialect=dialect, quats=quats, order=order, scene_scale=scene_scale)
+        found = Reading(dialect=dialect, quats=quats, order=order, scene_scale=scene_scale)
+        return found if max_side is None else replace(found, max_side=max_side)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ class Reading:
         order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
             pixels.
         scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
+        max_side: Longest side, pixels, at which views are worked on whose Gaussians belong to no pixels.
 
     Raises:
         ValueError: If a value is none of the possible ones.
@@ -33,6 +34,7 @@ class Reading:
     quats: QuatChoice = "auto"
     order: Order = "auto"
     scene_scale: float | None = None
+    max_side: int = 1600
 
     def __post_init__(self) -> None:
         for name, known in (("quats", QUATS), ("order", ORDERS)):
@@ -40,6 +42,8 @@ class Reading:
                 raise ValueError(f"{name}: expected {_listed(known)}, got {getattr(self, name)!r}")
         if self.scene_scale is not None and not 0 < self.scene_scale < float("inf"):
             raise ValueError(f"scene_scale: expected a positive number, got {self.scene_scale}")
+        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or self.max_side < 16:
+            raise ValueError(f"max_side: expected a whole number of at least 16 pixels, got {self.max_side!r}")
 
 
 AUTO = Reading()
