@@ -200,7 +200,7 @@ MaxSideOption = Annotated[
     typer.Option(
         min=16,
         help="Longest side of the views of Gaussians that belong to no pixels; larger photos are resized.",
-        show_default="1600",
+        show_default="1200",
         rich_help_panel=INPUT,
     ),
 ]

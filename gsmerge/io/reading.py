@@ -34,7 +34,7 @@ class Reading:
     quats: QuatChoice = "auto"
     order: Order = "auto"
     scene_scale: float | None = None
-    max_side: int = 1600
+    max_side: int = 1200
 
     def __post_init__(self) -> None:
         for name, known in (("quats", QUATS), ("order", ORDERS)):
