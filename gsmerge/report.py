@@ -226,7 +226,7 @@ def plan_document(
     pixels = max(views * height * width, count or 0)
     fit = options["fit"] if photos else "none"
     robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
-    work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
+    work = COST_READ + COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_SCORE * photos
     work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
     steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps

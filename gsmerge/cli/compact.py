@@ -32,7 +32,7 @@ def compact(
     scene_scale: opt.SceneScaleOption = None,
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
-    method: opt.MethodOption = None,
+    segmentation: opt.SegmentationOption = None,
     effort: opt.EffortOption = None,
     k: opt.KOption = None,
     budget: opt.BudgetOption = None,
@@ -76,7 +76,7 @@ def compact(
         "device": device,
         "superpixels": superpixels,
         "density": density,
-        "method": method,
+        "segmentation": segmentation,
         "effort": effort,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}

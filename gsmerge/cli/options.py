@@ -21,8 +21,8 @@ INPUT, SEGMENTATION, COUNT, MERGING, OUTPUT = (
 )
 
 
-class Method(str, Enum):
-    """Superpixel methods."""
+class Segmentation(str, Enum):
+    """Ways to cut superpixels."""
 
     rdseg = "rdseg"
     bass = "bass"
@@ -172,9 +172,9 @@ DensityOption = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, help="Superpixels per pixel.", show_default="0.044", rich_help_panel=SEGMENTATION),
 ]
-MethodOption = Annotated[
-    Method | None,
-    typer.Option(help="Superpixel method.", show_default="rdseg", rich_help_panel=SEGMENTATION),
+SegmentationOption = Annotated[
+    Segmentation | None,
+    typer.Option(help="How superpixels are cut.", show_default="rdseg", rich_help_panel=SEGMENTATION),
 ]
 EffortOption = Annotated[
     Effort | None,
