@@ -48,6 +48,7 @@ def compact(
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
     unseen: opt.UnseenOption = None,
+    method: opt.MethodOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -78,6 +79,7 @@ def compact(
         "density": density,
         "segmentation": segmentation,
         "effort": effort,
+        "method": method,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
@@ -132,7 +134,7 @@ def _run(
             superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
         read = perf_counter()
         with (
-            announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
+            announce_compilation(quiet=quiet, share=_fits_fully(settings)) as finish,
             stage_progress(quiet=quiet) as progress,
         ):
 
@@ -163,6 +165,11 @@ def _run(
         notes=notes,
         hashed=hashed,
     )
+
+
+def _fits_fully(settings: CompactOptions) -> bool:
+    """Whether the kernels of the full fit will be needed."""
+    return settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
 
 
 def _recognised(loaded: SceneLoad) -> dict[str, Any]:

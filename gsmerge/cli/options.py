@@ -30,6 +30,23 @@ class Segmentation(str, Enum):
     slic = "slic"
 
 
+class Method(str, Enum):
+    """Our own method and its rivals."""
+
+    gsmerge = "gsmerge"
+    unmerged = "unmerged"
+    unmerged_color = "unmerged-color"
+    unmerged_fit = "unmerged-fit"
+    paper = "paper"
+    voxel = "voxel"
+    opacity = "opacity"
+    contribution = "contribution"
+    random = "random"
+    blocks = "blocks"
+    greedy = "greedy"
+    splat_transform = "splat-transform"
+
+
 class Effort(str, Enum):
     """How much work to put in."""
 
@@ -266,6 +283,14 @@ MatchOption = Annotated[
 ]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
+]
+MethodOption = Annotated[
+    Method | None,
+    typer.Option(
+        help="What makes the result: gsmerge, or another method to compare it with.",
+        show_default="gsmerge",
+        rich_help_panel=MERGING,
+    ),
 ]
 UnseenOption = Annotated[
     Unseen | None,
