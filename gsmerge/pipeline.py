@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from gsmerge.allocate import RegionTree
-from gsmerge.baselines import Baseline, check_scene, find_baseline, unused_settings
+from gsmerge.baselines import Baseline, check_scene, find_baseline, unused_notes
 from gsmerge.build import Source, build
 from gsmerge.canonical import Frame
 from gsmerge.contribution import ContributionOptions
@@ -185,9 +185,7 @@ def _rival(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
     baseline = find_baseline(settings.method)
     if baseline is not None:
         check_scene(baseline, scene)
-        unused = unused_settings(baseline, settings)
-        if unused:
-            journal.notes.append(f"method {baseline.name} does not look at {', '.join(unused)}")
+        journal.notes += unused_notes(baseline, settings)
     return baseline
 
 

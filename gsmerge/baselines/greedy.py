@@ -29,7 +29,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 NEIGHBORS = 10
-PAIRS = 1 / 3  # of the Gaussians that a round may merge at most: later pairs of a full matching are poor ones
 COLOR_WEIGHT = 1.0  # of squared distances of harmonics against nats
 FLAT = 0.01  # least scale, as a share of the largest: the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4
@@ -188,11 +187,14 @@ def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
 
 
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
-    """Rounds of merging until ``count`` are left; nothing is done where there are no more."""
+    """Rounds of merging until ``count`` are left; nothing is done where there are no more.
+
+    A round takes every pair that it can. Fewer at a time keep cheap regions growing while the rest stays as it is, and
+    render worse: on a real capture by 0.6 dB at a third of the Gaussians a round, by 1.6 dB at a sixth.
+    """
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)
-        limit = min(len(cloud) - count, max(1, int(PAIRS * len(cloud))))
-        chosen = cheapest_disjoint(left, right, costs, limit)
+        chosen = cheapest_disjoint(left, right, costs, len(cloud) - count)
         cloud = merge_pairs(cloud, left[chosen], right[chosen])
     return cloud
 

@@ -55,7 +55,8 @@ def check_scene(baseline: Baseline, scene: PixelScene | LooseScene) -> None:
         find_program()
 
 
-def unused_settings(baseline: Baseline, options: CompactOptions) -> list[str]:
-    """Settings that were changed and that a method does not look at, by flat name."""
+def unused_notes(baseline: Baseline, options: CompactOptions) -> list[str]:
+    """A sentence that names the settings that were changed and that a method does not look at, if there are any."""
     usual, own = CompactOptions().to_dict(), {*baseline.uses, *EVERYBODY_S}
-    return [name for name, value in options.to_dict().items() if name not in own and value != usual[name]]
+    unused = [name for name, value in options.to_dict().items() if name not in own and value != usual[name]]
+    return [f"method {baseline.name} does not look at {', '.join(unused)}"] if unused else []

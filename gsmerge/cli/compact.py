@@ -199,6 +199,7 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 def _print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
+    from gsmerge.baselines import check_scene, find_baseline, unused_notes
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
     from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
@@ -208,8 +209,12 @@ def _print_plan(
     scene, cameras = loaded.scene, loaded.scene.cameras
     if len(scene):
         superpixels_per_view(settings.segment, cameras.width, cameras.height)
+    baseline, unused = find_baseline(settings.method), []
     with told_as_usage():
         wanted = limit_of(scene, settings)
+    if baseline is not None:
+        check_scene(baseline, scene)
+        unused = unused_notes(baseline, settings)
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
@@ -221,7 +226,7 @@ def _print_plan(
         fit_steps=settings.fit.steps,
         usual=usual_count(scene, settings),
         wanted=wanted,
-        notes=loaded.notes,
+        notes=[*loaded.notes, *unused],
         count=scene.num_gaussians,
     )
     if as_json:

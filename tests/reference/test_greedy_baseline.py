@@ -53,7 +53,7 @@ def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
             far = [float(np.linalg.norm(blob.mean - other.mean)) for other in blobs]
             nearest = [j for j in np.argsort(far) if j != i][: greedy.NEIGHBORS]
             pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest}
-        limit = min(len(blobs) - count, max(1, int(greedy.PAIRS * len(blobs))))
+        limit = len(blobs) - count
         chosen: list[tuple[int, int]] = []
         for i, j in sorted(pairs, key=lambda pair: blobs[pair[0]].cost(blobs[pair[1]])):
             if len(chosen) < limit and not any({i, j} & set(pair) for pair in chosen):
