@@ -28,7 +28,7 @@ from gsmerge.types import Gaussians
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NEIGHBORS = 10
+NEIGHBORS = 10  # 16 bring 0.03 dB on a real capture and take half as long again
 COLOR_WEIGHT = 1.0  # of squared distances of harmonics against nats
 FLAT = 0.01  # least scale, as a share of the largest: the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4

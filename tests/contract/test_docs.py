@@ -13,6 +13,7 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
+from gsmerge.options import METHODS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -96,6 +97,11 @@ def test_readme_s_defaults_are_the_library_s(root: Path) -> None:
     told = dict(rows)
     for name, default in cli_defaults():
         assert told[name.replace("_", "-")].replace("`", "") == default
+
+
+def test_readme_lists_every_method(root: Path) -> None:
+    text = (root / "README.md").read_text()
+    assert [method for method in METHODS if f"| `{method}` |" not in text] == []
 
 
 def test_every_option_is_a_field_of_the_api() -> None:
