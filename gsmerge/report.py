@@ -24,6 +24,9 @@ COST_SCORE = 1.3  # rendering the photos from input and output
 COST_ROBUST = 1.6
 COST_COLOR_FIT = 0.9
 COST_FULL_FIT = 0.36  # per step and million pixels of one view
+COST_RIVALS = {"paper": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
+COST_RIVAL = 0.2  # of the others
+COST_RIVAL_STEP = 0.15  # per step of the full fit, for each million Gaussians of an input that was not merged
 BYTES_FIXED = 350_000_000  # interpreter, torch and numba
 BYTES_PER_GAUSSIAN = 240
 BYTES_PER_PIXEL = 100  # the photo as floats and what segmentation and rendering keep of it
@@ -224,13 +227,18 @@ def plan_document(
     """
     views, height, width = grid
     pixels = max(views * height * width, count or 0)
-    fit = options["fit"] if photos else "none"
-    robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
-    work = COST_READ + COST_MERGE + COST_SEGMENT[options["method"]] + COST_SCORE * photos
-    work += COST_ROBUST * robust + COST_COLOR_FIT * (fit == "color")
+    method, at_most = options["method"], usual if wanted is None else wanted
+    fit, robust = _fit_of(method, options, photos), False
+    if method == "gsmerge":
+        robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
+        work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * robust
+    else:
+        work = COST_RIVALS.get(method, COST_RIVAL)
+        at_most = pixels if method.startswith("unmerged") else at_most
+    work += COST_READ + COST_SCORE * photos + COST_COLOR_FIT * (fit == "color")
     steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
-    at_most = usual if wanted is None else wanted
+    seconds += pixels / 1e6 * COST_RIVAL_STEP * steps * (method == "unmerged-fit")
     memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
     return {
         **document_head(),
@@ -240,6 +248,7 @@ def plan_document(
             "path": os.fspath(output_path),
             "num_gaussians_at_most": min(count or pixels, at_most),
         },
+        "method": method,
         "superpixels_per_view": per_view if wanted is None and options["k"] != "auto" else None,
         "robust": robust,
         "fit": fit,
@@ -252,6 +261,12 @@ def plan_document(
     }
 
 
+def _fit_of(method: str, options: Mapping[str, Any], photos: bool) -> str:
+    """What is fitted to the photos."""
+    own = {"gsmerge": options["fit"], "unmerged-fit": "full", "unmerged-color": "color"}
+    return own.get(method, "none") if photos else "none"
+
+
 def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     """The plan for people."""
     found, guess, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
@@ -259,12 +274,15 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     superpixels = (
         f"{per_view:,} per view, {plan['options']['k']} Gaussian(s) each" if even else "where the scene needs them"
     )
-    return [
-        f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",
-        f"would write  {plan['output']['path']}: at most {plan['output']['num_gaussians_at_most']:,} Gaussians",
+    steps = [
         f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
         f" across views: {plan['options']['match']}",
+    ]
+    return [
+        f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",
+        f"would write  {plan['output']['path']}: at most {plan['output']['num_gaussians_at_most']:,} Gaussians",
+        *(steps if plan["method"] == "gsmerge" else [f"method       {plan['method']}"]),
         f"fit          {plan['fit']}",
         f"estimate     about {guess['seconds']:.0f} s, {human_bytes(guess['memory_bytes'])} of memory",
         *(f"note         {note}" for note in plan["notes"]),

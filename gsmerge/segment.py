@@ -3,7 +3,7 @@
 The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
 first (more than wanted), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
 is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
-Shi-Tomasi response, as in the paper, and ``slic`` the common baseline. Whatever the method, there are exactly as
+Shi-Tomasi response, as in the paper, and ``slic`` the common baseline. Whichever it is, there are exactly as
 many superpixels as asked for, none is empty, each is 4-connected, and a run repeats bit for bit.
 """
 
@@ -23,7 +23,7 @@ from gsmerge.kernels.ward import merge_regions
 from gsmerge.threads import parallel_map
 from gsmerge.types import Groups
 
-METHODS = ("rdseg", "bass", "bass-st", "slic")
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic")
 # Effort -> (rectangles per superpixel, sweeps before merging).
 EFFORTS = {"fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
 NUM_SWEEPS = 2
@@ -39,7 +39,7 @@ class SegmentOptions:
     Args:
         superpixels: Superpixels of each view; None to take ``density`` of its pixels.
         density: Superpixels per pixel, in (0, 1].
-        method: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
+        segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
         effort: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
         compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
             [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
@@ -50,7 +50,7 @@ class SegmentOptions:
 
     superpixels: int | None = None
     density: float = 0.044
-    method: str = "rdseg"
+    segmentation: str = "rdseg"
     effort: str = "default"
     compactness: float = 1e-5
 
@@ -59,12 +59,12 @@ class SegmentOptions:
             raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
         if not 0 < self.density <= 1:
             raise ValueError(f"density: expected a number in (0, 1], got {self.density}")
-        _check_method(self.method, self.effort, self.compactness)
+        _check(self.segmentation, self.effort, self.compactness)
 
 
-def _check_method(method: str, effort: str, compactness: float) -> None:
-    if method not in METHODS:
-        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+def _check(segmentation: str, effort: str, compactness: float) -> None:
+    if segmentation not in SEGMENTATIONS:
+        raise ValueError(f"segmentation: expected one of {', '.join(SEGMENTATIONS)}, got {segmentation!r}")
     if effort not in EFFORTS:
         raise ValueError(f"effort: expected one of {', '.join(EFFORTS)}, got {effort!r}")
     if not 0 <= compactness <= 1:
@@ -83,7 +83,7 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -
 
     Args:
         images: ``[v,h,w,3]`` float in [0, 1] or uint8.
-        options: Method and number.
+        options: How, and how many.
         count: Superpixels of each view; None to follow ``options``.
 
     Raises:
@@ -95,7 +95,7 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -
     wanted = count_for(options, height, width) if count is None else count
 
     def one_view(image: Tensor) -> Tensor:
-        return superpixels(image, wanted, options.method, effort=options.effort, compactness=options.compactness)
+        return superpixels(image, wanted, options.segmentation, effort=options.effort, compactness=options.compactness)
 
     labels = parallel_map(one_view, images.unbind(0))
     stacked = torch.stack(labels) if labels else torch.empty((0, height, width), dtype=torch.int32)
@@ -105,7 +105,7 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -
 def superpixels(
     image: Tensor | np.ndarray,
     count: int,
-    method: str = "rdseg",
+    segmentation: str = "rdseg",
     *,
     effort: str = "default",
     compactness: float = 1e-5,
@@ -115,7 +115,7 @@ def superpixels(
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
         count: Superpixels wanted, 1 to h·w.
-        method: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
+        segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
         effort: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the two BASS methods).
 
@@ -129,7 +129,7 @@ def superpixels(
         >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
         [[0, 0], [0, 0]]
     """
-    _check_method(method, effort, compactness)
+    _check(segmentation, effort, compactness)
     pixels = _as_pixels(image)
     height, width, _ = pixels.shape
     if count < 1:
@@ -138,12 +138,12 @@ def superpixels(
         raise ValueError(
             f"count: expected at most {height * width} superpixels ({width} x {height} pixels), got {count}"
         )
-    if method == "rdseg":
+    if segmentation == "rdseg":
         labels = _rdseg(pixels, count, effort, compactness)
-    elif method == "slic":
+    elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
-        labels = _bass(pixels, count, salient=method == "bass-st")
+        labels = _bass(pixels, count, salient=segmentation == "bass-st")
     return torch.from_numpy(np.ascontiguousarray(labels[1:-1, 1:-1]))
 
 

@@ -32,7 +32,7 @@ def compact(
     max_side: opt.MaxSideOption = None,
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
-    method: opt.MethodOption = None,
+    segmentation: opt.SegmentationOption = None,
     effort: opt.EffortOption = None,
     k: opt.KOption = None,
     budget: opt.BudgetOption = None,
@@ -48,6 +48,7 @@ def compact(
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
     unseen: opt.UnseenOption = None,
+    method: opt.MethodOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -76,8 +77,9 @@ def compact(
         "device": device,
         "superpixels": superpixels,
         "density": density,
-        "method": method,
+        "segmentation": segmentation,
         "effort": effort,
+        "method": method,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
@@ -123,7 +125,7 @@ def _run(
             superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
         read = perf_counter()
         with (
-            announce_compilation(quiet=quiet, share=settings.fit.fit == "full") as finish,
+            announce_compilation(quiet=quiet, share=_fits_fully(settings)) as finish,
             stage_progress(quiet=quiet) as progress,
         ):
 
@@ -156,6 +158,11 @@ def _run(
     )
 
 
+def _fits_fully(settings: CompactOptions) -> bool:
+    """Whether the kernels of the full fit will be needed."""
+    return settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
+
+
 def _recognised(loaded: SceneLoad) -> dict[str, Any]:
     """What the report says about the input."""
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
@@ -183,6 +190,7 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 def _print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
+    from gsmerge.baselines import check_scene, find_baseline, unused_notes
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
     from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
@@ -192,8 +200,12 @@ def _print_plan(
     scene, cameras = loaded.scene, loaded.scene.cameras
     if len(scene):
         superpixels_per_view(settings.segment, cameras.width, cameras.height)
+    baseline, unused = find_baseline(settings.method), []
     with told_as_usage():
         wanted = limit_of(scene, settings)
+    if baseline is not None:
+        check_scene(baseline, scene)
+        unused = unused_notes(baseline, settings)
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
@@ -205,7 +217,7 @@ def _print_plan(
         fit_steps=settings.fit.steps,
         usual=usual_count(scene, settings),
         wanted=wanted,
-        notes=loaded.notes,
+        notes=[*loaded.notes, *unused],
         count=scene.num_gaussians,
     )
     if as_json:

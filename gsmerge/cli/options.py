@@ -22,13 +22,30 @@ INPUT, SEGMENTATION, COUNT, MERGING, MEASURING, OUTPUT = (
 )
 
 
-class Method(str, Enum):
-    """Superpixel methods."""
+class Segmentation(str, Enum):
+    """Ways to cut superpixels."""
 
     rdseg = "rdseg"
     bass = "bass"
     bass_st = "bass-st"
     slic = "slic"
+
+
+class Method(str, Enum):
+    """Our own method and its rivals."""
+
+    gsmerge = "gsmerge"
+    unmerged = "unmerged"
+    unmerged_color = "unmerged-color"
+    unmerged_fit = "unmerged-fit"
+    paper = "paper"
+    voxel = "voxel"
+    opacity = "opacity"
+    contribution = "contribution"
+    random = "random"
+    blocks = "blocks"
+    greedy = "greedy"
+    splat_transform = "splat-transform"
 
 
 class Effort(str, Enum):
@@ -212,9 +229,9 @@ DensityOption = Annotated[
     float | None,
     typer.Option(min=0.0, max=1.0, help="Superpixels per pixel.", show_default="0.044", rich_help_panel=SEGMENTATION),
 ]
-MethodOption = Annotated[
-    Method | None,
-    typer.Option(help="Superpixel method.", show_default="rdseg", rich_help_panel=SEGMENTATION),
+SegmentationOption = Annotated[
+    Segmentation | None,
+    typer.Option(help="How superpixels are cut.", show_default="rdseg", rich_help_panel=SEGMENTATION),
 ]
 EffortOption = Annotated[
     Effort | None,
@@ -306,6 +323,14 @@ MatchOption = Annotated[
 ]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
+]
+MethodOption = Annotated[
+    Method | None,
+    typer.Option(
+        help="What makes the result: gsmerge, or another method to compare it with.",
+        show_default="gsmerge",
+        rich_help_panel=MERGING,
+    ),
 ]
 UnseenOption = Annotated[
     Unseen | None,

@@ -28,7 +28,7 @@ def segment(
     ],
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
-    method: opt.MethodOption = None,
+    segmentation: opt.SegmentationOption = None,
     effort: opt.EffortOption = None,
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
@@ -51,7 +51,7 @@ def segment(
     from gsmerge.threads import use_threads
 
     chosen: dict[str, Any] = {"superpixels": superpixels, "density": density}
-    chosen |= {"method": method and method.value, "effort": effort and effort.value}
+    chosen |= {"segmentation": segmentation and segmentation.value, "effort": effort and effort.value}
     with told_as_usage():
         options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
     files = find_scene_files(scene, cameras=cameras, images=images)

@@ -41,7 +41,7 @@ def test_public_functions_are_typed(name: str) -> None:
     ("name", "parameters"),
     [
         ("compact", ["scene", "options", "progress", "settings"]),
-        ("superpixels", ["image", "count", "method"]),
+        ("superpixels", ["image", "count", "segmentation"]),
         ("render", ["gaussians", "cameras", "background"]),
         ("Gaussians", ["means", "quats", "scales", "opacities", "sh0", "shN"]),
         ("Cameras", ["viewmats", "Ks", "width", "height"]),

@@ -14,6 +14,7 @@ import typer.main
 import gsmerge
 from gsmerge.cli.app import app
 from gsmerge.io import Reading
+from gsmerge.options import METHODS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -83,7 +84,8 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
 def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
-    known = {"k", "density", "method", "effort", "robust", "match", "fit", "fit_steps", "seed", "levels", "device"}
+    known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
+    known |= {"levels", "device"}
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None
@@ -103,6 +105,11 @@ def test_readme_s_defaults_are_the_library_s(root: Path) -> None:
     told = dict(rows)
     for name, default in cli_defaults():
         assert told[name.replace("_", "-")].replace("`", "") == default
+
+
+def test_readme_lists_every_method(root: Path) -> None:
+    text = (root / "README.md").read_text()
+    assert [method for method in METHODS if f"| `{method}` |" not in text] == []
 
 
 def test_every_option_is_a_field_of_the_api() -> None:

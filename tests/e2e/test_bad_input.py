@@ -178,7 +178,7 @@ CASES: dict[str, tuple[Spoil, int, list[str]]] = {
     "no superpixels": (given("--superpixels", 0), 2, ["--superpixels"]),
     "density zero": (given("--density", 0), 2, ["density"]),
     "density above one": (given("--density", 1.5), 2, ["--density"]),
-    "unknown method": (given("--method", "magic"), 2, ["--method", "rdseg"]),
+    "unknown segmentation": (given("--segmentation", "magic"), 2, ["--segmentation", "rdseg"]),
     "unknown match": (given("--match", "magic"), 2, ["--match", "overlap"]),
     "unknown option": (given("--magic"), 2, ["--magic"]),
     "no threads": (given("--threads", 0), 2, ["--threads"]),

@@ -1,4 +1,4 @@
-"""Whatever the picture and the method: the exact number, nothing empty, everything in one piece, every time."""
+"""Whatever the picture and the segmentation: the exact number, nothing empty, everything in one piece, every time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from skimage.measure import label as connected_parts
 
 from gsmerge.segment import superpixels
 
-METHODS = [("rdseg", "fast"), ("rdseg", "default"), ("rdseg", "best"), ("bass", "default"), ("bass-st", "default")]
+SEGMENTATIONS = [
+    ("rdseg", "fast"),
+    ("rdseg", "default"),
+    ("rdseg", "best"),
+    ("bass", "default"),
+    ("bass-st", "default"),
+]
 
 
 def noise(height: int, width: int) -> np.ndarray:
@@ -49,12 +55,12 @@ def counts_of(num_pixels: int) -> list[int]:
 
 
 @pytest.mark.parametrize("picture", PICTURES)
-@pytest.mark.parametrize(("method", "effort"), [*METHODS, ("slic", "default")])
-def test_exact_count_in_one_piece_each(picture: str, method: str, effort: str) -> None:
+@pytest.mark.parametrize(("segmentation", "effort"), [*SEGMENTATIONS, ("slic", "default")])
+def test_exact_count_in_one_piece_each(picture: str, segmentation: str, effort: str) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for count in counts_of(height * width):
-        labels = superpixels(image, count, method, effort=effort)
+        labels = superpixels(image, count, segmentation, effort=effort)
         assert_partition(labels, height, width, count)
 
 
@@ -74,7 +80,7 @@ def test_any_compactness(picture: str, compactness: float) -> None:
     width=st.integers(1, 20),
     share=st.floats(0, 1),
     colours=st.integers(1, 5),
-    kind=st.sampled_from(METHODS),
+    kind=st.sampled_from(SEGMENTATIONS),
     seed=st.integers(0, 999),
 )
 def test_any_size(height: int, width: int, share: float, colours: int, kind: tuple[str, str], seed: int) -> None:
@@ -84,8 +90,8 @@ def test_any_size(height: int, width: int, share: float, colours: int, kind: tup
     assert_partition(superpixels(image, count, kind[0], effort=kind[1]), height, width, count)
 
 
-@pytest.mark.parametrize(("method", "effort"), [*METHODS, ("slic", "default")])
-def test_a_run_repeats(method: str, effort: str) -> None:
+@pytest.mark.parametrize(("segmentation", "effort"), [*SEGMENTATIONS, ("slic", "default")])
+def test_a_run_repeats(segmentation: str, effort: str) -> None:
     image = PICTURES["noise"]
-    first = superpixels(image, 80, method, effort=effort)
-    assert torch.equal(first, superpixels(image.copy(), 80, method, effort=effort))
+    first = superpixels(image, 80, segmentation, effort=effort)
+    assert torch.equal(first, superpixels(image.copy(), 80, segmentation, effort=effort))

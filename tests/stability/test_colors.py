@@ -72,20 +72,20 @@ def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: s
 
 
 @pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("method", ["rdseg", "bass-st"])
-def test_flat_pictures(room: PixelScene, grey: float, method: str) -> None:
+@pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
+def test_flat_pictures(room: PixelScene, grey: float, segmentation: str) -> None:
     assert room.images is not None
     flat = painted(room, torch.full_like(room.images, grey))
-    result = scenes.compacted(flat, method=method, superpixels=60)
+    result = scenes.compacted(flat, segmentation=segmentation, superpixels=60)
     assert 1 <= len(result.gaussians) <= 4 * 60
     assert result.report.psnr_after > 25  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("method", ["rdseg", "bass-st"])
-def test_noise_does_not_explode(room: PixelScene, method: str) -> None:
+@pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
+def test_noise_does_not_explode(room: PixelScene, segmentation: str) -> None:
     assert room.images is not None
     noise = torch.rand(room.images.shape, generator=torch.Generator().manual_seed(0))
-    result = scenes.compacted(painted(room, noise), method=method, superpixels=60)
+    result = scenes.compacted(painted(room, noise), segmentation=segmentation, superpixels=60)
     assert len(result.gaussians) <= 4 * 60
 
 

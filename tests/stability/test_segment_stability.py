@@ -9,16 +9,16 @@ from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_p
 
 from gsmerge.kernels.regions import pad_labels, region_rows
 from gsmerge.kernels.sweeps import refine
-from gsmerge.segment import METHODS, SegmentOptions, segment, superpixels
+from gsmerge.segment import SEGMENTATIONS, SegmentOptions, segment, superpixels
 from gsmerge.threads import use_threads
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_threads_do_not_matter(method: str) -> None:
+@pytest.mark.parametrize("segmentation", SEGMENTATIONS)
+def test_threads_do_not_matter(segmentation: str) -> None:
     images = torch.rand((5, 40, 50, 3), generator=torch.Generator().manual_seed(1))
     images = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), 3, 1, 1).permute(0, 2, 3, 1).contiguous()
-    options = SegmentOptions(superpixels=150, method=method)
-    alone = torch.stack([superpixels(image, 150, method) for image in images])
+    options = SegmentOptions(superpixels=150, segmentation=segmentation)
+    alone = torch.stack([superpixels(image, 150, segmentation) for image in images])
     for threads in (1, 2, 8):
         with use_threads(threads):
             assert torch.equal(segment(images, options).labels, alone)
@@ -68,7 +68,8 @@ def test_methods_rank_as_published() -> None:
     image = photos()["coffee"]
     count = count_at(image, 12_000)
     scores = [
-        proxy_psnr(image, superpixels(image, count, method).numpy()) for method in ("rdseg", "bass-st", "bass", "slic")
+        proxy_psnr(image, superpixels(image, count, segmentation).numpy())
+        for segmentation in ("rdseg", "bass-st", "bass", "slic")
     ]
     assert scores == sorted(scores, reverse=True)
     assert scores[0] > scores[1] + 2

@@ -68,8 +68,8 @@ def test_every_setting_is_documented(stage: str) -> None:
 @pytest.mark.parametrize(
     "setting",
     [
-        {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5}, {"method": "voronoi"},
-        {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
+        {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5},
+        {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
         {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
         {"min_opacity": -1.0}, {"rounds": -1}, {"tolerance": 0.0}, {"overlap": float("nan")}, {"boost": 0.0},

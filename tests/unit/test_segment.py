@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsmerge.kernels.seeds import hexagonal_seeds, seed_density, seeds_from_density
-from gsmerge.segment import METHODS, SegmentOptions, count_for, saliency, segment, superpixels
+from gsmerge.segment import SEGMENTATIONS, SegmentOptions, count_for, saliency, segment, superpixels
 
 
 def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -24,9 +24,9 @@ def test_two_colours_part_where_they_meet() -> None:
 def test_detail_gets_the_superpixels() -> None:
     image = np.full((64, 64, 3), 0.5)
     image[:, 32:] = random_image(64, 32)
-    for method in ("rdseg", "bass-st"):
-        labels = superpixels(image, 200, method)
-        assert len(labels[:, 34:].unique()) > 2 * len(labels[:, :30].unique()), method
+    for segmentation in ("rdseg", "bass-st"):
+        labels = superpixels(image, 200, segmentation)
+        assert len(labels[:, 34:].unique()) > 2 * len(labels[:, :30].unique()), segmentation
 
 
 def test_as_many_superpixels_as_pixels() -> None:
@@ -43,13 +43,13 @@ def test_bytes_and_floats_are_the_same_picture() -> None:
     assert expected.dtype == torch.int32
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_count_is_checked(method: str) -> None:
+@pytest.mark.parametrize("segmentation", SEGMENTATIONS)
+def test_count_is_checked(segmentation: str) -> None:
     image = random_image(4, 5)
     with pytest.raises(ValueError, match=r"expected at most 20 superpixels \(5 x 4 pixels\), got 21"):
-        superpixels(image, 21, method)
+        superpixels(image, 21, segmentation)
     with pytest.raises(ValueError, match="expected at least 1 superpixel, got 0"):
-        superpixels(image, 0, method)
+        superpixels(image, 0, segmentation)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_image_is_checked(image: np.ndarray, message: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "watershed"}, "method: expected one of rdseg, bass, bass-st, slic, got 'watershed'"),
+        ({"segmentation": "watershed"}, "segmentation: expected one of rdseg, bass, bass-st, slic, got 'watershed'"),
         ({"effort": "slow"}, "effort: expected one of fast, default, best, got 'slow'"),
         ({"compactness": -1.0}, r"compactness: expected a number in \[0, 1\], got -1.0"),
         ({"compactness": float("nan")}, "compactness: expected a number"),

@@ -1,0 +1,43 @@
+"""Pruning by what a Gaussian adds to the views: its blending weights, summed over all of them (Mini-Splatting)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.allocate import trim
+from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.build import Source
+from gsmerge.grouping import Canvas
+from gsmerge.journal import Journal
+from gsmerge.options import CompactOptions
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians
+
+AT_ONCE = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
+
+
+def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
+    """``[n]`` float64 blending weights summed over the pixels of all views; the same on any number of threads."""
+    splats = prepare(gaussians)
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+
+    def one_view(view: int) -> np.ndarray:
+        sums, _ = contributions(plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
+        return sums
+
+    total, step = np.zeros(len(splats)), max(1, AT_ONCE // max(len(splats), 1))
+    for first in range(0, len(cameras), step):
+        for sums in parallel_map(one_view, range(first, min(first + step, len(cameras)))):
+            total += sums
+    return total
+
+
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+    """Those that show most, unchanged and in their order; of equal ones the first of the file."""
+    gaussians = own_gaussians(source)
+    with journal.stage("reduce"):
+        return gaussians[trim(summed_weights(gaussians, source.scene.cameras), count)]
+
+
+CONTRIBUTION = Baseline("contribution", "keep those with the largest summed blending weight", run)

@@ -1,0 +1,18 @@
+"""The input as it is."""
+
+from __future__ import annotations
+
+from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.build import Source
+from gsmerge.grouping import Canvas
+from gsmerge.journal import Journal
+from gsmerge.options import CompactOptions
+from gsmerge.types import Gaussians
+
+
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+    """All Gaussians, whatever the count."""
+    return own_gaussians(source)
+
+
+UNMERGED = Baseline("unmerged", "the input as it is", run, uses=())

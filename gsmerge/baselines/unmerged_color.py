@@ -1,0 +1,27 @@
+"""The input with colours solved on the photos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gsmerge.baselines.baseline import Baseline
+from gsmerge.baselines.unmerged_fit import fitted_input
+from gsmerge.build import Source
+from gsmerge.grouping import Canvas
+from gsmerge.journal import Journal
+from gsmerge.options import CompactOptions
+from gsmerge.types import Gaussians
+
+
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+    """The colour fit on all Gaussians, none left out; whatever the count."""
+    return fitted_input(source, replace(options.fit, fit="color", prune=0.0), options.seed, journal)
+
+
+UNMERGED_COLOR = Baseline(
+    "unmerged-color",
+    "the input with colours solved on the photos",
+    run,
+    needs=("photos",),
+    uses=("iterations", "pull", "huber", "min_gain", "max_gain", "holdout"),
+)

@@ -1,0 +1,92 @@
+"""AnySplat's rule (Jiang et al. 2025): one Gaussian for each voxel, a softmax-weighted mean of what lies in it.
+
+The means run over the parameters as a network puts them out: logarithms of scales, logits of opacities. AnySplat
+weighs with the softmax of a confidence that no file keeps; opacity stands in for it. The size of the voxels is found
+by bisection, so the count is met from below.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.build import Source
+from gsmerge.grouping import Canvas
+from gsmerge.journal import Journal
+from gsmerge.options import CompactOptions
+from gsmerge.types import Gaussians
+
+BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
+FINEST = -17.0  # octaves of the canonical unit: there the outermost voxels lie 8 units away, farther for larger ones
+PRECISION = 1e-4  # octaves
+MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12
+
+
+def voxel_keys(means: np.ndarray, size: float) -> np.ndarray:
+    """``[n]`` int64: the voxel of each mean ``[n,3]``, by the nearest multiple of ``size``."""
+    half = 1 << (BITS - 1)
+    index = np.clip(np.rint(means / size), -half, half - 1).astype(np.int64) + half
+    return (index[:, 0] << 2 * BITS) | (index[:, 1] << BITS) | index[:, 2]
+
+
+def voxel_size(means: np.ndarray, count: int) -> float:
+    """The smallest size, within a ten-thousandth octave, that leaves at most ``count`` voxels of ``[n,3]`` occupied."""
+
+    def occupied(octave: float) -> int:
+        keys = np.sort(voxel_keys(means, 2.0**octave))
+        return 1 + int((keys[1:] != keys[:-1]).sum())
+
+    reach = float(np.abs(means).max(initial=0))
+    fine, coarse = FINEST, max(FINEST, math.log2(4 * reach)) if reach > 0 else FINEST  # coarse: all in one
+    if occupied(fine) <= count:
+        return 2.0**fine
+    while coarse - fine > PRECISION:
+        middle = (fine + coarse) / 2
+        fine, coarse = (fine, middle) if occupied(middle) <= count else (middle, coarse)
+    return 2.0**coarse
+
+
+def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
+    """One Gaussian for each voxel, in the order of the keys ``[n]``: means with weights exp(opacity).
+
+    Rotations are averaged whatever the sign of their quaternions (Markley et al. 2007).
+    """
+    _, cells = np.unique(keys, return_inverse=True)
+    opacities = gaussians.opacities.double().numpy()
+    weights = np.exp(opacities)
+    count = int(cells.max(initial=-1)) + 1
+    total = np.bincount(cells, weights, count)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        columns = [np.bincount(cells, weights * column, count) / total for column in flat.T]
+        return np.stack(columns, 1).reshape(count, *values.shape[1:]) if columns else values[:count]
+
+    bounded = opacities.clip(MIN_OPACITY, 1 - MIN_OPACITY)
+    quats = gaussians.quats.double().numpy()
+    _, axes = np.linalg.eigh(mean(quats[:, :, None] * quats[:, None]))
+    arrays = (
+        mean(gaussians.means.double().numpy()),
+        axes[:, :, -1],
+        np.exp(mean(np.log(gaussians.scales.double().numpy().clip(MIN_SCALE)))),
+        1 / (1 + np.exp(-mean(np.log(bounded / (1 - bounded))))),
+        mean(gaussians.sh0.double().numpy()),
+        mean(gaussians.shN.double().numpy()),
+    )
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)).float() for array in arrays))
+
+
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+    """At most ``count`` voxels, and hardly fewer."""
+    gaussians = own_gaussians(source)
+    with journal.stage("reduce"):
+        means = gaussians.means.double().numpy()
+        size = voxel_size(means, count)
+        journal.choices["voxel_size"] = size
+        return fuse(gaussians, voxel_keys(means, size))
+
+
+VOXEL = Baseline("voxel", "one Gaussian per voxel, AnySplat's rule", run)

@@ -1,0 +1,150 @@
+"""Rival methods from the command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsmerge import read_ply
+from gsmerge.options import METHODS
+
+from .conftest import Run, listing
+
+FAKE = """#!{python}
+import sys
+from pathlib import Path
+
+w, g, cpu, given, d, count, made = sys.argv[1:]
+assert (w, g, cpu, d) == ("-w", "-g", "cpu", "-d")
+head, rows = Path(given).read_bytes().split(b"end_header\\n", 1)
+lines = head.decode().splitlines()
+total = next(int(line.split()[-1]) for line in lines if line.startswith("element vertex"))
+lines = [f"element vertex {{count}}" if line.startswith("element vertex") else line for line in lines]
+Path(made).write_bytes("\\n".join([*lines, "end_header", ""]).encode() + rows[: len(rows) // total * int(count)])
+"""
+
+
+def program(folder: Path, text: str) -> Path:
+    """An executable script."""
+    path = folder / "splat-transform"
+    path.write_text(text.format(python=sys.executable))
+    path.chmod(0o755)
+    return path
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_writes_a_ply(
+    method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
+    out, settings = tmp_path / "small.ply", ["--fit-steps", 8] if method == "unmerged-fit" else []
+    told = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json")
+    assert told.code == 0, told.err
+    document, total = json.loads(told.out), 5 * 96 * 64
+    count = len(read_ply(out).gaussians)
+    assert document["options"]["method"] == method
+    assert document["output"]["num_gaussians"] == count
+    assert count == {"unmerged": total, "unmerged-color": total}.get(method, count)
+    if method == "unmerged-fit":
+        assert 400 < count <= total
+    elif method == "voxel":
+        assert 380 <= count <= 400
+    elif not method.startswith("unmerged"):
+        assert count == 400
+    assert document["psnr_input_views"]["after"] > 5
+    assert document["notes"] == ([f"method {method} does not look at budget"] if method.startswith("unmerged") else [])
+
+
+def test_the_program_is_found_on_the_path(
+    made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GSMERGE_SPLAT_TRANSFORM", raising=False)
+    monkeypatch.setenv("PATH", str(program(tmp_path, FAKE).parent))
+    out = tmp_path / "small.ply"
+    told = run("compact", made_scene, "-o", out, "--method", "splat-transform", "--budget", 50, "--json")
+    assert told.code == 0, told.err
+    assert len(read_ply(out).gaussians) == 50
+    assert "reduce" in json.loads(told.out)["seconds"]
+
+
+@pytest.mark.parametrize("named", [None, "no/such/program"])
+def test_a_missing_program_is_told(
+    named: str | None, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
+    before = listing(scene_copy)
+    told = run("compact", scene_copy, "--method", "splat-transform")
+    assert (told.code, told.out, told.err.count("\n")) == (2, "", 1)
+    assert (named or "on PATH or named by GSMERGE_SPLAT_TRANSFORM") in told.err
+    assert "npm install -g @playcanvas/splat-transform" in told.err
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("#!{python}\nraise SystemExit('out of\\nmemory')\n", "it ended with code 1: out of memory"),
+        ("#!{python}\n", "it ended with code 0: without a word"),
+    ],
+)
+def test_a_failing_program_is_told(
+    text: str, words: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
+    before = listing(scene_copy)
+    told = run("compact", scene_copy, "--method", "splat-transform", "--quiet")
+    assert (told.code, told.out, told.err.count("\n")) == (1, "", 1)
+    assert words in told.err
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["--method", "magic"], ["--method", "voxel"]),
+        (["--method", "voxel", "--k", "auto"], ["method voxel", "k auto"]),
+        (["--method", "voxel", "--levels", 2], ["method voxel", "levels"]),
+        (["--method", "voxel", "--target-psnr", 20], ["method voxel", "target psnr"]),
+        (["--method", "voxel", "--max-drop", 1], ["method voxel", "max drop"]),
+        (["--method", "blocks", "--order", "none"], ["method blocks", "one Gaussian per pixel"]),
+    ],
+    ids=str,
+)
+def test_what_does_not_go_together_is_told(
+    arguments: list[object], fragments: list[str], scene_copy: Path, run: Run
+) -> None:
+    for rest in ([], ["--dry-run"]):
+        told = run("compact", scene_copy, *arguments, "--quiet", *rest)
+        assert (told.code, told.out, told.err.count("\n")) == (2, "", 1), told.err
+        assert [part for part in fragments if part not in told.err] == []
+    assert not (scene_copy / "scene.compact.ply").exists()
+
+
+@pytest.mark.parametrize("method", ["unmerged-color", "unmerged-fit"])
+def test_missing_photos_are_told(method: str, scene_copy: Path, run: Run) -> None:
+    shutil.rmtree(scene_copy / "images")
+    told = run("compact", scene_copy, "--method", method, "--quiet")
+    assert (told.code, told.out, told.err.count("\n")) == (2, "", 1)
+    assert f"method {method}: expected photos, found none; give --images" in told.err
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_plan_names_the_method(
+    method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
+    told = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400)
+    assert told.code == 0, told.err
+    assert (f"method       {method}" in told.out) == (method != "gsmerge")
+    assert ("superpixels " in told.out) == (method == "gsmerge")
+    document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)
+    assert document["method"] == method
+    assert document["estimate"]["seconds"] > 0
+    assert document["notes"] == []
+    kept = document["output"]["num_gaussians_at_most"]
+    assert (kept == 5 * 96 * 64) == method.startswith("unmerged")
