@@ -19,6 +19,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
+    from gsmerge.evaluate import EvaluateOptions as EvaluateOptions
+    from gsmerge.evaluate import Evaluation as Evaluation
+    from gsmerge.evaluate import Views as Views
+    from gsmerge.evaluate import evaluate as evaluate
     from gsmerge.inspect import inspect as inspect
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_ply as read_ply
@@ -42,6 +46,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "errors": ("GsmergeError", "SceneError"),
+    "evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "inspect": ("inspect",),
     "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_ply"),
     "options": ("CompactOptions",),

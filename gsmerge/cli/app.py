@@ -12,6 +12,7 @@ import typer
 from gsmerge import __version__
 from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
+from gsmerge.cli.evaluate import evaluate
 from gsmerge.cli.inspect import inspect
 from gsmerge.cli.options import debug_wanted, set_debug
 from gsmerge.cli.preview import preview
@@ -25,7 +26,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, inspect, segment, render, preview):
+for command in (compact, evaluate, inspect, segment, render, preview):
     app.command()(command)
 
 

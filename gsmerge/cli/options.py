@@ -164,6 +164,17 @@ SceneScaleOption = Annotated[
         help="Size of the Gaussians' world in units of the cameras'.", show_default="found", rich_help_panel=INPUT
     ),
 ]
+TargetsOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Cameras of held-out photos: any camera file; views that the scene was made of are left out.",
+        rich_help_panel=INPUT,
+    ),
+]
+TargetImagesOption = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the held-out photos. Found by their cameras if not given.", rich_help_panel=INPUT),
+]
 SuperpixelsOption = Annotated[
     int | None,
     typer.Option(min=1, help="Superpixels per view. Wins over --density.", rich_help_panel=SEGMENTATION),

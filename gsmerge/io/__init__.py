@@ -10,6 +10,7 @@ from gsmerge.io.reading import AUTO, Reading
 from gsmerge.io.recover import Recovery
 from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, read_scene, read_told
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
+from gsmerge.io.targets import Targets, read_targets
 from gsmerge.io.views import read_photos
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Recovery",
     "SceneFiles",
     "SceneLoad",
+    "Targets",
     "align_scene",
     "atomic_output",
     "check_alignment",
@@ -34,6 +36,7 @@ __all__ = [
     "read_photos",
     "read_ply",
     "read_scene",
+    "read_targets",
     "read_told",
     "to_cameras",
     "write_ply",

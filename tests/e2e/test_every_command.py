@@ -21,7 +21,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "render": ("renders",),
     "preview": ("sheet.png", "--views", "1"),
 }
-COMMANDS = ("inspect", *WRITERS)
+COMMANDS = ("inspect", "evaluate", *WRITERS)
 
 
 def call(command: str, scene: Path) -> list[object]:
@@ -29,6 +29,8 @@ def call(command: str, scene: Path) -> list[object]:
     given: Path = scene / "scene.ply" if command == "preview" else scene
     if command == "inspect":
         return [command, given]
+    if command == "evaluate":
+        return [command, given, "--targets", scene / "targets", "--lpips", "none"]
     output, *rest = WRITERS[command]
     return [command, given, "-o", scene / output, *rest]
 

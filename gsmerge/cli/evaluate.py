@@ -1,0 +1,208 @@
+"""``gsmerge evaluate``: a scene and its compact versions against photos."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gsmerge.cli import options as opt
+from gsmerge.cli.console import announce_compilation, one_line, say, say_notes, stage_progress
+from gsmerge.cli.paths import check_output, input_files
+from gsmerge.cli.settings import reading_of, told_as_usage
+from gsmerge.errors import UsageError
+
+if TYPE_CHECKING:
+    from gsmerge.evaluate import EvaluateOptions, Evaluation, Views
+    from gsmerge.io import PlyInfo, SceneLoad
+    from gsmerge.types import Gaussians, LooseScene, PixelScene
+
+
+class Lpips(str, Enum):
+    """Networks of ``--lpips``."""
+
+    both = "both"
+    vgg = "vgg"
+    alex = "alex"
+    none = "none"
+
+
+_NETS = {Lpips.both: ("vgg", "alex"), Lpips.vgg: ("vgg",), Lpips.alex: ("alex",), Lpips.none: ()}
+
+MEASURING = "Measuring"
+
+
+def evaluate(
+    scene: opt.SceneArgument,
+    results: Annotated[
+        list[Path] | None, typer.Argument(metavar="[RESULTS]...", help="Compact .ply files of that scene.")
+    ] = None,
+    cameras: opt.CamerasOption = None,
+    images: opt.ImagesOption = None,
+    opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
+    targets: opt.TargetsOption = None,
+    target_images: opt.TargetImagesOption = None,
+    views: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Take so many of the input views, at equal intervals, as the context, and the held-out ones midway"
+            " between them as targets.",
+            show_default="all",
+            rich_help_panel=MEASURING,
+        ),
+    ] = None,
+    lpips: Annotated[
+        Lpips | None,
+        typer.Option(
+            help="Networks of the perceptual distance; none is much faster.",
+            show_default="both, where installed",
+            rich_help_panel=MEASURING,
+        ),
+    ] = None,
+    lpips_views: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Measure it on at most so many views of each split.",
+            show_default="all",
+            rich_help_panel=MEASURING,
+        ),
+    ] = None,
+    context: Annotated[
+        bool, typer.Option("--context/--no-context", help="Also measure the input views.", rich_help_panel=MEASURING)
+    ] = True,
+    csv: Annotated[
+        Path | None, typer.Option(help="Write a row for each result and view here.", rich_help_panel=opt.OUTPUT)
+    ] = None,
+    report: opt.ReportOption = None,
+    threads: opt.ThreadsOption = None,
+    overwrite: opt.OverwriteOption = False,
+    json: opt.JsonOption = False,
+    quiet: opt.QuietOption = False,
+    debug: opt.DebugOption = False,
+) -> None:
+    """Measure compact scenes against photos: PSNR, SSIM, LPIPS, counts, sizes, render time."""
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    if not context and targets is None:
+        raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
+    from gsmerge.evaluate import EvaluateOptions
+    from gsmerge.io import find_scene_files, load_files, read_ply
+
+    files = find_scene_files(scene, cameras=cameras, images=images)
+    paths = results or []
+    inputs = (*input_files(files), *paths)
+    for path in (csv, report):
+        if path is not None:
+            check_output(path, inputs, overwrite=overwrite)
+    nets, missing = _networks(lpips)
+    with told_as_usage():
+        options = EvaluateOptions(nets, lpips_views, context, threads)
+    load = load_files(files, opacity=opacity.value, reading=reading)
+    measured, held_out = _held_out(load, targets, target_images, views)
+    plys = {name: read_ply(path) for name, path in zip(_names(paths), paths, strict=True)}
+    notes = [*load.notes, *missing]
+    say_notes(notes, quiet=quiet or json)
+    gaussians = {name: ply.gaussians for name, ply in plys.items()}
+    found = _measure(measured, held_out, gaussians, options, quiet=quiet or json)
+    facts = {"input": _file(load.ply), **{name: _file(ply.info) for name, ply in plys.items()}}
+    _tell(found, facts, notes, csv, report, as_json=json, quiet=quiet, overwrite=overwrite)
+
+
+def _networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
+    """The networks to measure with, and a note where the weights are not installed and nobody asked for them."""
+    if asked is not None:
+        return _NETS[asked], []
+    from gsmerge.perceptual import INSTALL, lpips_available
+
+    nets = tuple(net for net in _NETS[Lpips.both] if lpips_available(net))
+    return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
+
+
+def _held_out(
+    load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
+) -> tuple[PixelScene | LooseScene, Views | None]:
+    """The scene with the context views that were asked for, and the held-out ones."""
+    from gsmerge.evaluate import Views
+    from gsmerge.io import read_targets
+    from gsmerge.sampling import even_views, midpoint_views, subset
+
+    if target_images is not None and targets is None:
+        raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
+    read = None if targets is None else read_targets(load, targets, target_images)
+    found = None if read is None else Views(read.cameras, read.images, read.names)
+    if views is None:
+        return load.scene, found
+    with told_as_usage():
+        ids = even_views(len(load.scene), views)
+    if read is not None and found is not None:
+        if read.context_places is None:
+            raise UsageError(
+                "--views: expected --targets that also name the input views, in the order of the trajectory"
+            )
+        chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
+        if not chosen:
+            raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
+        found = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
+    return subset(load.scene, ids), found
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """A short name for each file: its own where no two are alike, otherwise its path."""
+    short = [path.name for path in paths]
+    return short if len(set(short)) == len(short) else [str(path) for path in paths]
+
+
+def _file(info: PlyInfo) -> dict[str, Any]:
+    return {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
+
+
+def _measure(
+    scene: PixelScene | LooseScene,
+    held_out: Views | None,
+    gaussians: dict[str, Gaussians],
+    options: EvaluateOptions,
+    *,
+    quiet: bool,
+) -> Evaluation:
+    from gsmerge.evaluate import evaluate as evaluate_scene
+
+    with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, told_as_usage():
+        return evaluate_scene(scene, gaussians, held_out, options, progress=progress)
+
+
+def _tell(
+    found: Evaluation,
+    facts: dict[str, dict[str, Any]],
+    notes: Sequence[str],
+    csv: Path | None,
+    report: Path | None,
+    *,
+    as_json: bool,
+    quiet: bool,
+    overwrite: bool,
+) -> None:
+    """The figures where they were asked for: files, stdout, or a table."""
+    from gsmerge.io import atomic_output
+    from gsmerge.report import to_json
+    from gsmerge.scores import evaluation_csv, evaluation_document, evaluation_lines
+
+    document = evaluation_document(found, facts, notes)
+    for path, text in ((report, to_json(document)), (csv, evaluation_csv(document))):
+        if path is not None:
+            with atomic_output(path, overwrite=overwrite) as temporary:
+                temporary.write_text(text)
+    if as_json:
+        sys.stdout.write(to_json(document))
+    elif not quiet:
+        print("\n".join(map(one_line, evaluation_lines(document))))
+        for note in found.notes:
+            say(f"note: {note}")

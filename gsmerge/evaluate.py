@@ -1,0 +1,275 @@
+"""What compact scenes are worth: their renders against photos, view by view, beside the input's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmerge.canonical import find_frame, find_loose_frame
+from gsmerge.metrics import psnr, ssim
+from gsmerge.perceptual import lpips
+from gsmerge.render import render
+from gsmerge.threads import use_threads
+from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
+from gsmerge.visibility import context_points, visible_pixels
+
+NEAR = 0.01  # near plane, in canonical units: as everywhere
+NETS = ("vgg", "alex")
+LITTLE = 0.1  # share of the held-out pixels that input views have seen; less is odd
+INPUT = "input"  # what the scene itself is called among the results
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """What is measured.
+
+    Args:
+        lpips: Networks of the perceptual distance, of "vgg" and "alex"; none: it is left out, which is much faster.
+        lpips_views: At most so many views of each split get it, evenly spread; None: all.
+        context: Also measure the input views.
+        threads: Threads to use; None: all processors. The figures do not depend on it.
+
+    Raises:
+        ValueError: If a network is unknown or the number of views not positive.
+    """
+
+    lpips: tuple[str, ...] = NETS
+    lpips_views: int | None = None
+    context: bool = True
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        unknown = next((net for net in self.lpips if net not in NETS), None)
+        if unknown is not None:
+            raise ValueError(f"lpips: expected {' or '.join(NETS)}, got {unknown!r}")
+        if self.lpips_views is not None and self.lpips_views < 1:
+            raise ValueError(f"lpips_views: expected at least 1, got {self.lpips_views}")
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views with what they should look like.
+
+    Args:
+        cameras: v cameras, in the scene's world.
+        images: ``[v,h,w,3]`` sRGB in [0, 1].
+        names: Of the views.
+    """
+
+    cameras: Cameras
+    images: Tensor
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How near a picture is to another one; None where it was not measured.
+
+    Args:
+        psnr: dB; inf for equal pictures.
+        ssim: At most 1.
+        lpips_vgg: At least 0, lower is nearer.
+        lpips_alex: The same with AlexNet.
+    """
+
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips_vgg: float | None = None
+    lpips_alex: float | None = None
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One result in one view.
+
+    Args:
+        split: "context": an input view; "target": one that was held out.
+        view: Its name.
+        visible: Share of the pixels that the input views have seen.
+        full: Over all pixels.
+        masked: Over those that the input views have seen (supplement A).
+    """
+
+    split: str
+    view: str
+    visible: float
+    full: Quality
+    masked: Quality
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """One result.
+
+    Args:
+        name: As given.
+        num_gaussians: Their number.
+        ratio: Of the input's.
+        render_seconds: Mean wall time of one view, all threads.
+        scores: One for each view.
+    """
+
+    name: str
+    num_gaussians: int
+    ratio: float
+    render_seconds: float
+    scores: tuple[ViewScore, ...]
+
+    def mean(self, split: str) -> tuple[Quality, Quality]:
+        """Means over the views of a split: over all pixels, and over the visible ones."""
+        mine = [score for score in self.scores if score.split == split]
+        return _mean([score.full for score in mine]), _mean([score.masked for score in mine])
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All results on the same views.
+
+    Args:
+        results: The scene itself first, as "input".
+        reference: "photos", or "renders of the input" where there are none.
+        num_views: Views by split.
+        notes: Things worth telling, one sentence each.
+    """
+
+    results: tuple[Evaluated, ...]
+    reference: str
+    num_views: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def evaluate(
+    scene: PixelScene | LooseScene,
+    results: Mapping[str, Gaussians],
+    targets: Views | None = None,
+    options: EvaluateOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Measure compact results, and the scene itself, on its input views and on held-out ones.
+
+    Args:
+        scene: The input. Without photos its own renders are what results are compared with.
+        results: Gaussians by name, in the scene's world.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_targets`; None: input views alone.
+        options: What is measured.
+        progress: Called with ("evaluate", done, total) after each result.
+
+    Raises:
+        ValueError: If the scene has no views, or a result is called "input".
+        GsmergeError: If LPIPS is asked for and its weights are not installed.
+    """
+    options = options or EvaluateOptions()
+    if INPUT in results:
+        raise ValueError(f"results: expected names other than {INPUT!r}")
+    if len(scene) == 0:
+        raise ValueError("expected a scene with views, got none")
+    own = scene.gaussians
+    with use_threads(options.threads):
+        near = NEAR * (find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)).unit
+        points = context_points(scene, near)
+        splits = _splits(scene, own, targets, options, near)
+        judged = [(name, views, visible_pixels(points, views.cameras, near)) for name, views in splits.items()]
+        out = []
+        for i, (name, gaussians) in enumerate({INPUT: own, **results}.items()):
+            out.append(_evaluated(name, gaussians, len(own), judged, options, near))
+            if progress:
+                progress("evaluate", i + 1, 1 + len(results))
+    counts = {name: len(views.names) for name, views in splits.items()}
+    reference = "photos" if scene.images is not None else "renders of the input"
+    return Evaluation(tuple(out), reference, counts, _notes(judged))
+
+
+def _notes(judged: Sequence[tuple[str, Views, NDArray[np.bool_]]]) -> tuple[str, ...]:
+    shares = {split: float(visible.mean()) for split, _, visible in judged}
+    if "target" not in shares:
+        return ("no held-out views were given: input views flatter what was fitted to them",)
+    if shares["target"] < LITTLE:
+        share = f"{100 * shares['target']:.0f} %"
+        return (f"the input views have seen {share} of the held-out views: are those of the same world?",)
+    return ()
+
+
+def _splits(
+    scene: PixelScene | LooseScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, near: float
+) -> dict[str, Views]:
+    """The views by split, with what they should look like."""
+    splits = {}
+    if options.context or targets is None:
+        images = scene.images
+        if images is None:
+            images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
+        splits["context"] = Views(scene.cameras, images, scene.names)
+    if targets is not None:
+        splits["target"] = targets
+    return splits
+
+
+def _evaluated(
+    name: str,
+    gaussians: Gaussians,
+    num_input: int,
+    judged: Sequence[tuple[str, Views, NDArray[np.bool_]]],
+    options: EvaluateOptions,
+    near: float,
+) -> Evaluated:
+    scores: list[ViewScore] = []
+    seconds, count = 0.0, 0
+    for split, views, visible in judged:
+        perceptual = _spread(len(views.names), options.lpips_views)
+        for i, view in enumerate(views.names):
+            start = time.perf_counter()
+            image = _image(gaussians, views.cameras, i, near)
+            seconds, count = seconds + time.perf_counter() - start, count + 1
+            nets = options.lpips if i in perceptual else ()
+            scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[i], nets))
+    return Evaluated(name, len(gaussians), len(gaussians) / max(num_input, 1), seconds / max(count, 1), tuple(scores))
+
+
+def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
+    """``[h,w,3]``: one view, as every view is drawn here, so that equal Gaussians give equal pictures."""
+    return render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
+
+
+def _score(
+    split: str, view: str, image: np.ndarray, photo: np.ndarray, visible: NDArray[np.bool_], nets: Sequence[str]
+) -> ViewScore:
+    share = float(visible.mean())
+    full = _quality(image, photo, None, nets)
+    masked = full if visible.all() else _quality(image, photo, visible, nets) if visible.any() else Quality()
+    return ViewScore(split, view, share, full, masked)
+
+
+def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
+    found = Quality(psnr=psnr(image, photo, mask), ssim=_ssim(image, photo, mask))
+    return replace(found, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in nets})
+
+
+def _ssim(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None) -> float | None:
+    """None where no window of it is inside of the picture."""
+    try:
+        return ssim(image, photo, mask)
+    except ValueError:
+        return None
+
+
+def _spread(count: int, most: int | None) -> set[int]:
+    """Indices of at most so many of ``count`` views, evenly spread."""
+    if most is None or most >= count:
+        return set(range(count))
+    return {int((i + 0.5) * count / most) for i in range(most)}
+
+
+def _mean(found: Sequence[Quality]) -> Quality:
+    means = {}
+    for field in fields(Quality):
+        values = [v for q in found if (v := getattr(q, field.name)) is not None]
+        means[field.name] = float(np.mean(values)) if values else None
+    return Quality(**means)

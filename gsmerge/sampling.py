@@ -1,0 +1,64 @@
+"""Which views go in and which are held out: the paper's rule (supplement A, "View sampling")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import torch
+
+from gsmerge.types import LooseScene, PixelScene
+
+
+def even_views(num_views: int, count: int) -> list[int]:
+    """``count`` of the views at equal intervals, first and last among them (the middle one for ``count = 1``).
+
+    Raises:
+        ValueError: If there are not as many.
+    """
+    if not 1 <= count <= num_views:
+        raise ValueError(f"views: expected 1 to {num_views}, got {count}")
+    if count == 1:
+        return [(num_views - 1) // 2]
+    return [round(i * (num_views - 1) / (count - 1)) for i in range(count)]
+
+
+def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
+    """For each two consecutive contexts the candidate nearest the middle between them.
+
+    Args:
+        contexts: Places along the trajectory, in any order.
+        candidates: Places of the views that may be targets.
+
+    Returns:
+        Indices of candidates, none twice, in the order of the trajectory; a gap with no candidate gives none.
+    """
+    chosen = []
+    for low, high in pairwise(sorted(contexts)):
+        inside = [i for i, place in enumerate(candidates) if low < place < high]
+        if inside:
+            chosen.append(min(inside, key=lambda i: (abs(candidates[i] - (low + high) / 2), candidates[i])))
+    return chosen
+
+
+def subset(scene: PixelScene | LooseScene, view_ids: Sequence[int]) -> PixelScene | LooseScene:
+    """The scene as if only some of its views had been given: their Gaussians, cameras and photos.
+
+    Gaussians in no order belong to no view, and all stay.
+    """
+    ids = list(view_ids)
+    images = None if scene.images is None else scene.images[ids]
+    names = tuple(scene.names[i] for i in ids)
+    if isinstance(scene, LooseScene):
+        return replace(scene, cameras=scene.cameras[ids], images=images, names=names)
+    size = scene.pixels_per_view
+    rows = (torch.tensor(ids)[:, None] * size + torch.arange(size)).reshape(-1)
+    return replace(
+        scene,
+        gaussians=scene.gaussians[rows],
+        cameras=scene.cameras[ids],
+        images=images,
+        valid=scene.valid[ids],
+        names=names,
+    )

@@ -1,0 +1,66 @@
+"""Which pixels of a view show what the input views have seen: the rest is extrapolation (supplement A)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.render import render
+from gsmerge.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
+
+Points = NDArray[np.float64]  # [n,3]
+_OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
+_DILATION = 3  # pixels per side of the square that every sample marks
+
+
+def context_points(scene: PixelScene | LooseScene, near: float) -> Points:
+    """A point in the world for every pixel of the input views: their depth samples.
+
+    Args:
+        scene: Of a scene with pixels the Gaussians are the samples; otherwise its depth is rendered.
+        near: Nearest depth that is rendered, world units.
+
+    Returns:
+        ``[n,3]``.
+    """
+    if isinstance(scene, PixelScene):
+        return np.asarray(scene.gaussians.means[scene.valid.reshape(-1)].double().numpy())
+    return np.concatenate([_rendered_points(scene.gaussians, scene.cameras[[i]], near) for i in range(len(scene))])
+
+
+def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
+    drawn = render(gaussians, camera, near=near, with_depths=True)
+    assert drawn.depths is not None
+    depth, solid = drawn.depths[0].double().numpy(), drawn.alphas[0].numpy() > _OPAQUE
+    y, x = np.nonzero(solid.reshape(depth.shape[:2]))
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.Ks[0].double().numpy()).T
+    pose = np.linalg.inv(camera.viewmats[0].double().numpy())
+    return np.asarray((rays * depth.reshape(solid.shape[0], -1)[y, x, None]) @ pose[:3, :3].T + pose[:3, 3])
+
+
+def visible_pixels(points: Points, cameras: Cameras, near: float) -> NDArray[np.bool_]:
+    """Pixels on which, or beside which, at least one of the points falls, whatever lies before it.
+
+    Args:
+        points: ``[n,3]`` depth samples of the input views, see :func:`context_points`.
+        cameras: The views to be judged.
+        near: Samples nearer than this do not count, world units.
+
+    Returns:
+        ``[c,h,w]`` bool.
+    """
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    size = np.array([cameras.width, cameras.height])
+
+    def one_view(view: int) -> NDArray[np.bool_]:
+        image = (points @ viewmats[view, :3, :3].T + viewmats[view, :3, 3]) @ Ks[view].T
+        image = image[image[:, 2] > near]
+        pixels = np.floor(image[:, :2] / image[:, 2:])
+        pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
+        hit = np.zeros((cameras.height, cameras.width), np.uint8)
+        hit[pixels[:, 1], pixels[:, 0]] = 1
+        return cv2.dilate(hit, np.ones((_DILATION, _DILATION), np.uint8)) > 0
+
+    return np.stack(parallel_map(one_view, range(len(cameras))))

@@ -1,0 +1,90 @@
+"""``gsmerge evaluate`` as users call it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from .conftest import Run
+
+
+@pytest.fixture
+def small(scene_copy: Path, run: Run) -> Path:
+    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", "--fit", "color", "--no-robust", "-q").code == 0
+    return scene_copy / "small.ply"
+
+
+def test_table_and_files(scene_copy: Path, small: Path, run: Run) -> None:
+    table, report = scene_copy / "a.csv", scene_copy / "a.json"
+    outcome = run(
+        "evaluate", scene_copy / "scene.ply", small, "--targets", scene_copy / "targets", "--lpips", "none",
+        "--csv", table, "--report", report,
+    )  # fmt: skip
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "small.ply" in outcome.out
+    document = json.loads(report.read_text())
+    before, after = document["results"]
+    assert after["bytes"] == small.stat().st_size
+    assert sum(after["bytes_by_attribute"].values()) < after["bytes"]
+    assert after["mean"]["target"]["psnr_visible"] > before["mean"]["target"]["psnr_visible"] + 2
+    assert document["num_views"] == {"context": 5, "target": 4}
+    with table.open() as file:
+        assert len(list(csv.DictReader(file))) == 2 * 9
+
+
+def test_agrees_with_the_measuring_example(scene_copy: Path, small: Path, run: Run, target_psnr) -> None:
+    outcome = run("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none", "--json")
+    mean = json.loads(outcome.out)["results"][1]["mean"]["target"]
+    assert mean["psnr"] == pytest.approx(target_psnr(scene_copy / "targets", small), abs=1e-4)
+
+
+def test_fewer_views_need_the_trajectory(scene_copy: Path, run: Run) -> None:
+    outcome = run("evaluate", scene_copy, "--targets", scene_copy / "targets", "--views", "3", "--lpips", "none")
+    assert outcome.code == 2
+    assert "also name the input views" in outcome.err
+    outcome = run("evaluate", scene_copy, "--views", "3", "--lpips", "none", "--json")
+    assert json.loads(outcome.out)["num_views"] == {"context": 3}
+    assert "expected 1 to 5" in run("evaluate", scene_copy, "--views", "6", "--lpips", "none").err
+
+
+def test_a_trajectory_with_both_kinds_of_views(scene_copy: Path, run: Run) -> None:
+    context = json.loads((scene_copy / "transforms.json").read_text())
+    targets = json.loads((scene_copy / "targets" / "transforms.json").read_text())
+    frames = []
+    for i, frame in enumerate(context["frames"]):
+        frames.append(frame)
+        if i < len(targets["frames"]):
+            own = targets["frames"][i]
+            frames.append(own | {"file_path": "targets/" + own["file_path"]})
+    for frame in frames[1::2]:  # names of their own
+        new = frame["file_path"].replace("view", "held")
+        (scene_copy / frame["file_path"]).rename(scene_copy / new)
+        frame["file_path"] = new
+    trajectory = scene_copy / "all.json"
+    trajectory.write_text(json.dumps(context | {"frames": frames}))
+    outcome = run("evaluate", scene_copy, "--targets", trajectory, "--views", "3", "--lpips", "none", "--json")
+    document = json.loads(outcome.out)
+    assert document["num_views"] == {"context": 3, "target": 2}
+    held = [view["view"] for view in document["results"][0]["views"] if view["split"] == "target"]
+    assert [Path(name).stem for name in held] == [Path(frames[i]["file_path"]).stem for i in (1, 5)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--no-context",), 2, "--targets"),
+        (("--target-images", "images"), 2, "--targets"),
+        (("--targets", "nowhere.json"), 3, "expected cameras of held-out views"),
+        (("--targets", "transforms.json"), 3, "the scene was not made of"),
+        (("--csv", "scene.ply"), 2, "other than the input"),
+    ],
+)
+def test_bad_calls(arguments: tuple[str, ...], code: int, words: str, scene_copy: Path, run: Run) -> None:
+    flag, *rest = arguments
+    outcome = run("evaluate", scene_copy, "--lpips", "none", flag, *(scene_copy / name for name in rest))
+    assert outcome.code == code
+    assert words in outcome.err
+    assert outcome.err.count("\n") == 1
