@@ -67,6 +67,11 @@ def make_ready(scene: PixelScene | LooseScene, options: CompactOptions) -> Ready
     return ReadyScene(loose, frame, options, kept, tuple(notes))
 
 
+def with_views(scene: PixelScene | LooseScene) -> tuple[PixelScene | LooseScene, list[str]]:
+    """:func:`with_cameras` for a scene of either kind; one with pixels has its cameras."""
+    return (scene, []) if isinstance(scene, PixelScene) else with_cameras(scene)
+
+
 def with_cameras(scene: LooseScene) -> tuple[LooseScene, list[str]]:
     """The finite Gaussians, and cameras where there are none.
 

@@ -17,6 +17,7 @@ from gsmerge.cli.inspect import inspect
 from gsmerge.cli.options import debug_wanted, set_debug
 from gsmerge.cli.preview import preview
 from gsmerge.cli.render import render
+from gsmerge.cli.report import report
 from gsmerge.cli.segment import segment
 from gsmerge.errors import GsmergeError
 
@@ -26,7 +27,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview):
+for command in (compact, evaluate, inspect, segment, render, preview, report):
     app.command()(command)
 
 

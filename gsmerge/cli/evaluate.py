@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,28 +11,15 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes, stage_progress
+from gsmerge.cli.held_out import file_names, held_out_views, networks
 from gsmerge.cli.paths import check_output, input_files
 from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
     from gsmerge.evaluate import EvaluateOptions, Evaluation, Views
-    from gsmerge.io import PlyInfo, SceneLoad
+    from gsmerge.io import PlyInfo
     from gsmerge.types import Gaussians, LooseScene, PixelScene
-
-
-class Lpips(str, Enum):
-    """Networks of ``--lpips``."""
-
-    both = "both"
-    vgg = "vgg"
-    alex = "alex"
-    none = "none"
-
-
-_NETS = {Lpips.both: ("vgg", "alex"), Lpips.vgg: ("vgg",), Lpips.alex: ("alex",), Lpips.none: ()}
-
-MEASURING = "Measuring"
 
 
 def evaluate(
@@ -57,28 +43,22 @@ def evaluate(
             help="Take so many of the input views, at equal intervals, as the context, and the held-out ones midway"
             " between them as targets.",
             show_default="all",
-            rich_help_panel=MEASURING,
+            rich_help_panel=opt.MEASURING,
         ),
     ] = None,
-    lpips: Annotated[
-        Lpips | None,
-        typer.Option(
-            help="Networks of the perceptual distance; none is much faster.",
-            show_default="both, where installed",
-            rich_help_panel=MEASURING,
-        ),
-    ] = None,
+    lpips: opt.LpipsOption = None,
     lpips_views: Annotated[
         int | None,
         typer.Option(
             min=1,
             help="Measure it on at most so many views of each split.",
             show_default="all",
-            rich_help_panel=MEASURING,
+            rich_help_panel=opt.MEASURING,
         ),
     ] = None,
     context: Annotated[
-        bool, typer.Option("--context/--no-context", help="Also measure the input views.", rich_help_panel=MEASURING)
+        bool,
+        typer.Option("--context/--no-context", help="Also measure the input views.", rich_help_panel=opt.MEASURING),
     ] = True,
     csv: Annotated[
         Path | None, typer.Option(help="Write a row for each result and view here.", rich_help_panel=opt.OUTPUT)
@@ -103,62 +83,18 @@ def evaluate(
     for path in (csv, report):
         if path is not None:
             check_output(path, inputs, overwrite=overwrite)
-    nets, missing = _networks(lpips)
+    nets, missing = networks(lpips)
     with told_as_usage():
         options = EvaluateOptions(nets, lpips_views, context, threads)
     load = load_files(files, opacity=opacity.value, reading=reading)
-    measured, held_out = _held_out(load, targets, target_images, views)
-    plys = {name: read_ply(path) for name, path in zip(_names(paths), paths, strict=True)}
+    measured, held_out = held_out_views(load, targets, target_images, views)
+    plys = {name: read_ply(path) for name, path in zip(file_names(paths), paths, strict=True)}
     notes = [*load.notes, *missing]
     say_notes(notes, quiet=quiet or json)
     gaussians = {name: ply.gaussians for name, ply in plys.items()}
     found = _measure(measured, held_out, gaussians, options, quiet=quiet or json)
     facts = {"input": _file(load.ply), **{name: _file(ply.info) for name, ply in plys.items()}}
     _tell(found, facts, notes, csv, report, as_json=json, quiet=quiet, overwrite=overwrite)
-
-
-def _networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
-    """The networks to measure with, and a note where the weights are not installed and nobody asked for them."""
-    if asked is not None:
-        return _NETS[asked], []
-    from gsmerge.perceptual import INSTALL, lpips_available
-
-    nets = tuple(net for net in _NETS[Lpips.both] if lpips_available(net))
-    return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
-
-
-def _held_out(
-    load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
-) -> tuple[PixelScene | LooseScene, Views | None]:
-    """The scene with the context views that were asked for, and the held-out ones."""
-    from gsmerge.evaluate import Views
-    from gsmerge.io import read_targets
-    from gsmerge.sampling import even_views, midpoint_views, subset
-
-    if target_images is not None and targets is None:
-        raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
-    read = None if targets is None else read_targets(load, targets, target_images)
-    found = None if read is None else Views(read.cameras, read.images, read.names)
-    if views is None:
-        return load.scene, found
-    with told_as_usage():
-        ids = even_views(len(load.scene), views)
-    if read is not None and found is not None:
-        if read.context_places is None:
-            raise UsageError(
-                "--views: expected --targets that also name the input views, in the order of the trajectory"
-            )
-        chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
-        if not chosen:
-            raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
-        found = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
-    return subset(load.scene, ids), found
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """A short name for each file: its own where no two are alike, otherwise its path."""
-    short = [path.name for path in paths]
-    return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
 
 def _file(info: PlyInfo) -> dict[str, Any]:

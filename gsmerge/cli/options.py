@@ -12,11 +12,12 @@ from typing import Annotated
 
 import typer
 
-INPUT, SEGMENTATION, COUNT, MERGING, OUTPUT = (
+INPUT, SEGMENTATION, COUNT, MERGING, MEASURING, OUTPUT = (
     "Input",
     "Superpixels",
     "How many Gaussians",
     "Merging and colours",
+    "Measuring",
     "Output and behaviour",
 )
 
@@ -105,6 +106,15 @@ class Order(str, Enum):
     none = "none"
 
 
+class Lpips(str, Enum):
+    """Networks of ``--lpips``."""
+
+    both = "both"
+    vgg = "vgg"
+    alex = "alex"
+    none = "none"
+
+
 def debug_wanted() -> bool:
     """Whether the command line asked for tracebacks."""
     return _state["debug"]
@@ -174,6 +184,14 @@ TargetsOption = Annotated[
 TargetImagesOption = Annotated[
     Path | None,
     typer.Option(help="Folder of the held-out photos. Found by their cameras if not given.", rich_help_panel=INPUT),
+]
+LpipsOption = Annotated[
+    Lpips | None,
+    typer.Option(
+        help="Networks of the perceptual distance; none is much faster.",
+        show_default="both, where installed",
+        rich_help_panel=MEASURING,
+    ),
 ]
 SuperpixelsOption = Annotated[
     int | None,

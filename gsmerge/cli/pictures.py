@@ -40,23 +40,29 @@ def picture_stems(names: Sequence[str]) -> list[str]:
     return stems
 
 
+def png_bytes(picture: Picture) -> bytes:
+    """An 8 bit RGB picture as a PNG file."""
+    import cv2
+
+    _, data = cv2.imencode(".png", picture[..., ::-1])
+    return bytes(data.tobytes())
+
+
 def write_picture(path: Path, picture: Picture, *, overwrite: bool) -> None:
     """Write an 8 bit RGB picture as PNG, atomically; its folder is made if it is not there.
 
     Raises:
         SceneError: If the file cannot be written.
     """
-    import cv2
-
     from gsmerge.io import atomic_output
 
-    _, data = cv2.imencode(".png", picture[..., ::-1])
+    data = png_bytes(picture)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(path.parent, f"cannot be made ({error.strerror})", "name another with --output") from error
     with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(data.tobytes())
+        temporary.write_bytes(data)
 
 
 def tell_pictures(

@@ -2,6 +2,7 @@
 
 from gsmerge.io.alignment import Alignment, check_alignment
 from gsmerge.io.atomic import atomic_output
+from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
 from gsmerge.io.images import read_images
 from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
@@ -33,6 +34,7 @@ __all__ = [
     "ply_notes",
     "read_cameras",
     "read_images",
+    "read_json",
     "read_photos",
     "read_ply",
     "read_scene",

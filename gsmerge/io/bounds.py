@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 from gsmerge.errors import SceneError
 
@@ -48,6 +50,19 @@ def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise SceneError(path, f"cannot be read as text ({error})") from error
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file of at most 32 MiB holds.
+
+    Raises:
+        SceneError: If it cannot be read or is no JSON.
+    """
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise SceneError(path, f"expected JSON, found something else ({error})") from error
 
 
 def check_pixels(path: str | os.PathLike[str], width: int, height: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import read_json
 from gsmerge.io.frame import Frame
 from gsmerge.io.loose import Sight, sight
 from gsmerge.io.poses import with_poses
@@ -39,14 +39,14 @@ def read_dataparser(path: Path, cameras: Path | None) -> list[Frame]:
     Raises:
         SceneError: If there is no rotation, shift and positive scale in it.
     """
-    data = _read(path)
+    data = read_json(path)
     try:
         moved = _square(data["transform"])
         scale = float(data["scale"])
     except (KeyError, TypeError, ValueError) as error:
         raise SceneError(path, f"expected 'transform' of 3x4 numbers and 'scale' ({error})") from error
     frames = [_frame(path, moved, scale)]
-    beside = _read(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
+    beside = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(beside, dict) and "applied_transform" in beside:
         try:
             applied, factor = _square(beside["applied_transform"]), float(beside.get("applied_scale") or 1)
@@ -81,13 +81,6 @@ def seen_in_dataparser(
     if not seen.ok or seen.score <= sight(gaussians, valid, cameras, images).score:
         return None
     return best, seen, f"the cameras are moved into the Gaussians' frame by {NAME}"
-
-
-def _read(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SceneError(path, f"expected JSON, found something else ({error})") from error
 
 
 def _square(values: Any) -> np.ndarray:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file, read_text
+from gsmerge.io.bounds import check_file, read_json
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
 from gsmerge.io.cameras.da3 import read_da3
@@ -86,11 +85,7 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
 
 
 def _read_json(path: Path) -> CameraFile:
-    text = read_text(path)
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise SceneError(path, f"expected JSON, found something else ({error})") from error
+    data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
         if isinstance(frames, list) and frames and all(isinstance(f, dict) and "w2c" in f for f in frames):

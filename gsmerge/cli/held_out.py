@@ -1,0 +1,62 @@
+"""Held-out views and networks as commands that measure want them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsmerge.cli.options import Lpips
+from gsmerge.cli.settings import told_as_usage
+from gsmerge.errors import UsageError
+
+if TYPE_CHECKING:
+    from gsmerge.evaluate import Views
+    from gsmerge.io import SceneLoad
+    from gsmerge.types import LooseScene, PixelScene
+
+_NETS = {Lpips.both: ("vgg", "alex"), Lpips.vgg: ("vgg",), Lpips.alex: ("alex",), Lpips.none: ()}
+
+
+def networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
+    """The networks to measure with, and a note where the weights are not installed and nobody asked for them."""
+    if asked is not None:
+        return _NETS[asked], []
+    from gsmerge.perceptual import INSTALL, lpips_available
+
+    nets = tuple(net for net in _NETS[Lpips.both] if lpips_available(net))
+    return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
+
+
+def held_out_views(
+    load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
+) -> tuple[PixelScene | LooseScene, Views | None]:
+    """The scene with the context views that were asked for, and the held-out ones."""
+    from gsmerge.evaluate import Views
+    from gsmerge.io import read_targets
+    from gsmerge.sampling import even_views, midpoint_views, subset
+
+    if target_images is not None and targets is None:
+        raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
+    read = None if targets is None else read_targets(load, targets, target_images)
+    found = None if read is None else Views(read.cameras, read.images, read.names)
+    if views is None:
+        return load.scene, found
+    with told_as_usage():
+        ids = even_views(len(load.scene), views)
+    if read is not None and found is not None:
+        if read.context_places is None:
+            raise UsageError(
+                "--views: expected --targets that also name the input views, in the order of the trajectory"
+            )
+        chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
+        if not chosen:
+            raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
+        found = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
+    return subset(load.scene, ids), found
+
+
+def file_names(paths: Sequence[Path]) -> list[str]:
+    """A short name for each file: its own where no two are alike, otherwise its path."""
+    short = [path.name for path in paths]
+    return short if len(set(short)) == len(short) else [str(path) for path in paths]
