@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -100,6 +101,9 @@ def chart(
     if not draw_only:
         with told_as_usage():
             told = _run_options(lpips, lpips_views, proxy_views, seed, threads, rerun)
+        typed = {**lists, "grid": grid, "targets": targets, "target_images": target_images, "lpips_views": lpips_views}
+        typed |= {"lpips": None if lpips == "none" else lpips, "seed": seed, "threads": threads}
+        told = replace(told, command=_command(scenes or [], out, typed))
         plan, stored, notes = _planned(scenes or [], _grid(grid, lists), out, targets, target_images, told)
         if dry_run:
             _print_plan(plan, stored, told, out, notes, as_json=json)
@@ -143,16 +147,16 @@ def _run_options(
     missing = [net for net in nets[lpips] if not lpips_available(net)]
     if missing:
         raise UsageError(f"--lpips {lpips}: its weights are not installed: {INSTALL}")
-    return RunOptions(
-        nets[lpips], lpips_views, seed or 0, threads, proxy_views, rerun, shlex.join(["gsmerge", *_typed()])
-    )
+    return RunOptions(nets[lpips], lpips_views, seed or 0, threads, proxy_views, rerun)
 
 
-def _typed() -> list[str]:
-    """The arguments of this command, as they were typed."""
-    context: Any = typer.Context
-    found = getattr(context, "current", None)
-    return list(found) if found else sys.argv[1:]
+def _command(scenes: Sequence[Path], out: Path, told: dict[str, Any]) -> str:
+    """The command line that does the same, without what was left at its default."""
+    words = ["gsmerge", "chart", *map(str, scenes), "--out", str(out)]
+    for name, value in told.items():
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)
 
 
 def _planned(

@@ -31,7 +31,7 @@ def readme_commands(root: Path) -> list[str]:
 
 
 def test_commands_are_the_documented_ones() -> None:
-    assert set(COMMANDS) == {"compact", "evaluate", "inspect", "segment", "render", "preview", "report"}
+    assert set(COMMANDS) == {"compact", "evaluate", "inspect", "segment", "render", "preview", "report", "chart"}
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
