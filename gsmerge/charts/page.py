@@ -64,7 +64,7 @@ def make_page(
         ("environment", "Environment", _environment(records, command)),
     ]
     sections = [section for section in sections if section[2]]
-    links = "".join(f'<a href="#{text(name)}">{text(title)}</a>' for name, title, _ in sections)
+    links = " ".join(f'<a href="#{text(name)}">{text(title)}</a>' for name, title, _ in sections)
     body = "".join(
         f'<section id="{text(name)}"><h2>{text(title)}</h2>{content}</section>' for name, title, content in sections
     )

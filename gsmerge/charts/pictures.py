@@ -62,7 +62,12 @@ def find_shots(records: Sequence[RunRecord], folder: Path) -> list[Shot]:
 
 def compare_section(records: Sequence[RunRecord], folder: Path) -> str:
     """Sliders between photo, input and results; the arrow keys move them."""
-    return "".join(_slider(shot, number) for number, shot in enumerate(find_shots(records, folder)))
+    shots = find_shots(records, folder)
+    if not shots:
+        return ""
+    how = "Left and right of the line; drag it, or move the slider with the arrow keys."
+    sliders = "".join(_slider(shot, number) for number, shot in enumerate(shots))
+    return f'<p class="muted">{how}</p><div class="pairs">{sliders}</div>'
 
 
 def _slider(shot: Shot, number: int) -> str:

@@ -189,6 +189,8 @@ def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]]
 def _middle(points: Mapping[str, tuple[float, float]]) -> float:
     """Geometric mean of the costs; arithmetic where one is not positive."""
     costs = [x for x, _ in points.values()]
+    if min(costs) == max(costs):
+        return costs[0]
     return float(np.exp(np.mean(np.log(costs)))) if min(costs) > 0 else float(np.mean(costs))
 
 

@@ -48,6 +48,12 @@ def _canvas(num_panels: int, height: float = HEIGHT) -> tuple[Canvas, list[Axes]
     return canvas, list(np.atleast_1d(canvas.subplots(1, num_panels)))
 
 
+def _lay_out(canvas: Canvas) -> None:
+    """Decide all places once, so that those in pixels are known and stay."""
+    canvas.draw_without_rendering()
+    canvas.set_layout_engine("none")
+
+
 def _draw_curves(figure: figures.Curves) -> Canvas:
     canvas, all_axes = _canvas(len(figure.panels))
     looks = style.looks(figure.panels[0].lines)
@@ -61,10 +67,10 @@ def _draw_curves(figure: figures.Curves) -> Canvas:
             _mark_front(axes, panel)
     first, last = all_axes[0], all_axes[-1]
     labels = _labels(last, figure.panels[-1], looks)
-    at_ends = end_labels(last, labels)  # one panel has the names for all
-    canvas.draw_without_rendering()  # so that places in pixels are known
-    if at_ends:
-        settle(last, labels)
+    names = end_labels(last, labels)  # one panel has the names for all
+    _lay_out(canvas)
+    if names:
+        settle(last, labels, names)
     else:
         place_labels(first, _labels(first, figure.panels[0], looks))
     return canvas
@@ -143,7 +149,7 @@ def _draw_bars(figure: figures.Bars) -> Canvas:
         )
         left += np.array(seconds)
     for row, total in enumerate(left):
-        axes.text(total + 0.012 * left.max(), row, f"{total:.2g} s" if total < 10 else f"{total:.0f} s", va="center")
+        axes.text(total + 0.012 * left.max(), row, _seconds(float(total)), va="center")
     axes.set_yticks(range(rows), figure.rows)
     axes.set_ylim(rows - 0.5, -0.5)
     axes.set_xlim(0, 1.12 * left.max())
@@ -157,6 +163,10 @@ def _draw_bars(figure: figures.Bars) -> Canvas:
         handleheight=0.9, columnspacing=1.0, handletextpad=0.4,
     )  # fmt: skip
     return canvas
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.0f} s" if value >= 10 else f"{value:.1f} s" if value >= 1 else f"{value:.2f} s"
 
 
 def _draw_payback(figure: figures.Payback) -> Canvas:
@@ -180,7 +190,7 @@ def _draw_payback(figure: figures.Payback) -> Canvas:
     style.log_axis(axes, "y", float(spread.min()) / 1.3, float(spread.max()) * 1.3)
     axes.set_xlabel("Frames rendered")
     axes.set_ylabel("Seconds, merge included")
-    canvas.draw_without_rendering()
+    _lay_out(canvas)
     spots = np.linspace(8, len(frames) - 12, 14).astype(int)
     labels = []
     for name, total in totals.items():

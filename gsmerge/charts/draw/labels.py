@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
@@ -36,28 +37,28 @@ class Label:
     anchors: Curve | None = None
 
 
-def end_labels(axes: Axes, labels: Sequence[Label]) -> bool:
+def end_labels(axes: Axes, labels: Sequence[Label]) -> list[Text]:
     """Write the names right of the axes, each at the height of its line's end, moved apart where they would touch.
 
     Must come before the figure is laid out, which then makes room for them; :func:`settle` moves them apart.
 
     Returns:
-        Whether it was done: only where all lines end at about the same place.
+        The names; none where the lines do not all end at about the same place.
     """
     ends = [_axes_place(axes, label.curve[-1])[0] for label in labels]
     if not labels or max(ends) - min(ends) > SAME_END:
-        return False
-    for label in labels:
+        return []
+    return [
         axes.text(
             1.03, _axes_place(axes, label.curve[-1])[1], label.text, transform=axes.transAxes, fontsize=SIZE,
-            color=label.color, fontweight="bold", va="center", gid="end-label",
-        )  # fmt: skip
-    return True
+            color=label.color, fontweight="bold", va="center",
+        )
+        for label in labels
+    ]  # fmt: skip
 
 
-def settle(axes: Axes, labels: Sequence[Label]) -> None:
+def settle(axes: Axes, labels: Sequence[Label], texts: Sequence[Text]) -> None:
     """Move the names of :func:`end_labels` apart, with a thin line to the end of the curve from those that moved."""
-    texts = [text for text in axes.texts if text.get_gid() == "end-label"]
     height = 1.25 * max(text.get_window_extent().height for text in texts) / axes.bbox.height
     wanted = [_axes_place(axes, label.curve[-1])[1] for label in labels]
     for text, label, at, y in zip(texts, labels, wanted, spread(wanted, height), strict=True):
