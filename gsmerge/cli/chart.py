@@ -15,6 +15,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
+from gsmerge.cli.evaluate import Lpips
 from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import BatchError, UsageError
 
@@ -33,12 +34,8 @@ def _list(help: str, default: str, name: str | None = None) -> Any:
 
 def chart(
     scenes: Annotated[
-        list[Path] | None, typer.Argument(metavar="[SCENES]...", help=".ply files, or the folders that they are in.")
+        list[Path] | None, typer.Argument(metavar="SCENES", help=".ply files, or the folders that they are in.")
     ] = None,
-    out: Annotated[
-        Path,
-        typer.Option(help="Results folder; runs that it has already are not repeated.", rich_help_panel=opt.OUTPUT),
-    ] = Path("charts"),
     methods: Annotated[str | None, _list("Methods: gsmerge and others to compare it with.", "gsmerge")] = None,
     k: Annotated[str | None, _list("Gaussians per superpixel: 1 to 8, auto.", "1", "--k")] = None,
     budgets: Annotated[
@@ -63,9 +60,8 @@ def chart(
         str | None, typer.Option(help="Folder of those photos, in the same way.", rich_help_panel=opt.INPUT)
     ] = None,
     lpips: Annotated[
-        str,
-        typer.Option(help="Perceptual distance: vgg, alex, both or none; slow.", rich_help_panel=MEASURING),
-    ] = "none",
+        Lpips, typer.Option(help="Networks of the perceptual distance; slow.", rich_help_panel=MEASURING)
+    ] = Lpips.none,
     lpips_views: Annotated[
         int | None,
         typer.Option(min=1, help="Measure it on at most so many views.", show_default="all", rich_help_panel=MEASURING),
@@ -73,6 +69,10 @@ def chart(
     proxy_views: Annotated[
         int, typer.Option(min=0, help="Photos per scene to measure superpixels on.", rich_help_panel=MEASURING)
     ] = 2,
+    out: Annotated[
+        Path,
+        typer.Option(help="Results folder; runs that it has already are not repeated.", rich_help_panel=opt.OUTPUT),
+    ] = Path("charts"),
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Repeat runs that are done.", rich_help_panel=opt.OUTPUT)
     ] = False,
@@ -102,7 +102,7 @@ def chart(
         with told_as_usage():
             told = _run_options(lpips, lpips_views, proxy_views, seed, threads, rerun)
         typed = {**lists, "grid": grid, "targets": targets, "target_images": target_images, "lpips_views": lpips_views}
-        typed |= {"lpips": None if lpips == "none" else lpips, "seed": seed, "threads": threads}
+        typed |= {"lpips": None if lpips == Lpips.none else lpips.value, "seed": seed, "threads": threads}
         told = replace(told, command=_command(scenes or [], out, typed))
         plan, stored, notes = _planned(scenes or [], _grid(grid, lists), out, targets, target_images, told)
         if dry_run:
@@ -136,18 +136,15 @@ def _grid(file: Path | None, lists: dict[str, str | None]) -> Grid:
 
 
 def _run_options(
-    lpips: str, lpips_views: int | None, proxy_views: int, seed: int | None, threads: int | None, rerun: bool
+    lpips: Lpips, lpips_views: int | None, proxy_views: int, seed: int | None, threads: int | None, rerun: bool
 ) -> RunOptions:
     from gsmerge.charts.run import RunOptions
     from gsmerge.perceptual import INSTALL, lpips_available
 
-    nets = {"none": (), "vgg": ("vgg",), "alex": ("alex",), "both": ("vgg", "alex")}
-    if lpips not in nets:
-        raise UsageError(f"--lpips: expected one of {', '.join(nets)}, got {lpips}")
-    missing = [net for net in nets[lpips] if not lpips_available(net)]
-    if missing:
-        raise UsageError(f"--lpips {lpips}: its weights are not installed: {INSTALL}")
-    return RunOptions(nets[lpips], lpips_views, seed or 0, threads, proxy_views, rerun)
+    nets = {Lpips.none: (), Lpips.both: ("vgg", "alex")}.get(lpips, (lpips.value,))
+    if not all(map(lpips_available, nets)):
+        raise UsageError(f"--lpips {lpips.value}: its weights are not installed: {INSTALL}")
+    return RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun)
 
 
 def _command(scenes: Sequence[Path], out: Path, told: dict[str, Any]) -> str:
