@@ -38,7 +38,8 @@ RATIOS = (0.0045, 0.22)  # of rivals' points that are judged: 0.5 % to 20 %, and
 ALIKE = 0.01  # counts that differ by less than this share are drawn once
 SMALL = 0.03  # share of the longest bar below which a stage is not told apart
 BAND_WORDS = (
-    "Means over {scenes}; bands: 95 % t intervals of what the settings differ by, the scenes' own level taken off."
+    "Means over {scenes}; bands, from three scenes on: 95 % t intervals of what the settings differ by, the scenes' own"
+    " level taken off."
 )
 
 
@@ -187,7 +188,7 @@ def _usual(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     chosen = [r for r in records if r.method != INPUT and size_label(r) == size and r.views_asked == views]
     names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
     found: dict[str, list[RunRecord]] = {}
-    for record in sorted(chosen, key=lambda r: r.method != OURS):
+    for record in sorted(chosen, key=lambda r: (r.method != OURS, len(line_key(r)[1]))):
         found.setdefault(names[line_key(record)], []).append(record)
     return found
 

@@ -102,7 +102,8 @@ def _results(records: Sequence[RunRecord]) -> str:
         }
         for metric in metrics
     }
-    ours_first = sorted((r for r in records if r.method != INPUT), key=lambda r: r.method != OURS)
+    merged = [r for r in records if r.method != INPUT]
+    ours_first = sorted(merged, key=lambda r: (r.method != OURS, len(line_key(r)[1])))
     names = line_names(list(dict.fromkeys(map(line_key, ours_first))))
     groups: dict[tuple[str, str], list[RunRecord]] = {}
     lines = list(names)

@@ -43,7 +43,7 @@ def find_shots(records: Sequence[RunRecord], folder: Path) -> list[Shot]:
         own = [r for r in records if r.scene == scene and r.views_asked == views and r.pictures]
         inputs = [r for r in own if r.method == INPUT][-1:]
         results = [r for r in own if r.method != INPUT and size_label(r) == size]
-        results.sort(key=lambda r: r.method != OURS)
+        results.sort(key=lambda r: (r.method != OURS, len(line_key(r)[1])))
         chosen = [*inputs, *results[:MOST_RESULTS]]
         for i, view in enumerate(chosen[0].pictures if chosen else ()):
             photo = picture_path(folder, chosen[0].scene_sha256, i, "photo")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -141,7 +140,7 @@ def by_views(records: Sequence[RunRecord], y: Value, *, with_input: bool = False
     """Lines from number of views to number of views, at the usual size; empty where there is one number alone."""
     size = usual_size(records)
     chosen = [r for r in records if (r.method == INPUT and with_input) or (r.method != INPUT and size_label(r) == size)]
-    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y)
+    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, least=1.0)
     return [line for line in lines if len(line.points) > 1]
 
 
@@ -151,31 +150,33 @@ def _lines(
     order: Callable[[RunRecord], float],
     x: Value,
     y: Value,
+    least: float = 0.5,
 ) -> list[Line]:
+    """Lines of points that have at least a share of the scenes, all over the same ones."""
     cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]] = {}
     for record in sorted(records, key=order):
         at, value = x(record), y(record)
         if at is not None and value is not None:
             cells.setdefault(line_key(record), {}).setdefault(label(record), {})[record.scene] = (float(at), value)
-    _keep_common(cells)
+    _keep_common(cells, least)
     columns = [points for line in cells.values() for points in line.values()]
-    intervals = iter(_intervals(columns))
+    intervals = dict(zip(map(id, columns), _intervals(columns), strict=True))
     names = line_names(list(cells))
     lines = []
-    for key, sizes in cells.items():
-        points = [Point(name, _middle(found), next(intervals), found) for name, found in sizes.items()]
+    for key, sizes in sorted(cells.items(), key=lambda cell: (cell[0][0] != OURS, len(cell[0][1]))):
+        points = [Point(name, _middle(found), intervals[id(found)], found) for name, found in sizes.items()]
         lines.append(Line(names[key], key[0] == OURS, tuple(points)))
-    return sorted(lines, key=lambda line: not line.ours)
+    return lines
 
 
-def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]]) -> None:
+def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]], least: float) -> None:
     """Leave only scenes that every point has, so that all means are over the same; all, where that leaves none.
 
-    Points that have less than half of the scenes are left out first: a few failed runs must not cost the rest.
+    Points that have too few of the scenes are left out first: a few failed runs must not cost the rest.
     """
-    counts: Counter[str] = Counter(s for line in cells.values() for points in line.values() for s in points)
+    num_scenes = len({scene for line in cells.values() for points in line.values() for scene in points})
     for key in list(cells):
-        cells[key] = {name: points for name, points in cells[key].items() if 2 * len(points) >= len(counts)}
+        cells[key] = {name: points for name, points in cells[key].items() if len(points) >= least * num_scenes}
         if not cells[key]:
             del cells[key]
     columns = [points for line in cells.values() for points in line.values()]
@@ -195,11 +196,12 @@ def _middle(points: Mapping[str, tuple[float, float]]) -> float:
 
 
 def _intervals(columns: Sequence[Mapping[str, tuple[float, float]]]) -> list[Interval]:
-    """One for each column: without what scenes differ by where all columns have the same ones."""
+    """One for each column, without what scenes differ by; of no width where the columns have different ones."""
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))
-    return [paired_intervals(np.array([[y] for _, y in column.values()], np.float64))[0] for column in columns]
+    means = [float(np.mean([y for _, y in column.values()])) for column in columns]
+    return [Interval(mean, mean, mean, len(column)) for mean, column in zip(means, columns, strict=True)]
 
 
 def scene_points(records: Sequence[RunRecord], x: Value, y: Value) -> dict[str, list[tuple[float, float]]]:

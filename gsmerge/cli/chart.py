@@ -7,7 +7,6 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,8 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
-from gsmerge.cli.evaluate import Lpips
+from gsmerge.cli.held_out import networks
+from gsmerge.cli.options import Lpips
 from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import BatchError, UsageError
 
@@ -59,13 +59,10 @@ def chart(
     target_images: Annotated[
         str | None, typer.Option(help="Folder of those photos, in the same way.", rich_help_panel=opt.INPUT)
     ] = None,
-    lpips: Annotated[
-        Lpips, typer.Option(help="Networks of the perceptual distance; slow.", rich_help_panel=MEASURING)
-    ] = Lpips.none,
+    lpips: opt.LpipsOption = None,
     lpips_views: Annotated[
-        int | None,
-        typer.Option(min=1, help="Measure it on at most so many views.", show_default="all", rich_help_panel=MEASURING),
-    ] = None,
+        int, typer.Option(min=1, help="Measure it on at most so many views of each split.", rich_help_panel=MEASURING)
+    ] = 2,
     proxy_views: Annotated[
         int, typer.Option(min=0, help="Photos per scene to measure superpixels on.", rich_help_panel=MEASURING)
     ] = 2,
@@ -99,15 +96,19 @@ def chart(
     done: list[RunRecord] = []
     notes: list[str] = []
     if not draw_only:
+        from gsmerge.charts.run import RunOptions
+
+        nets, missing = _networks(lpips)
+        typed: dict[str, Any] = {**lists, "grid": grid, "targets": targets, "target_images": target_images}
+        typed |= {"lpips": lpips and lpips.value, "lpips_views": lpips_views, "seed": seed, "threads": threads}
+        command = _command(scenes or [], out, typed)
         with told_as_usage():
-            told = _run_options(lpips, lpips_views, proxy_views, seed, threads, rerun)
-        typed = {**lists, "grid": grid, "targets": targets, "target_images": target_images, "lpips_views": lpips_views}
-        typed |= {"lpips": None if lpips == Lpips.none else lpips.value, "seed": seed, "threads": threads}
-        told = replace(told, command=_command(scenes or [], out, typed))
+            told = RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun, command)
         plan, stored, notes = _planned(scenes or [], _grid(grid, lists), out, targets, target_images, told)
         if dry_run:
             _print_plan(plan, stored, told, out, notes, as_json=json)
             return
+        notes = [*missing, *notes]
         say_notes(notes, quiet=quiet or json)
         done, more = _run(plan, out, told, quiet=quiet or json)
         say_notes(more, quiet=quiet or json)
@@ -135,16 +136,14 @@ def _grid(file: Path | None, lists: dict[str, str | None]) -> Grid:
     return parse_grid(lists, Grid() if file is None else read_grid(file))
 
 
-def _run_options(
-    lpips: Lpips, lpips_views: int | None, proxy_views: int, seed: int | None, threads: int | None, rerun: bool
-) -> RunOptions:
-    from gsmerge.charts.run import RunOptions
+def _networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
+    """The networks of LPIPS; those that were asked for must be there before the first run."""
     from gsmerge.perceptual import INSTALL, lpips_available
 
-    nets = {Lpips.none: (), Lpips.both: ("vgg", "alex")}.get(lpips, (lpips.value,))
+    nets, missing = networks(asked)
     if not all(map(lpips_available, nets)):
-        raise UsageError(f"--lpips {lpips.value}: its weights are not installed: {INSTALL}")
-    return RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun)
+        raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
+    return nets, missing
 
 
 def _command(scenes: Sequence[Path], out: Path, told: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from gsmerge.charts.store import read_runs
 from .conftest import Outcome, Run, listing
 
 TARGETS = ("--targets", "{parent}/targets/transforms.json")
-FAST = ("--budgets", "1%,2%", "--fit", "none", "--proxy-views", "0")
+FAST = ("--budgets", "1%,2%", "--fit", "none", "--proxy-views", "0", "--lpips", "none")
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +200,18 @@ def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run
     grid = copied / "grid.json"
     grid.write_text('{"budgets": ["1%"], "densities": [0.02], "fit": "none"}')
     outcome = run(
-        "chart", copied / "room", "--out", copied / "out", *TARGETS, "--grid", grid, "--proxy-views", 0, "--json"
+        "chart",
+        copied / "room",
+        "--out",
+        copied / "out",
+        *TARGETS,
+        "--grid",
+        grid,
+        "--proxy-views",
+        0,
+        "--lpips",
+        "none",
+        "--json",
     )
     assert outcome.code == 0
     assert {settings.get("density") for settings in merges} == {0.02}

@@ -36,13 +36,13 @@ def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
         SceneError: If a file cannot be written.
     """
     require_matplotlib()
-    from gsmerge.charts.draw.figures import draw
+    from gsmerge.charts.draw.figures import common_looks, draw
     from gsmerge.io import atomic_output
 
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = {}
+    drawn, looks = {}, common_looks(figures)
     for figure in figures:
-        png, svg = draw(figure)
+        png, svg = draw(figure, looks)
         for suffix, data in (("png", png), ("svg", svg)):
             with atomic_output(folder / f"{figure.name}.{suffix}", overwrite=True) as temporary:
                 temporary.write_bytes(data)

@@ -16,26 +16,53 @@ from matplotlib.ticker import FixedLocator, MaxNLocator
 from gsmerge.charts import figures
 from gsmerge.charts.draw import style
 from gsmerge.charts.draw.labels import Label, end_labels, place_labels, settle
+from gsmerge.charts.experiment import OURS
+from gsmerge.charts.record import INPUT
 from gsmerge.charts.series import Line
 from gsmerge.charts.statistics import pareto_front
 
 PANEL_WIDTH, HEIGHT = 2.9, 2.5  # inches
 SINGLE_WIDTH = 4.4
+SAME_COST = 1.02  # costs that differ by less than this factor are drawn as one
+FEWEST = 3  # scenes that a band is drawn from; two say next to nothing
 MARGIN = 0.12  # of the range of the means, above and below
 STAGE_COLORS = ("#0072B2", "#56B4E9", "#009E73", "#F0E442", "#E69F00", "#D55E00", "#CC79A7", "#999999")
 
 
-def draw(figure: figures.Figure) -> tuple[bytes, bytes]:
-    """A figure as PNG and SVG; the same numbers give the same bytes."""
+Looks = Mapping[str, style.Look]
+
+
+def common_looks(several: Sequence[figures.Figure]) -> Looks:
+    """The looks of the first figure's lines, for all figures that show no others."""
+    return style.looks(next((_names(figure) for figure in several if isinstance(figure, figures.Curves)), []))
+
+
+def _names(figure: figures.Figure) -> list[tuple[str, bool]]:
+    """The lines of a figure and whether they are ours."""
+    if isinstance(figure, figures.Curves):
+        return [(INPUT, False), *dict.fromkeys((line.name, line.ours) for p in figure.panels for line in p.lines)]
+    rows = figure.rows if isinstance(figure, figures.Bars) else [name for name, *_ in figure.rows]
+    return [(INPUT, False), *((name, name.startswith(OURS)) for name in rows)]
+
+
+def draw(figure: figures.Figure, common: Looks) -> tuple[bytes, bytes]:
+    """A figure as PNG and SVG; the same numbers give the same bytes.
+
+    Args:
+        figure: What to draw.
+        common: Looks of lines, taken if they have all of the figure's.
+    """
+    names = _names(figure)
+    looks = common if all(name in common for name, _ in names) else style.looks(names)
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # whatever the user's own style is
         matplotlib.rcParams.update(style.RC)
         if isinstance(figure, figures.Curves):
-            canvas = _draw_curves(figure)
+            canvas = _draw_curves(figure, looks)
         elif isinstance(figure, figures.Bars):
             canvas = _draw_bars(figure)
         else:
-            canvas = _draw_payback(figure)
+            canvas = _draw_payback(figure, looks)
         png, svg = io.BytesIO(), io.BytesIO()
         canvas.savefig(png, format="png", metadata={"Software": None})
         canvas.savefig(svg, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -54,13 +81,12 @@ def _lay_out(canvas: Canvas) -> None:
     canvas.set_layout_engine("none")
 
 
-def _draw_curves(figure: figures.Curves) -> Canvas:
+def _draw_curves(figure: figures.Curves, looks: Looks) -> Canvas:
     canvas, all_axes = _canvas(len(figure.panels))
-    looks = style.looks(figure.panels[0].lines)
     for axes, panel in zip(all_axes, figure.panels, strict=True):
         _axes(axes, figure, panel)
         for line in panel.lines:
-            _line(axes, line, looks.setdefault(line.name, style.Look(style.MUTED, "-", ".", 1.0, 2)))
+            _line(axes, line, looks[line.name])
         if panel.reference is not None:
             axes.axhline(panel.reference[1], color=style.INPUT_COLOR, linewidth=0.9, linestyle=(0, (2, 2)), zorder=1)
         if figure.front:
@@ -76,7 +102,7 @@ def _draw_curves(figure: figures.Curves) -> Canvas:
     return canvas
 
 
-def _labels(axes: Axes, panel: figures.Panel, looks: Mapping[str, style.Look]) -> list[Label]:
+def _labels(axes: Axes, panel: figures.Panel, looks: Looks) -> list[Label]:
     labels = [
         Label(line.name, looks[line.name].color, np.array([[p.x, p.y.mean] for p in line.points]))
         for line in panel.lines
@@ -116,9 +142,10 @@ def _axes(axes: Axes, figure: figures.Curves, panel: figures.Panel) -> None:
 def _line(axes: Axes, line: Line, look: style.Look) -> None:
     x, y = [p.x for p in line.points], [p.y.mean for p in line.points]
     low, high = [p.y.low for p in line.points], [p.y.high for p in line.points]
-    if low != high and len(x) > 1:
+    known = min(p.y.count for p in line.points) >= FEWEST and low != high
+    if known and len(x) > 1:
         axes.fill_between(x, low, high, color=look.color, alpha=0.13, linewidth=0, zorder=look.order - 1)
-    elif low != high:
+    elif known:
         axes.vlines(x, low, high, color=look.color, alpha=0.35, linewidth=2.5, zorder=look.order - 1)
     axes.plot(
         x, y, color=look.color, linestyle=look.dash, linewidth=look.width, marker=look.marker, markersize=3.6,
@@ -130,7 +157,8 @@ def _mark_front(axes: Axes, panel: figures.Panel) -> None:
     """Rings around the points that no other beats, and the steps between them."""
     points = [p for line in panel.lines for p in line.points]
     sign = 1 if panel.higher else -1
-    front = [points[i] for i in pareto_front([p.x for p in points], [sign * p.y.mean for p in points])]
+    costs = [round(math.log(p.x) / math.log(SAME_COST)) for p in points]
+    front = [points[i] for i in pareto_front(costs, [sign * p.y.mean for p in points])]
     x, y = [p.x for p in front], [p.y.mean for p in front]
     axes.plot(x, y, color="#c9c9c9", linewidth=4.5, solid_capstyle="round", zorder=1, alpha=0.6)
     axes.plot(
@@ -169,14 +197,13 @@ def _seconds(value: float) -> str:
     return f"{value:.0f} s" if value >= 10 else f"{value:.1f} s" if value >= 1 else f"{value:.2f} s"
 
 
-def _draw_payback(figure: figures.Payback) -> Canvas:
+def _draw_payback(figure: figures.Payback, looks: Looks) -> Canvas:
     canvas, (axes,) = _canvas(1)
     even = [frames for *_, frames in figure.rows if frames is not None]
     last = 10 ** math.ceil(math.log10(max([30.0, *even]) * 2))
     first = 10 ** math.floor(math.log10(max(1.0, min([10.0, *even]) / 3)))
     frames = np.geomspace(first, last, 120)
-    looks = style.names_looks([("input", False), *((name, name.startswith("gsmerge")) for name, *_ in figure.rows)])
-    totals = {"input": frames * figure.input_ms / 1000}
+    totals = {INPUT: frames * figure.input_ms / 1000}
     totals |= {name: seconds + frames * ms / 1000 for name, seconds, ms, _ in figure.rows}
     for name, total in totals.items():
         look = looks[name]

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
 from gsmerge.charts.record import INPUT
-from gsmerge.charts.series import Line
 
 INK, MUTED, GRID = "#222222", "#6b6b6b", "#e6e6e6"
 OURS = ("#0072B2", "#56B4E9", "#003F66", "#7FA8C9", "#2E5C8A", "#9FC5E8")
@@ -59,13 +58,8 @@ class Look:
     order: int
 
 
-def looks(lines: Sequence[Line]) -> dict[str, Look]:
-    """A look for every line by name: ours blue and in front, each rival a colour and marker of its own."""
-    return names_looks([(line.name, line.ours) for line in lines])
-
-
-def names_looks(names: Sequence[tuple[str, bool]]) -> dict[str, Look]:
-    """The same for names and whether they are ours."""
+def looks(names: Sequence[tuple[str, bool]]) -> dict[str, Look]:
+    """A look for every line by its name and whether it is ours: ours blue and in front, each rival its own."""
     found: dict[str, Look] = {}
     ours = rivals = 0
     for name, is_ours in names:
