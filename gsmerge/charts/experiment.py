@@ -16,6 +16,8 @@ from gsmerge.errors import SceneError, UsageError
 OURS = "gsmerge"
 ALL = "all"  # word for all views
 SIZES = ("budget", "density")
+WHOLE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians, so have one size
+FITTED = ("unmerged-fit",)  # methods other than ours that effort changes
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
     """Method and settings of every run on one scene, for one number of views, and what was left out.
 
     Only what differs from the defaults is set. Left out are a method of superpixels times efforts that it does not
-    have, and for other methods than ours everything that only ours has: they run once per size and fit.
+    have, and for other methods than ours everything that only ours has: they run once per size.
 
     Returns:
         The combinations, the unmerged input first; one note per kind of combination that was left out.
@@ -157,8 +159,9 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
             if why is not None:
                 dropped[why] = dropped.get(why, 0) + 1
                 continue
-            told = {name: value for name, value in chosen.items() if value != defaults[name]}
-            out.append((method, size | told if method == OURS else dict(size)))
+            known = chosen if method == OURS else {"effort": effort} if method in FITTED else {}
+            told = {name: value for name, value in known.items() if value != defaults[name]}
+            out.append((method, told if method in WHOLE else size | told))
     return out, [f"{why}: {count} combination(s) left out" for why, count in dropped.items()]
 
 
@@ -167,10 +170,11 @@ def _senseless(
 ) -> str | None:
     """Why a combination is left out; None if it is not."""
     if method != OURS:
-        if "density" in size:
-            return f"{method} has no superpixels, so no density"
         first = {"k": grid.k[0], "segmentation": grid.segmentations[0], "fit": grid.fit[0], "effort": grid.efforts[0]}
-        return None if dict(chosen) == first else f"{method} takes a budget alone"
+        own = {"effort"} if method in FITTED else set()
+        if any(chosen[name] != value for name, value in first.items() if name not in own):
+            return f"{method} knows sizes" + (" and effort alone" if own else " alone")
+        return f"{method} keeps all Gaussians" if method in WHOLE and sizes and size != sizes[0] else None
     if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and chosen["effort"] != grid.efforts[0]:
         return "effort changes nothing for other superpixels than rdseg without a full fit"
     if chosen["k"] == "auto" and sizes and size != sizes[0]:

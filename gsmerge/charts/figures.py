@@ -26,7 +26,7 @@ from gsmerge.charts.series import (
     metrics_of,
     scene_points,
     score_of,
-    size_label,
+    stands_for_all,
     usable,
     usual_size,
     usual_views,
@@ -185,7 +185,7 @@ def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | Non
 def _usual(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     """Runs of the usual size and number of views by the name of their line, ours first."""
     size, views = usual_size(records), usual_views(records)
-    chosen = [r for r in records if r.method != INPUT and size_label(r) == size and r.views_asked == views]
+    chosen = [r for r in records if stands_for_all(r, size) and r.views_asked == views]
     names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
     found: dict[str, list[RunRecord]] = {}
     for record in sorted(chosen, key=lambda r: (r.method != OURS, len(line_key(r)[1]))):

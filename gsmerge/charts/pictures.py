@@ -10,7 +10,7 @@ from gsmerge.charts.experiment import OURS
 from gsmerge.charts.markup import data_uri, text
 from gsmerge.charts.measure import WORST
 from gsmerge.charts.record import INPUT, RunRecord
-from gsmerge.charts.series import line_key, line_names, size_label, usual_size, usual_views
+from gsmerge.charts.series import line_key, line_names, stands_for_all, usual_size, usual_views
 from gsmerge.charts.store import picture_path
 
 MOST_SCENES = 6  # whose pictures are on the page
@@ -42,7 +42,7 @@ def find_shots(records: Sequence[RunRecord], folder: Path) -> list[Shot]:
     for scene in list(dict.fromkeys(record.scene for record in records))[:MOST_SCENES]:
         own = [r for r in records if r.scene == scene and r.views_asked == views and r.pictures]
         inputs = [r for r in own if r.method == INPUT][-1:]
-        results = [r for r in own if r.method != INPUT and size_label(r) == size]
+        results = [r for r in own if stands_for_all(r, size)]
         results.sort(key=lambda r: (r.method != OURS, len(line_key(r)[1])))
         chosen = [*inputs, *results[:MOST_RESULTS]]
         for i, view in enumerate(chosen[0].pictures if chosen else ()):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.charts.experiment import OURS, SIZES
+from gsmerge.charts.experiment import OURS, SIZES, WHOLE
 from gsmerge.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord
 from gsmerge.charts.statistics import Interval, paired_intervals
 
@@ -129,6 +129,11 @@ def usual_size(records: Sequence[RunRecord]) -> str:
     return min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
 
 
+def stands_for_all(record: RunRecord, size: str) -> bool:
+    """Whether a run has the size that stands for all, or a method that has one size alone."""
+    return record.method != INPUT and (size_label(record) == size or record.method in WHOLE)
+
+
 def by_size(records: Sequence[RunRecord], x: Value, y: Value) -> list[Line]:
     """Lines from size to size, at the usual number of views."""
     views = usual_views(records)
@@ -139,7 +144,7 @@ def by_size(records: Sequence[RunRecord], x: Value, y: Value) -> list[Line]:
 def by_views(records: Sequence[RunRecord], y: Value, *, with_input: bool = False) -> list[Line]:
     """Lines from number of views to number of views, at the usual size; empty where there is one number alone."""
     size = usual_size(records)
-    chosen = [r for r in records if (r.method == INPUT and with_input) or (r.method != INPUT and size_label(r) == size)]
+    chosen = [r for r in records if (r.method == INPUT and with_input) or stands_for_all(r, size)]
     lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, least=1.0)
     return [line for line in lines if len(line.points) > 1]
 

@@ -13,7 +13,8 @@ from gsmerge.charts.record import INPUT
 
 INK, MUTED, GRID = "#222222", "#6b6b6b", "#e6e6e6"
 OURS = ("#0072B2", "#56B4E9", "#003F66", "#7FA8C9", "#2E5C8A", "#9FC5E8")
-RIVALS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00", "#8C6D31", "#7B4173")
+RIVALS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00", "#7B4173", "#8C6D31")
+RIVAL_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # another for every round through the colours
 INPUT_COLOR = "#555555"
 OUR_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), "-", (0, (4, 1.5)))
 OUR_MARKERS, RIVAL_MARKERS = "oosDvP", "^vD<>XP"
@@ -71,7 +72,8 @@ def looks(names: Sequence[tuple[str, bool]]) -> dict[str, Look]:
             ours += 1
         else:
             i = rivals % len(RIVALS)
-            found[name] = Look(RIVALS[i], "-", RIVAL_MARKERS[i], 1.1, 3)
+            dash = RIVAL_DASHES[rivals // len(RIVALS) % len(RIVAL_DASHES)]
+            found[name] = Look(RIVALS[i], dash, RIVAL_MARKERS[rivals % len(RIVAL_MARKERS)], 1.1, 3)
             rivals += 1
     return found
 

@@ -26,15 +26,28 @@ def test_the_product() -> None:
     assert Experiment(Path("b"), "gsmerge", {"budget": 4000, "k": 2, "fit": "none"}, None) in made
 
 
-def test_rivals_run_once_per_budget() -> None:
+def test_rivals_run_once_per_size() -> None:
     combinations, notes = grid_settings(
         Grid(methods=("gsmerge", "voxel"), k=(1, 2), budgets=("1%",), densities=(0.1,), fit=("full", "none"))
     )
-    assert [settings for method, settings in combinations if method == "voxel"] == [{"budget": "1%"}]
-    assert len(combinations) == 1 + 2 * 2 * 2 + 1
+    assert [settings for method, settings in combinations if method == "voxel"] == [{"budget": "1%"}, {"density": 0.1}]
+    assert len(combinations) == 1 + 2 * 2 * 2 + 2
+    assert notes == ["voxel knows sizes alone: 6 combination(s) left out"]
+
+
+def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
+    grid = Grid(methods=("unmerged", "unmerged-fit"), budgets=("1%", "2%"), efforts=("fast", "default"), fit=("none",))
+    combinations, notes = grid_settings(grid)
+    assert combinations == [
+        ("input", {}),
+        ("unmerged", {}),
+        ("unmerged-fit", {"effort": "fast"}),
+        ("unmerged-fit", {}),
+    ]
     assert notes == [
-        "voxel has no superpixels, so no density: 4 combination(s) left out",
-        "voxel takes a budget alone: 3 combination(s) left out",
+        "unmerged knows sizes alone: 2 combination(s) left out",
+        "unmerged keeps all Gaussians: 1 combination(s) left out",
+        "unmerged-fit keeps all Gaussians: 2 combination(s) left out",
     ]
 
 
