@@ -173,7 +173,7 @@ def _senseless(
         first = {"k": grid.k[0], "segmentation": grid.segmentations[0], "fit": grid.fit[0], "effort": grid.efforts[0]}
         own = {"effort"} if method in FITTED else set()
         if any(chosen[name] != value for name, value in first.items() if name not in own):
-            return f"{method} knows sizes" + (" and effort alone" if own else " alone")
+            return f"{method} takes " + ("effort alone" if own else "a size alone")
         return f"{method} keeps all Gaussians" if method in WHOLE and sizes and size != sizes[0] else None
     if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and chosen["effort"] != grid.efforts[0]:
         return "effort changes nothing for other superpixels than rdseg without a full fit"

@@ -32,7 +32,7 @@ def test_rivals_run_once_per_size() -> None:
     )
     assert [settings for method, settings in combinations if method == "voxel"] == [{"budget": "1%"}, {"density": 0.1}]
     assert len(combinations) == 1 + 2 * 2 * 2 + 2
-    assert notes == ["voxel knows sizes alone: 6 combination(s) left out"]
+    assert notes == ["voxel takes a size alone: 6 combination(s) left out"]
 
 
 def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
@@ -45,8 +45,8 @@ def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
         ("unmerged-fit", {}),
     ]
     assert notes == [
-        "unmerged knows sizes alone: 2 combination(s) left out",
         "unmerged keeps all Gaussians: 1 combination(s) left out",
+        "unmerged takes a size alone: 2 combination(s) left out",
         "unmerged-fit keeps all Gaussians: 2 combination(s) left out",
     ]
 
