@@ -36,6 +36,7 @@ from gsmerge.journal import STAGES
 
 RATIOS = (0.0045, 0.22)  # of rivals' points that are judged: 0.5 % to 20 %, and what rounding does
 ALIKE = 0.01  # counts that differ by less than this share are drawn once
+NOISE = 0.05  # share of the render time that a gain must exceed to be one
 SMALL = 0.03  # share of the longest bar below which a stage is not told apart
 BAND_WORDS = (
     "Means over {scenes}; bands, from three scenes on: 95 % t intervals of what the settings differ by, the scenes' own"
@@ -289,7 +290,8 @@ def _payback(records: Sequence[RunRecord]) -> Payback | None:
     for name, group in rows.items():
         seconds = float(np.mean([r.seconds for r in group if r.seconds is not None]))
         after = float(np.mean([r.render_ms for r in group if r.render_ms is not None]))
-        found.append((name, seconds, after, break_even(seconds, before, after)))
+        even = break_even(seconds, before, after) if after < (1 - NOISE) * before else None
+        found.append((name, seconds, after, even))
     caption = (
         "Time to render so many frames, the merge included, on the processor that ran the grid. Dots: frames after"
         f" which merging has paid for itself. {_size_words(records)} Means over {len(scenes)} scene(s)."
