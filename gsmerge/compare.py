@@ -111,7 +111,7 @@ def compare(
     sides = (own, 2 * own) if long_sides is None else long_sides
     if not sides or min(sides) < 1:
         raise ValueError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
-    every = {INPUT: scene.gaussians, **results}
+    every = {INPUT: scene.file_gaussians, **results}
     threads = None if options is None else options.threads
     speeds = measure_speeds(every, scene.cameras, sides, near, threads=threads)
     known = merge_seconds or {}

@@ -171,7 +171,7 @@ def evaluate(
         raise ValueError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise ValueError("expected a scene with views, got none")
-    own = scene.gaussians
+    own = scene.file_gaussians
     with use_threads(options.threads):
         near = NEAR * (find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)).unit
         points = context_points(scene, near)

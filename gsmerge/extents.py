@@ -81,11 +81,11 @@ def coverage(scene: PixelScene | LooseScene) -> tuple[Coverage, ...]:
         return ()
     rows = torch.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
     if isinstance(scene, PixelScene):
-        rows = rows[scene.valid.reshape(-1)[rows]]
+        rows = rows[scene.stored.reshape(-1)[rows]]
     shares = _shares_inside(scene.gaussians.means[rows].numpy().astype(np.float64), scene.cameras)
     pixels: list[float | None] = [None] * len(scene)
     if isinstance(scene, PixelScene):
-        visible = (scene.gaussians.opacities >= _VISIBLE).reshape(scene.valid.shape) & scene.valid
+        visible = (scene.gaussians.opacities >= _VISIBLE).reshape(scene.valid.shape) & scene.stored
         pixels = [float(view.double().mean()) for view in visible]
     return tuple(Coverage(*found) for found in zip(scene.names, pixels, shares, strict=True))
 

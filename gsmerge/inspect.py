@@ -26,9 +26,10 @@ from gsmerge.io import (
     read_cameras,
     read_told,
 )
-from gsmerge.io.dialects import dialect_words, recognise
+from gsmerge.io.dialects import dialect_words
 from gsmerge.io.loose import Sight, sight
 from gsmerge.io.ply import OpacityChoice
+from gsmerge.io.ply_layout import LOGIT_COMMENT
 from gsmerge.io.reading import make_reading
 from gsmerge.options import CompactOptions
 from gsmerge.report import plan_document
@@ -36,6 +37,7 @@ from gsmerge.threads import available_threads
 from gsmerge.types import LooseScene, PixelScene
 
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # below one step of an 8-bit image; where optical depth is capped
+_OWN = "gsmerge"
 _SATURATED = 1e-6  # no logit beyond it comes back from float32 as it was
 
 
@@ -63,7 +65,9 @@ class Inspection:
         num_opaque: Gaussians with an opacity of at least 0.995.
         num_transparent: Finite Gaussians with an opacity below 1/255.
         num_saturated: Finite Gaussians with an opacity of 0 or 1, but for 1e-6.
-        num_views: Cameras, 0 where none were found.
+        num_views: Cameras, 0 where none were found; where pixels were found, those that the file has.
+        per_pixel: Gaussians of each pixel; 0 while no pixels were found.
+        num_missing: Pixels of the views that the file has no Gaussian for.
         width: Of the Gaussian grid, pixels; 0 while it is not verified.
         height: The same.
         cameras: Where the cameras are, None where none were found.
@@ -103,6 +107,8 @@ class Inspection:
     num_transparent: int
     num_saturated: int
     num_views: int
+    per_pixel: int
+    num_missing: int
     width: int
     height: int
     cameras: str | None
@@ -142,7 +148,8 @@ def inspect(
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
-        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``.
+        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``,
+            ``max_side``.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist.
@@ -191,6 +198,8 @@ def _of_ply(ply: PlyScene) -> dict[str, Any]:
 def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, Any]:
     found: dict[str, Any] = {
         "num_views": 0,
+        "per_pixel": 0,
+        "num_missing": 0,
         "width": 0,
         "height": 0,
         "cameras": None if files.cameras is None else str(files.cameras),
@@ -198,7 +207,7 @@ def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, A
         "images": None if files.images is None else str(files.images),
         "alignment": None,
         "alignment_problem": None,
-        "dialect": dialect_words(recognise(ply.info, None, None, None)),
+        "dialect": _OWN if LOGIT_COMMENT in ply.info.comments else "not known before the cameras fit",
         "rows": None,
         "alignment_score": None,
         "alignment_margin": None,
@@ -210,18 +219,19 @@ def _of_views(ply: PlyScene, files: SceneFiles, reading: Reading) -> dict[str, A
     camera_file = None
     try:
         if files.cameras is not None:
-            camera_file = read_cameras(files.cameras)
+            camera_file = read_cameras(files.cameras, scene=files.ply.stem)
             found |= {"num_views": len(camera_file), "camera_format": camera_file.source}
         load = align_scene(ply, files, camera_file, reading=reading)
     except SceneError as error:
         return found | {"alignment_problem": str(error)}
-    found |= {"dialect": dialect_words(load.dialects), "notes": load.notes}
-    found |= {"num_views": len(load.scene.cameras), "camera_format": load.cameras and load.cameras.source}
+    found |= {"notes": load.notes} | ({} if found["dialect"] == _OWN else {"dialect": dialect_words(load.dialects)})
+    found |= {"num_views": len(load.views.used), "camera_format": load.cameras and load.cameras.source}
     found |= {"coverage": coverage(load.scene), "estimate": estimate(load.scene), "sight": _sight(load)}
     if load.recovery is None or load.alignment is None:
         return found | {"alignment_problem": load.problem}
     found |= {"alignment_score": load.alignment.share_within_1px, "alignment_margin": load.recovery.margin}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
+    size |= {"per_pixel": load.recovery.best.layout.per_pixel, "num_missing": load.pixel_scene().num_missing}
     return found | size | {"alignment": load.alignment, "rows": load.recovery.words}
 
 
@@ -230,7 +240,7 @@ def _sight(load: SceneLoad) -> Sight | None:
     if len(scene) == 0:
         return None
     everything = torch.ones(len(scene.gaussians), dtype=torch.bool)
-    valid = scene.valid.reshape(-1) if isinstance(scene, PixelScene) else everything
+    valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else everything
     return sight(scene.gaussians, valid, scene.cameras, scene.images)
 
 

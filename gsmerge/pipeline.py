@@ -131,7 +131,7 @@ def compact(
         if scene.images is not None:  # last, when the kernels are there and the rest is gone
             ending = Journal(progress)
             with ending.stage("input"):
-                before = input_psnr(scene.gaussians, scene_photos(scene), near)
+                before = input_psnr(scene.file_gaussians, scene_photos(scene), near)
             results = [_compared(one, before, ending.seconds if i == 0 else {}) for i, one in enumerate(results)]
     if progress:
         progress("done", len(STAGES), len(STAGES))

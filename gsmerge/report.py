@@ -278,34 +278,61 @@ def inspection_lines(found: Mapping[str, Any]) -> list[str]:
         found: ``Inspection.to_dict()``.
     """
     parts = ", ".join(f"{name} {human_bytes(size)}" for name, size in found["bytes_by_attribute"].items())
-    extras = [*found["extra_columns"], *(f"element {name}" for name in found["extra_elements"])]
+    ignored = _ignored(found)
     low, high = (" ".join(f"{value:.4g}" for value in found[key]) for key in ("box_low", "box_high"))
-    cameras = found["cameras"] and f"{found['cameras']}: {found['num_views']} ({found['camera_format']})"
-    alignment, size = found["alignment"], found["extents"]
+    size = found["extents"]
     lines = [
         f"file       {found['path']}: {human_bytes(found['bytes'])} ({parts})",
         f"layout     {found['layout']}, {found['format']}; opacity stored {_ENCODINGS[found['opacity_encoding']]}",
         f"dialect    {found['dialect']}",
-        f"ignored    {', '.join(extras)}" if extras else "",
+        f"ignored    {', '.join(ignored)}" if ignored else "",
         f"Gaussians  {found['count']:,}: {found['num_nonfinite']} not finite, {found['num_transparent']:,} transparent,"
         f" {found['num_opaque']:,} opaque, {found['num_saturated']:,} of opacity 0 or 1",
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.2g} % beyond ten times that box",
         f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"
         f" {size['diagonal']:.3g}; {100 * size['share_huge']:.2g} % above a tenth of it",
-        f"cameras    {cameras or 'none found'}",
+        f"cameras    {_cameras(found)}",
         f"images     {found['images'] or 'none found'}",
     ]
-    if found["alignment_problem"] is not None:
-        lines.append(f"alignment  not one Gaussian per pixel: {found['alignment_problem']}")
-    elif alignment is not None:
-        worst = max(m for m in alignment["median_px"] if m is not None)
-        lines.append(
-            f"alignment  one Gaussian per pixel, {found['num_views']} x {found['height']} x {found['width']}"
-            f" ({found['rows']}); median offset {worst:.2f} px in the worst view,"
-            f" {100 * found['alignment_score']:.1f} % within 1 px"
-        )
-    lines += _view_lines(found) + _estimate_lines(found)
-    return [line for line in lines if line] + [f"note       {note}" for note in found["notes"]]
+    lines += _alignment_lines(found) + _view_lines(found) + _estimate_lines(found)
+    said = () if found["alignment_problem"] is None and found["rows"] is None else _SAID_ABOVE
+    notes = [note for note in found["notes"] if not note.startswith(said)]
+    return [line for line in lines if line] + [f"note       {note}" for note in notes]
+
+
+def _ignored(found: Mapping[str, Any]) -> list[str]:
+    """Columns and elements that mean nothing here; those that hold the camera do."""
+    used = _CAMERA_ELEMENTS if found["cameras"] is None and found["camera_format"] else ()
+    elements = [name for name in found["extra_elements"] if name not in used]
+    return [*found["extra_columns"], *(f"element {name}" for name in elements)]
+
+
+def _cameras(found: Mapping[str, Any]) -> str:
+    if not found["num_views"]:
+        return found["cameras"] or "none found"
+    inside = set(_CAMERA_ELEMENTS) <= set(found["extra_elements"])
+    where = found["cameras"] or ("inside the .ply" if inside else "none found")
+    return f"{where}: {found['num_views']} ({found['camera_format']})"
+
+
+def _alignment_lines(found: Mapping[str, Any]) -> list[str]:
+    """Which row is which pixel, and how far from it; or why that is not known."""
+    alignment, problem = found["alignment"], found["alignment_problem"]
+    if problem is not None and found["estimate"] is None:
+        return [f"alignment  not measured: {problem}"]
+    if problem is not None:
+        return [f"alignment  not one Gaussian per pixel: {problem.removeprefix('expected one Gaussian per pixel, ')}"]
+    if alignment is None:
+        return []
+    worst = max(m for m in alignment["median_px"] if m is not None)
+    number = "one Gaussian" if found["per_pixel"] == 1 else f"{found['per_pixel']} Gaussians"
+    missing = f", none for {found['num_missing']:,} of them" if found["num_missing"] else ""
+    return [
+        f"rows       {found['rows']}",
+        f"alignment  {number} per pixel, {found['num_views']} x {found['height']} x {found['width']} (views x height x"
+        f" width){missing}; median offset {worst:.2f} px in the worst view, {100 * found['alignment_score']:.1f} %"
+        " within 1 px",
+    ]
 
 
 def _view_lines(found: Mapping[str, Any]) -> list[str]:
@@ -313,21 +340,23 @@ def _view_lines(found: Mapping[str, Any]) -> list[str]:
     views, seen = found["coverage"], found["sight"]
     if not views or seen is None:
         return []
-    colors = "" if seen["color_ratio"] is None else f"; colours {seen['color_ratio']:.2f} times as far as any others'"
+    colors = ""
+    if seen["color_ratio"] is not None:
+        colors = f"; colours {seen['color_ratio']:.2f} times as far from their own pixels as from any others"
     pixelwise = views[0]["share_of_pixels"] is not None
     key, what = ("share_of_pixels", "pixels") if pixelwise else ("share_of_gaussians", "Gaussians")
     shares = [view[key] for view in views]
-    least = views[shares.index(min(shares))]["name"]
-    return [
-        f"coverage   {100 * min(shares):.0f} to {100 * max(shares):.0f} % of the {what} per view, least in {least};"
-        f" {100 * seen['share_seen']:.0f} % of the Gaussians seen{colors}"
-    ]
+    least, most = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
+    each = f"{most} % of the {what} in every view"
+    if least != most:
+        each = f"{least} to {most} % of the {what} per view, least in {views[shares.index(min(shares))]['name']}"
+    return [f"coverage   {each}; {100 * seen['share_seen']:.0f} % of the Gaussians seen{colors}"]
 
 
 def _estimate_lines(found: Mapping[str, Any]) -> list[str]:
     guess = found["estimate"]
     if guess is None:
-        return []
+        return ["compact    would refuse the scene as it is"]
     return [
         f"compact    would give about {guess['num_gaussians']:,} Gaussians ({100 * guess['ratio']:.1f} %),"
         f" {human_bytes(guess['bytes'])}, in about {guess['seconds']:.0f} s with"
@@ -335,4 +364,6 @@ def _estimate_lines(found: Mapping[str, Any]) -> list[str]:
     ]
 
 
+_CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
+_SAID_ABOVE = ("read as: ", "the rows belong to no pixels")  # notes that repeat a line of their own
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}

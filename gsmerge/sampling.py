@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import torch
 
 from gsmerge.types import LooseScene, PixelScene
@@ -42,6 +43,28 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
     return chosen
 
 
+def distinct_views(scene: PixelScene | LooseScene) -> list[int]:
+    """The views without those that repeat an earlier one: the same camera, the same photo, the same Gaussians."""
+    cameras = torch.cat([scene.cameras.viewmats.flatten(1), scene.cameras.Ks.flatten(1)], 1).numpy()
+    _, firsts = np.unique(cameras, axis=0, return_inverse=True)
+    kept: list[int] = []
+    for view, kind in enumerate(firsts.reshape(-1)):
+        if not any(firsts.reshape(-1)[one] == kind and _equal_views(scene, one, view) for one in kept):
+            kept.append(view)
+    return kept
+
+
+def _equal_views(scene: PixelScene | LooseScene, one: int, other: int) -> bool:
+    """Whether two views of one camera have the same photo and the same Gaussians."""
+    if scene.images is not None and not torch.equal(scene.images[one], scene.images[other]):
+        return False
+    if isinstance(scene, LooseScene):
+        return True
+    size = scene.pixels_per_view
+    a, b = (vars(scene.gaussians[view * size : (view + 1) * size]) for view in (one, other))
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
 def subset(scene: PixelScene | LooseScene, view_ids: Sequence[int]) -> PixelScene | LooseScene:
     """The scene as if only some of its views had been given: their Gaussians, cameras and photos.
 
@@ -61,4 +84,5 @@ def subset(scene: PixelScene | LooseScene, view_ids: Sequence[int]) -> PixelScen
         images=images,
         valid=scene.valid[ids],
         names=names,
+        missing=None if scene.missing is None else scene.missing[ids],
     )

@@ -138,12 +138,12 @@ class PixelScene:
     Args:
         gaussians: V·H·W rows; row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v. Rows that were not
             finite in the file are kept, as fully transparent ones, so that the order survives; pixels that the
-            file has no row for are filled up with such ones.
+            file has no row for are filled up with such ones, or with what a depth map says.
         cameras: The V views; width and height are the grid's.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
-        valid: ``[v,h,w]`` bool, False where the file's row was not finite, or there is none.
+        valid: ``[v,h,w]`` bool, False where there is no finite Gaussian.
         names: The views' names (image file names where known).
-        num_missing: Pixels that the file has no row for.
+        missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -154,22 +154,39 @@ class PixelScene:
     images: Tensor | None
     valid: Tensor
     names: tuple[str, ...]
-    num_missing: int = 0
+    missing: Tensor | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
         if len(self.gaussians) != v * h * w:
             raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
         _expect("valid", self.valid, (v, h, w))
+        if self.missing is not None:
+            _expect("missing", self.missing, (v, h, w))
         _expect_views(self.cameras, self.images, self.names)
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     @property
+    def num_missing(self) -> int:
+        """Pixels that the file has no row for."""
+        return 0 if self.missing is None else int(self.missing.sum())
+
+    @property
     def num_gaussians(self) -> int:
         """Gaussians of the file: what budgets and ratios count."""
         return len(self.gaussians) - self.num_missing
+
+    @property
+    def stored(self) -> Tensor:
+        """``[v,h,w]`` bool: pixels whose Gaussian is a finite one of the file."""
+        return self.valid if self.missing is None else self.valid & ~self.missing
+
+    @property
+    def file_gaussians(self) -> Gaussians:
+        """The Gaussians of the file, without those that fill it up."""
+        return self.gaussians if self.missing is None else self.gaussians[~self.missing.reshape(-1)]
 
     @property
     def pixels_per_view(self) -> int:
@@ -206,6 +223,11 @@ class LooseScene:
     def num_gaussians(self) -> int:
         """Gaussians of the file."""
         return len(self.gaussians)
+
+    @property
+    def file_gaussians(self) -> Gaussians:
+        """All of them."""
+        return self.gaussians
 
     @property
     def pixels_per_view(self) -> int:

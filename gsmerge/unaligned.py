@@ -20,6 +20,7 @@ from gsmerge.grouping import Grouping
 from gsmerge.moments import Members, loose_members, pool_members, scene_members
 from gsmerge.options import CompactOptions
 from gsmerge.render import render
+from gsmerge.sampling import distinct_views, subset
 from gsmerge.targets import exact_count
 from gsmerge.types import FeatureGaussians, Gaussians, Groups, LooseScene, PixelScene
 from gsmerge.viewpoints import place_cameras
@@ -52,10 +53,12 @@ def make_ready(scene: PixelScene | LooseScene, options: CompactOptions) -> Ready
     Raises:
         ValueError: If there is no finite Gaussian, or there are images without cameras.
     """
+    scene, options, repeats = without_repeats(scene, options)
     if isinstance(scene, PixelScene):
         canonical, frame = canonicalise(scene)
-        return ReadyScene(canonical, frame, options, None, ())
+        return ReadyScene(canonical, frame, options, None, tuple(repeats))
     whole, notes = with_cameras(scene)
+    notes = [*repeats, *notes]
     loose, frame = canonicalise(whole)
     kept = None
     if options.contribution.unseen == "keep":
@@ -65,6 +68,21 @@ def make_ready(scene: PixelScene | LooseScene, options: CompactOptions) -> Ready
         loose = replace(loose, images=render(loose.gaussians, loose.cameras).images.clamp(0, 1))
         notes.append("no photos: views rendered from the scene itself stand in for them")
     return ReadyScene(loose, frame, options, kept, tuple(notes))
+
+
+def without_repeats(
+    scene: PixelScene | LooseScene, options: CompactOptions
+) -> tuple[PixelScene | LooseScene, CompactOptions, list[str]]:
+    """The scene with every view once, the options with budgets that stay shares of the whole, and a note of it."""
+    views = distinct_views(scene)
+    if len(views) == len(scene):
+        return scene, options, []
+    few = subset(scene, views)
+    wanted = exact_count(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
+    if wanted is not None:
+        target = replace(options.target, budget=min(wanted, few.num_gaussians), max_bytes=None)
+        options = replace(options, target=target)
+    return few, options, [f"{len(scene) - len(views)} views repeat others in every pixel and count once"]
 
 
 def with_views(scene: PixelScene | LooseScene) -> tuple[PixelScene | LooseScene, list[str]]:

@@ -344,7 +344,7 @@ def assert_invariants(gaussians: Gaussians, scene: PixelScene) -> None:
 
 def assert_consistent(report: CompactReport, scene: PixelScene, gaussians: Gaussians) -> None:
     """The report tells what the run did."""
-    assert (report.num_input, report.num_output) == (len(scene.gaussians), len(gaussians))
+    assert (report.num_input, report.num_output) == (scene.num_gaussians, len(gaussians))
     assert (report.psnr_before is None) == (report.psnr_after is None) == (scene.images is None)
     assert all(seconds >= 0 for seconds in report.seconds.values())
     assert report.peak_memory_bytes > 0

@@ -20,6 +20,7 @@ from gsmerge.cli.preview import preview
 from gsmerge.cli.render import render
 from gsmerge.cli.report import report
 from gsmerge.cli.segment import segment
+from gsmerge.cli.stress import stress
 from gsmerge.errors import GsmergeError
 
 PROGRAM = "gsmerge"
@@ -28,7 +29,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview, report, chart):
+for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart):
     app.command()(command)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from enum import Enum
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, default_output, input_files, level_output
-from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
+from gsmerge.cli.settings import reading_of, settings_of, superpixels_per_view, told_as_usage
 from gsmerge.errors import SceneError, TargetError
 
 if TYPE_CHECKING:
@@ -30,6 +29,7 @@ def compact(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     superpixels: opt.SuperpixelsOption = None,
     density: opt.DensityOption = None,
     method: opt.MethodOption = None,
@@ -60,7 +60,7 @@ def compact(
 ) -> None:
     """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)
@@ -82,7 +82,7 @@ def compact(
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
     chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads, "unseen": unseen}
-    settings = _settings(chosen)
+    settings = settings_of(chosen)
     if dry_run:
         _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
@@ -93,15 +93,6 @@ def compact(
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
     if document["unmet"]:
         raise TargetError(document["unmet"])
-
-
-def _settings(chosen: Mapping[str, Any]) -> CompactOptions:
-    """The library's options with those that were given."""
-    from gsmerge.options import CompactOptions
-
-    given = {name: value.value if isinstance(value, Enum) else value for name, value in chosen.items()}
-    with told_as_usage():
-        return CompactOptions().with_settings({name: value for name, value in given.items() if value is not None})
 
 
 def _run(

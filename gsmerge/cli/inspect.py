@@ -18,12 +18,13 @@ def inspect(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     json: opt.JsonOption = False,
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
     """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.inspect import inspect as inspect_scene
     from gsmerge.report import document_head, inspection_lines, to_json
 

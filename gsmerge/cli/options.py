@@ -92,6 +92,7 @@ class Quats(str, Enum):
     auto = "auto"
     wxyz = "wxyz"
     xyzw = "xyzw"
+    xyzw_root = "xyzw-root"
     camera = "camera"
 
 
@@ -103,6 +104,7 @@ class Order(str, Enum):
     view_fastest = "view-fastest"
     layer_major = "layer-major"
     column_major = "column-major"
+    unordered = "unordered"
     none = "none"
 
 
@@ -191,6 +193,15 @@ LpipsOption = Annotated[
         help="Networks of the perceptual distance; none is much faster.",
         show_default="both, where installed",
         rich_help_panel=MEASURING,
+    ),
+]
+MaxSideOption = Annotated[
+    int | None,
+    typer.Option(
+        min=16,
+        help="Longest side of the views of Gaussians that belong to no pixels; larger photos are resized.",
+        show_default="1200",
+        rich_help_panel=INPUT,
     ),
 ]
 SuperpixelsOption = Annotated[

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import CameraFile, SceneFiles
+    from gsmerge.io import SceneFiles
 
 
 def default_output(ply: Path) -> Path:
@@ -87,14 +88,20 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")
 
 
-def cameras_of(files: SceneFiles) -> CameraFile:
-    """The cameras found with a scene.
+def source_of(ply: Path) -> Path | None:
+    """The scene that ``compact`` made a file of, if it is still beside it: ``scene.ply`` of ``scene.compact.ply``."""
+    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?\.ply", ply.name)
+    source = None if match is None else ply.with_name(f"{match[1]}.ply")
+    return source if source is not None and source.is_file() else None
+
+
+def check_cameras(files: SceneFiles) -> None:
+    """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for.
 
     Raises:
-        SceneError: If none were found, or they cannot be read.
+        SceneError: If there are none.
     """
-    from gsmerge.io import read_cameras
+    from gsmerge.io.cameras.sharp import read_sharp
 
-    if files.cameras is None:
+    if files.cameras is None and files.images is None and read_sharp(files.ply) is None:
         raise SceneError(files.ply, "no cameras found beside it", "name them with --cameras")
-    return read_cameras(files.cameras)

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import cameras_of, check_output, input_files
+from gsmerge.cli.paths import check_cameras, check_output, input_files
 from gsmerge.cli.pictures import tell_pictures, write_picture
 from gsmerge.cli.settings import reading_of
-from gsmerge.errors import SceneError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gsmerge.io import CameraFile, PlyScene, Reading, SceneFiles
-    from gsmerge.types import Cameras
 
 
 def preview(
@@ -32,6 +25,7 @@ def preview(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
     json: opt.JsonOption = False,
@@ -40,21 +34,26 @@ def preview(
     debug: opt.DebugOption = False,
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
-    from gsmerge.io import find_scene_files, ply_notes, read_ply, read_told
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    from gsmerge.io import find_scene_files, place_views, ply_notes, read_ply, read_told
     from gsmerge.preview import contact_sheet, pick_views
     from gsmerge.threads import use_threads
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     check_output(output, (*scenes, *input_files(files)), overwrite=overwrite)
-    camera_file = cameras_of(files)
+    check_cameras(files)
     plys = [read_told(files.ply, opacity=opacity.value, reading=reading)]
     plys += [read_ply(path, opacity=opacity.value) for path in scenes[1:]]
-    seen_from, photos = _views(plys[0], files, camera_file, reading)
-    notes = [f"{path}: {note}" for path, ply in zip(scenes, plys, strict=True) for note in ply_notes(ply.info)]
+    placed = place_views(plys[0], files, reading=reading)
+    used = list(placed.views.used)
+    seen_from, photos = placed.views.cameras[used], placed.views.images
+    photos = None if photos is None else photos[used]
+    said = [placed.notes, *(ply_notes(ply.info) for ply in plys[1:])]
+    notes = [f"{path}: {note}" for path, some in zip(scenes, said, strict=True) for note in some]
     say_notes(notes, quiet=quiet or json)
     if not dry_run:
-        parts = [(path.name, ply.gaussians) for path, ply in zip(scenes, plys, strict=True)]
+        shown = [placed.gaussians, *(ply.gaussians for ply in plys[1:])]
+        parts = [(path.name, gaussians) for path, gaussians in zip(scenes, shown, strict=True)]
         with use_threads(threads), announce_compilation(quiet=quiet or json):
             sheet = contact_sheet(parts, seen_from, photos, most_views=views)
         write_picture(output, sheet, overwrite=overwrite)
@@ -67,17 +66,3 @@ def preview(
     }
     line = f"{len(scenes)} scene(s) from {len(ids)} views"
     tell_pictures(output, [output], facts, line, dry_run=dry_run, as_json=json, quiet=quiet)
-
-
-def _views(
-    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, reading: Reading
-) -> tuple[Cameras, Tensor | None]:
-    """Cameras and photos: in the frame of the Gaussians where their pixels are found, otherwise as they stand."""
-    from gsmerge.io import align_scene, read_photos, to_cameras
-
-    try:
-        scene = align_scene(ply, files, camera_file, reading=reading).scene
-    except SceneError:
-        photos = read_photos(files, camera_file)
-        return to_cameras(camera_file, None if photos is None else (photos.shape[2], photos.shape[1])), photos
-    return scene.cameras, scene.images

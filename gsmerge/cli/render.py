@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,10 +11,13 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes, stage_progress
-from gsmerge.cli.paths import cameras_of, check_folder, input_files
+from gsmerge.cli.paths import check_cameras, check_folder, input_files, source_of
 from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 
+MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
+
 if TYPE_CHECKING:
+    from gsmerge.io import Placed, PlyScene, SceneFiles
     from gsmerge.types import Cameras, Gaussians
 
 
@@ -23,6 +27,14 @@ def render(
         Path, typer.Option("--output", "-o", help="Folder for the pictures.", rich_help_panel=opt.OUTPUT)
     ],
     cameras: opt.CamerasOption = None,
+    frame_of: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PLY",
+            help="The .ply whose frame the cameras are moved into; default: SCENE, or what it was compacted from.",
+            rich_help_panel=opt.INPUT,
+        ),
+    ] = None,
     background: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Grey level behind the scene.", rich_help_panel=opt.OUTPUT)
     ] = 0.0,
@@ -39,22 +51,36 @@ def render(
     debug: opt.DebugOption = False,
 ) -> None:
     """Render a scene from every camera, one PNG each."""
-    from gsmerge.io import find_scene_files, ply_notes, read_ply, to_cameras
+    from gsmerge.io import find_scene_files, read_ply
 
     files = find_scene_files(scene, cameras=cameras)
-    check_folder(output, input_files(files), overwrite=overwrite)
-    camera_file = cameras_of(files)
-    views = to_cameras(camera_file)
-    pictures = [output / f"{stem}.png" for stem in picture_stems(camera_file.names)]
+    source = frame_of or source_of(files.ply)
+    like = files if source is None else find_scene_files(source, cameras=cameras or files.cameras)
+    check_folder(output, (*input_files(files), *input_files(like)), overwrite=overwrite)
+    check_cameras(like)
     ply = read_ply(files.ply, opacity=opacity.value)
-    notes = ply_notes(ply.info)
+    placed = _placed(ply, like)
+    views, notes = placed.views.cameras, placed.notes
+    pictures = [output / f"{stem}.png" for stem in picture_stems(placed.views.names)]
     say_notes(notes, quiet=quiet or json)
     if not dry_run:
         look = {"background": background, "antialiased": antialiased}
-        _write_renders(ply.gaussians, views, pictures, look, threads=threads, overwrite=overwrite, quiet=quiet or json)
+        parts = placed.gaussians, views, pictures
+        _write_renders(*parts, look, threads=threads, overwrite=overwrite, quiet=quiet or json)
     facts = {"width": views.width, "height": views.height, "num_gaussians": ply.info.count, "notes": notes}
     line = f"{len(views)} pictures of {views.width} x {views.height}"
     tell_pictures(output, pictures, facts, line, dry_run=dry_run, as_json=json, quiet=quiet)
+
+
+def _placed(ply: PlyScene, like: SceneFiles) -> Placed:
+    """The Gaussians, and the cameras as they stand for the scene of ``like``."""
+    from gsmerge.io import Reading, place_views, ply_notes, read_ply
+
+    reading = Reading(max_side=MAX_SIDE)
+    if str(like.ply) == ply.info.path:
+        return place_views(ply, like, reading=reading, photos=False)
+    placed = place_views(read_ply(like.ply), like, reading=reading, photos=False)
+    return replace(placed, gaussians=ply.gaussians, notes=(*ply_notes(ply.info), *placed.notes))
 
 
 def _write_renders(

@@ -154,7 +154,7 @@ def _write(
     from gsmerge.report import to_json
 
     if path.suffix == ".html":
-        parts = [("before", scene.gaussians), *gaussians.items()]
+        parts = [("before", scene.file_gaussians), *gaussians.items()]
         text = comparison_html(document, png_bytes(contact_sheet(parts, scene.cameras, scene.images, most_views=2)))
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from enum import Enum
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import UsageError
 
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from gsmerge.io import Reading
     from gsmerge.io.layouts import Order
     from gsmerge.io.reading import QuatChoice
+    from gsmerge.options import CompactOptions
     from gsmerge.segment import SegmentOptions
 
 
@@ -31,7 +34,9 @@ def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> in
     return count
 
 
-def reading_of(dialect: str, quats: QuatChoice, order: Order, scene_scale: float | None) -> Reading:
+def reading_of(
+    dialect: str, quats: QuatChoice, order: Order, scene_scale: float | None, max_side: int | None = None
+) -> Reading:
     """What the command line tells about the file.
 
     Raises:
@@ -42,7 +47,8 @@ def reading_of(dialect: str, quats: QuatChoice, order: Order, scene_scale: float
 
     with told_as_usage():
         find_dialect(dialect)
-        return Reading(dialect=dialect, quats=quats, order=order, scene_scale=scene_scale)
+        found = Reading(dialect=dialect, quats=quats, order=order, scene_scale=scene_scale)
+        return found if max_side is None else replace(found, max_side=max_side)
 
 
 @contextmanager
@@ -52,3 +58,12 @@ def told_as_usage() -> Iterator[None]:
         yield
     except ValueError as error:
         raise UsageError(str(error)) from error
+
+
+def settings_of(chosen: Mapping[str, Any]) -> CompactOptions:
+    """The library's options with those that were given."""
+    from gsmerge.options import CompactOptions
+
+    given = {name: value.value if isinstance(value, Enum) else value for name, value in chosen.items()}
+    with told_as_usage():
+        return CompactOptions().with_settings({name: value for name, value in given.items() if value is not None})

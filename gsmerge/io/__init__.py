@@ -5,6 +5,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
 from gsmerge.io.images import read_images
+from gsmerge.io.placed import Placed, place_views
 from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.ply_writer import write_ply
 from gsmerge.io.reading import AUTO, Reading
@@ -18,6 +19,7 @@ __all__ = [
     "AUTO",
     "Alignment",
     "CameraFile",
+    "Placed",
     "PlyInfo",
     "PlyScene",
     "Reading",
@@ -31,6 +33,7 @@ __all__ = [
     "find_scene_files",
     "load_files",
     "load_scene",
+    "place_views",
     "ply_notes",
     "read_cameras",
     "read_images",

@@ -26,7 +26,7 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     Returns:
         The scene as it was if it has no photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
-    if scene.images is None or scene.num_missing == 0:
+    if scene.images is None or scene.missing is None:
         return scene
     V, Ks = scene.cameras.viewmats.double().numpy(), scene.cameras.Ks.double().numpy()
     views, height, width = scene.valid.shape

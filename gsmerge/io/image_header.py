@@ -26,14 +26,26 @@ def stored_size(path: Path) -> tuple[int, int]:
     file_size = check_file(path)
     try:
         with path.open("rb") as file:
-            width, height = _size(file)
+            width, height = told_size(path, file)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    if file_size > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
+        raise SceneError(path, f"expected an image of {width} x {height}, found {file_size >> 20} MiB for it")
+    return width, height
+
+
+def told_size(path: Path, file: BinaryIO) -> tuple[int, int]:
+    """:func:`stored_size` of an image that is open, or inside another file.
+
+    Args:
+        path: The file, for messages.
+        file: At the image's first byte.
+    """
+    try:
+        width, height = _size(file)
     except (struct.error, ValueError) as error:
         raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
     check_pixels(path, width, height)
-    if file_size > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
-        raise SceneError(path, f"expected an image of {width} x {height}, found {file_size >> 20} MiB for it")
     return width, height
 
 

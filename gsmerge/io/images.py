@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Sequence
@@ -13,7 +14,8 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io.image_header import stored_size
+from gsmerge.io.image_header import stored_size, told_size
+from gsmerge.io.png import SIGNATURE, checked_png
 from gsmerge.threads import parallel_map
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
@@ -136,16 +138,52 @@ def _lookup(root: Path, keys: dict[str, list[Path]], name: str) -> Path | None:
     return None
 
 
+def decode_photos(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
+    """Images that lie in another file.
+
+    Args:
+        path: That file, for messages.
+        names: What to call each image.
+        files: ``[b]`` uint8 each: the bytes of an image file.
+        limit: Bytes that they may have when decoded.
+
+    Returns:
+        ``[c,h,w,3]`` uint8 sRGB.
+
+    Raises:
+        SceneError: If one cannot be decoded, two differ in size, or they are too many.
+    """
+    sizes = [told_size(path, io.BytesIO(data.tobytes())) for data in files]
+    width, height = sizes[0]
+    odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
+    if odd is not None:
+        raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
+    if 3 * width * height * len(files) > limit:
+        raise SceneError(
+            path, f"expected images of at most {limit >> 20} MiB, found {len(files)} of {width} x {height}"
+        )
+    out = np.empty((len(files), height, width, 3), np.uint8)
+    parallel_map(lambda i: np.copyto(out[i], _decoded(path, files[i], sizes[i])), range(len(files)))
+    return out
+
+
 def _decode(path: Path) -> np.ndarray:
-    """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
-    width, height = stored_size(path)
+    """``[h,w,3]`` uint8 sRGB of an image file."""
+    size = stored_size(path)
     try:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    return _decoded(path, data, size)
+
+
+def _decoded(path: Path, data: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
+    width, height = size
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    sound = checked_png(data) if data[: len(SIGNATURE)].tobytes() == SIGNATURE else data
     try:
-        image = cv2.imdecode(data, flags) if len(data) else None
+        image = cv2.imdecode(sound, flags) if sound is not None and len(sound) else None
     except cv2.error:
         image = None
     if image is None:

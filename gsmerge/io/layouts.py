@@ -8,8 +8,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "none"]
+Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 ORDERS: tuple[str, ...] = get_args(Order)
+MAY_BE_LOOSE: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
 
 TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write

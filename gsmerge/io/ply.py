@@ -23,14 +23,17 @@ from gsmerge.io.ply_layout import (
     NORMALS,
     QUATS,
     REQUIRED,
+    RGB,
     SCALES,
     SH0,
     bytes_by_attribute,
+    color_columns,
     layout_name,
     sh_degree,
+    spread_low_degree,
 )
 from gsmerge.threads import parallel_map
-from gsmerge.types import Gaussians
+from gsmerge.types import SH_C0, Gaussians
 
 OpacityChoice = Literal["auto", "logit", "raw"]
 
@@ -115,6 +118,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
             as logits. Infinite logits are opacities of 0 and 1.
 
+    Colours may stand as red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+
     Raises:
         SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
         ValueError: If ``opacity`` is none of the three.
@@ -137,7 +142,10 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     encoding = named or _likely_encoding(done)
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _set_aside(path, out)
-    used = {*REQUIRED, *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
+    if byte_columns == NORMALS:
+        spread_low_degree(out["shN"])
+    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
     extra = tuple(name for name in names if name not in used)
     info = PlyInfo(
         path=str(path),
@@ -149,7 +157,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         columns=names,
         extra_columns=extra,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
-        byte_columns=tuple(name for name in names if rows.dtype[name].itemsize == 1),
+        byte_columns=byte_columns,
         comments=comments,
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
@@ -169,6 +177,8 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties}
     missing = [name for name in REQUIRED if name not in columns]
+    if columns.issuperset(RGB):
+        missing = [name for name in missing if name not in SH0]
     if missing:
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
@@ -235,8 +245,11 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
                 np.clip(column, -MAX_HARMONIC, MAX_HARMONIC, out=column)
             return column
 
-        for j, name in enumerate(SH0):
-            out["sh0"][:, 0, j] = take_harmonic(name)
+        for j, name in enumerate(color_columns(rows.dtype.names)):
+            column = take_harmonic(name)
+            if name in RGB:
+                column = (column / (255 if rows.dtype[name].kind == "u" else 1) - 0.5) / SH_C0
+            out["sh0"][:, 0, j] = column
         num_higher = out["shN"].shape[1]
         for channel in range(3):
             for j in range(num_higher):
@@ -265,7 +278,8 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
 def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
     """Whether rows are usable: all finite, but an infinite logit or a scale of exactly zero is a value."""
     valid = ~np.isnan(rows["opacity"].astype(np.float32))
-    for name in (*MEANS, *SH0, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
+    colors = color_columns(rows.dtype.names)
+    for name in (*MEANS, *colors, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
         valid &= np.isfinite(rows[name].astype(np.float32))
     for name in SCALES:
         column = rows[name].astype(np.float32)

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, Convention, from_viewmats, to_viewmats
+from gsmerge.io.evidence import Clues
 from gsmerge.io.loose import Sight, sight
-from gsmerge.io.recover import MARGIN, Clues, Recovery, recover
+from gsmerge.io.recover import MARGIN, Recovery, recover
 from gsmerge.types import Cameras, Gaussians
 
 _AS_GOOD = 0.98  # of a sight's score: no difference
@@ -80,15 +81,24 @@ def aligned_poses(clues: Clues, camera_file: CameraFile) -> tuple[Poses, Recover
         if sight(clues.gaussians, clues.valid, cameras, None).ok:
             recovery = recover(replace(clues, cameras=cameras))
             found += [] if recovery is None else [(poses, recovery)]
-    found.sort(key=lambda one: one[1].best.worst_px)
-    if len(found) > 1 and found[1][1].best.worst_px < MARGIN * max(found[0][1].best.worst_px, 1e-3):
+    check_one_fits(camera_file, found)
+    return min(found, key=lambda one: one[1].best.worst_px, default=None)
+
+
+def check_one_fits(camera_file: CameraFile, found: Sequence[tuple[Poses, Recovery]]) -> None:
+    """Refuse poses of which several readings fit, none of them twice as well as the next.
+
+    Raises:
+        SceneError: If that is so.
+    """
+    ranked = sorted(found, key=lambda one: one[1].best.worst_px)
+    if len(ranked) > 1 and ranked[1][1].best.worst_px < MARGIN * max(ranked[0][1].best.worst_px, 1e-3):
         raise SceneError(
             camera_file.path,
-            f"expected poses that fit in one reading, found that they fit as {found[0][0].words} and as"
-            f" {found[1][0].words}",
+            f"expected poses that fit in one reading, found that they fit as {ranked[0][0].words} and as"
+            f" {ranked[1][0].words}",
             "convert them to the format's own",
         )
-    return found[0] if found else None
 
 
 def seen_poses(

@@ -10,14 +10,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gsmerge.io.frame import SAME, Frame, Sightings, candidate_frames
+from gsmerge.io.frame import Frame
 from gsmerge.io.layouts import Layout
 
 WINDOW = 40  # rows averaged on either side of a restart
 RESTART = 0.25  # of the image's height: how far back a restart goes at least
 SHORT = 1500  # rows that tell which view a block is of
-MIN_BLOCK = 64  # rows; less of a view cannot be told from noise
+MIN_BLOCK = 500  # rows; less of a view cannot be told from noise
 SCALES = np.geomspace(1 / 30, 30, 69)  # of the cameras' positions, tried in turn
+SPAN = 1.25  # how far the first guess of the scale may be off
+MOST_SCALES = 400  # that are tried
+TRIED_BLOCKS, STRETCH = 4, 2000  # blocks, and rows of each in a row, that a scale is tried on
 _SMALL = 1e-6  # weight of a point that says nothing
 
 Project = Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]
@@ -52,16 +55,9 @@ def pruned_layout(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, widt
         A layout, right or wrong: its pixels have to be measured. None if the rows do not look like views at all.
     """
     project = projector(points, viewmats, Ks)
-    start, view, blocks = 0, -1, []
-    while start < len(points):
-        view = _next_view(project, start, len(points), view, len(viewmats))
-        if view < 0:
-            return None
-        end = _block_end(project, start, min(len(points), start + width * height), view, height)
-        if end - start < MIN_BLOCK:
-            return None
-        blocks.append((view, np.arange(start, end, dtype=np.int64)))
-        start = end
+    blocks = _blocks(project, len(points), len(viewmats), width * height, height)
+    if blocks is None:
+        return None
     pixels = [assign_pixels(*project(rows, view), width, height) for view, rows in blocks]
     missing = len(blocks) * width * height - len(points)
     return Layout(
@@ -76,11 +72,45 @@ def pruned_layout(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, widt
     )
 
 
-def _next_view(project: Project, start: int, count: int, after: int, views: int) -> int:
-    """The view, later than ``after``, in which the rows from ``start`` on step from pixel to pixel; -1 if none is."""
-    rows = np.arange(start, min(count, start + SHORT))
-    steps = [_unevenness(*project(rows, view)) for view in range(after + 1, views)]
-    return after + 1 + int(np.argmin(steps)) if steps and np.isfinite(steps).any() else -1
+def _blocks(project: Project, count: int, views: int, most: int, height: int) -> list[tuple[int, np.ndarray]] | None:
+    """(view, rows) of each block, views increasing; None if the rows do not look like that.
+
+    Where a block ends shows in any view that is nearly its own. Which views they are is decided for all together.
+    """
+    start, view = 0, -1
+    parts: list[np.ndarray] = []
+    costs: list[np.ndarray] = []
+    while start < count:
+        rows = np.arange(start, min(count, start + SHORT))
+        cost = np.array([_unevenness(*project(rows, view)) for view in range(views)])
+        if len(parts) == views or not np.isfinite(cost).any():
+            return None
+        later = cost[view + 1 :]
+        view = view + 1 + int(np.argmin(later)) if np.isfinite(later).any() else int(np.argmin(cost))
+        end = _block_end(project, start, min(count, start + most), view, height)
+        if end - start < MIN_BLOCK:
+            return None
+        parts.append(np.arange(start, end, dtype=np.int64))
+        costs.append(cost)
+        start = end
+    chosen = _increasing(np.array(costs))
+    return None if chosen is None else list(zip(chosen, parts, strict=True))
+
+
+def _increasing(costs: np.ndarray) -> list[int] | None:
+    """Increasing columns of ``[b,v]``, one for each row, with the smallest sum; None where every choice is infinite."""
+    total, came_from = costs[0], []
+    for cost in costs[1:]:
+        best = np.minimum.accumulate(total)
+        where = np.maximum.accumulate(np.where(total == best, np.arange(len(total)), 0))
+        came_from.append(np.concatenate([[0], where[:-1]]))
+        total = cost + np.concatenate([[np.inf], best[:-1]])
+    if not np.isfinite(total).any():
+        return None
+    chosen = [int(np.argmin(total))]
+    for where in reversed(came_from):
+        chosen.append(int(where[chosen[-1]]))
+    return chosen[::-1]
 
 
 def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
@@ -158,12 +188,8 @@ def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(isotonic_regression(values, weights=weights).x)
 
 
-def rough_frames(
-    points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int, scale: float | None
-) -> list[Frame]:
-    """Frames worth a try before any pixel is known: the same, and the scale under which rows step by single pixels."""
-    if scale is not None:
-        return [Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}, as told", "scaled")]
+def rough_scale(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> float:
+    """The scale of the cameras' positions under which rows step by single pixels, before any pixel is known."""
     views = len(viewmats)
     windows = [
         (view, np.arange(middle - SHORT // 4, middle + SHORT // 4).clip(0, len(points) - 1))
@@ -180,7 +206,59 @@ def rough_frames(
     for width_of_search in (1.08, 1.02, 1.005):
         near = best * np.geomspace(1 / width_of_search, width_of_search, 9)
         best = float(near[int(np.argmin([cost(size) for size in near]))])
-    return [SAME, Frame(np.eye(3), best, np.zeros(3), f"positions scaled by {best:.4g}", "scaled")]
+    return best
+
+
+def scaled(scale: float, words: str = "") -> Frame:
+    """The cameras' frame with other units."""
+    return Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}{words}", "scaled")
+
+
+def finer_scale(points: np.ndarray, layout: Layout, viewmats: np.ndarray, Ks: np.ndarray, rough: float) -> float:
+    """The scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
+
+    A scale that is wrong by little moves rows by parts of a pixel, which finding their pixels hides: so scales are
+    tried in steps that move most rows by a quarter of a pixel at most.
+
+    Args:
+        points: ``[n,3]`` float64.
+        layout: Its blocks are right, its pixels need not be.
+        viewmats: ``[c,4,4]`` in the cameras' own frame.
+        Ks: ``[c,3,3]``.
+        rough: Where to look.
+    """
+    chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
+    middles = [(len(layout.rows[b]) - STRETCH) // 2 for b in chosen]
+    parts = [
+        (layout.views[b], layout.rows[b][max(0, a) : max(0, a) + STRETCH]) for b, a in zip(chosen, middles, strict=True)
+    ]
+
+    def seen(scale: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        project = projector(points, scaled(scale).move_cameras(viewmats), Ks)
+        return [project(rows, view) for view, rows in parts]
+
+    def cost(scale: float) -> float:
+        return float(np.mean([_distance(u, v, layout.width, layout.height) for u, v in seen(scale)]))
+
+    here, there = seen(rough), seen(rough * 1.001)
+    moved = np.concatenate([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in zip(here, there, strict=True)]) / 0.001
+    speed = float(np.nanquantile(moved, 0.9)) if np.isfinite(moved).any() else 0.0
+    if speed <= 0:
+        return rough
+    step = max(0.25 / speed, 2 * np.log(SPAN) / MOST_SCALES)
+    best = rough
+    for reach in (max(step, np.log(SPAN)), step, step / 8):
+        near = best * np.exp(np.linspace(-reach, reach, 2 * max(1, int(np.ceil(reach / step))) + 1))
+        best = float(near[int(np.argmin([cost(scale) for scale in near]))])
+        step = min(step, reach) / 8
+    return best
+
+
+def _distance(u: np.ndarray, v: np.ndarray, width: int, height: int) -> float:
+    """Median distance of projected rows from the pixels that they come to."""
+    y, x = np.divmod(assign_pixels(u, v, width, height), width)
+    away = np.hypot(u - x - 0.5, v - y - 0.5)
+    return float(np.median(np.where(np.isfinite(away), away, width)))
 
 
 def _mean_unevenness(
@@ -188,9 +266,3 @@ def _mean_unevenness(
 ) -> float:
     project = projector(points, viewmats, Ks)
     return float(np.mean([min(_unevenness(*project(rows, view)), 10.0) for view, rows in windows]))
-
-
-def refined_scale(seen: Sightings, viewmats: np.ndarray, Ks: np.ndarray) -> Frame | None:
-    """The scale of a frame, solved from pixels that are roughly known."""
-    scaled = (frame for frame in candidate_frames(seen, viewmats, Ks) if frame.scale != 1)
-    return next(scaled, None)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 from gsmerge.io.layouts import ORDERS, Order
 
-QuatChoice = Literal["auto", "wxyz", "xyzw", "camera"]
-QUATS: tuple[str, ...] = ("auto", "wxyz", "xyzw", "camera")
+QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
+QUATS: tuple[str, ...] = get_args(QuatChoice)
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,13 @@ class Reading:
 
     Args:
         dialect: Which exporter wrote it, a name of :data:`gsmerge.io.dialects.DIALECTS`; "auto": found out.
-        quats: How rotations are stored: "wxyz", "xyzw", or "camera" (wxyz, relative to the own view's camera);
+        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are taken,
+            where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
             "auto": as the dialect says, and checked against the surface where the pixels are known.
-        order: Order of the rows; "none": they belong to no pixels.
+        order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
+            pixels.
         scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
+        max_side: Longest side, pixels, at which views are worked on whose Gaussians belong to no pixels.
 
     Raises:
         ValueError: If a value is none of the possible ones.
@@ -31,6 +34,7 @@ class Reading:
     quats: QuatChoice = "auto"
     order: Order = "auto"
     scene_scale: float | None = None
+    max_side: int = 1200
 
     def __post_init__(self) -> None:
         for name, known in (("quats", QUATS), ("order", ORDERS)):
@@ -38,6 +42,8 @@ class Reading:
                 raise ValueError(f"{name}: expected {_listed(known)}, got {getattr(self, name)!r}")
         if self.scene_scale is not None and not 0 < self.scene_scale < float("inf"):
             raise ValueError(f"scene_scale: expected a positive number, got {self.scene_scale}")
+        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or self.max_side < 16:
+            raise ValueError(f"max_side: expected a whole number of at least 16 pixels, got {self.max_side!r}")
 
 
 AUTO = Reading()

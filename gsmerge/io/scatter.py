@@ -34,20 +34,19 @@ def to_grid(
         return PixelScene(gaussians, cameras, images, valid.reshape(grid), names)
     source = _row_of_pixel(layout)
     missing = source < 0
-    num_missing = int(missing.sum())
-    if num_missing:
+    none = torch.from_numpy(missing) if missing.any() else None
+    if none is not None:
         there = np.where(missing, 0, np.arange(len(source)))
         there[: int(np.argmin(missing))] = int(np.argmin(missing))
         source = source[np.maximum.accumulate(there)]
     index = torch.from_numpy(source)
     out, kept = gaussians[index], valid[index]
-    if num_missing:
-        none = torch.from_numpy(missing)
+    if none is not None:
         kept[none] = False
         for values, value in ((out.opacities, 0.0), (out.sh0, 0.0), (out.shN, 0.0)):
             values[none] = value
         out.quats[none] = torch.tensor((1.0, 0, 0, 0))
-    return PixelScene(out, cameras, images, kept.reshape(grid), names, num_missing)
+    return PixelScene(out, cameras, images, kept.reshape(grid), names, None if none is None else none.reshape(grid))
 
 
 def _row_of_pixel(layout: Layout) -> np.ndarray:

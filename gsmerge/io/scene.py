@@ -18,17 +18,20 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
 from gsmerge.io.dialects import Dialect, find_dialect, recognise
 from gsmerge.io.dialects.voxels import is_padding
+from gsmerge.io.evidence import Clues
 from gsmerge.io.fill import fill_from_depths
 from gsmerge.io.fitting import fit_cameras
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes
+from gsmerge.io.large import lighter_photos, lighter_views
+from gsmerge.io.layouts import MAY_BE_LOOSE
 from gsmerge.io.loose import looks_like_a_grid
 from gsmerge.io.mismatch import count_problem, misaligned, other_grid
 from gsmerge.io.nerfstudio import seen_in_dataparser
 from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
 from gsmerge.io.reading import AUTO, Reading, make_reading
-from gsmerge.io.recover import Clues, Recovery, recover
+from gsmerge.io.recover import Recovery, recover
 from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
@@ -36,6 +39,23 @@ from gsmerge.io.views import cameras_of, stored_photos
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 _MIN_CORRELATION = 0.5
+
+
+@dataclass(frozen=True)
+class Views:
+    """All views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures.
+
+    Args:
+        cameras: The c cameras.
+        images: ``[c,h,w,3]`` photos, or None.
+        names: Names of the c views.
+        used: Which of them the scene has, each once, in its order.
+    """
+
+    cameras: Cameras
+    images: Tensor | None
+    names: tuple[str, ...]
+    used: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -52,6 +72,7 @@ class SceneLoad:
         problem: Why no pixels were found, in one sentence; None where they were.
         dialects: The exporters that may have written the file, or the one that was told.
         notes: What was adapted or looks odd, one sentence each, without a full stop.
+        views: All views that there are cameras of, also those that the scene does not have.
     """
 
     scene: PixelScene | LooseScene
@@ -63,6 +84,7 @@ class SceneLoad:
     problem: str | None
     dialects: tuple[Dialect, ...]
     notes: tuple[str, ...]
+    views: Views
 
     def pixel_scene(self) -> PixelScene:
         """The scene, for those who need one Gaussian per pixel.
@@ -92,7 +114,8 @@ def read_scene(
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
-        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``.
+        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``,
+            ``max_side``.
 
     Returns:
         One Gaussian per pixel; a :class:`gsmerge.types.LooseScene` where the rows belong to no pixels.
@@ -132,7 +155,12 @@ def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlySce
 
 
 def align_scene(
-    ply: PlyScene, files: SceneFiles, camera_file: CameraFile | None = None, *, reading: Reading = AUTO
+    ply: PlyScene,
+    files: SceneFiles,
+    camera_file: CameraFile | None = None,
+    *,
+    reading: Reading = AUTO,
+    photos: bool = True,
 ) -> SceneLoad:
     """Put Gaussians, cameras and images together and find out which row belongs to which pixel.
 
@@ -141,6 +169,7 @@ def align_scene(
         files: Where the cameras and images are.
         camera_file: The cameras, if they are read already.
         reading: What is told instead of found.
+        photos: Whether to look for photos.
 
     Raises:
         SceneError: As :func:`read_scene`.
@@ -151,8 +180,10 @@ def align_scene(
     told = find_dialect(reading.dialect)
     known = told.order if told is not None else read.order
     order = known if reading.order == "auto" else reading.order
-    read, photos, notes = as_pinholes(read, stored_photos(files, read))
-    fitted = fit_cameras(ply, read, photos, order=order, scale=reading.scene_scale)
+    read, pictures, notes = as_pinholes(read, stored_photos(files, read) if photos else None)
+    pictures, smaller = lighter_photos(pictures, len(ply.gaussians), reading.max_side, loose=order == "none")
+    notes += smaller
+    fitted = fit_cameras(ply, read, pictures, order=order, scale=reading.scene_scale)
     clues, recovery, read = fitted.clues, fitted.recovery, fitted.camera_file
     notes += fitted.notes
     if recovery is None:
@@ -164,13 +195,15 @@ def align_scene(
     scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, clues.images, read.names)
     scene, filled = _filled(scene, recovery, clues.depths)
     scene, turned = _with_rotations(scene, reading, dialects)
+    views = Views(in_frame, clues.images, read.names, tuple(dict.fromkeys(best.layout.views)))
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
     if read.source == ESTIMATED:
         notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
     notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
-    alignment = check_alignment(scene.gaussians, scene.cameras, scene.valid)
-    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, (*ply_notes(ply.info), *notes))
+    alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
+    said = (*ply_notes(ply.info), *notes)
+    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, said, views)
 
 
 def _filled(
@@ -222,7 +255,7 @@ def _loose(
     cameras, images = clues.cameras, clues.images
     views, width, height = len(cameras), cameras.width, cameras.height
     problem, remedy = count_problem(ply.info, views, width, height), other_grid(ply.info.count, views, width, height)
-    if clues.order != "none":
+    if clues.order not in MAY_BE_LOOSE:
         if len(ply.gaussians) == views * width * height:
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
@@ -239,9 +272,14 @@ def _loose(
     told = find_dialect(reading.dialect)
     dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
     gaussians, padding = _loose_rows(ply, reading)
+    cameras, images, smaller = lighter_views(cameras, images, reading.max_side)
+    notes += tuple(smaller)
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
-    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost))
+    all_views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
+    return SceneLoad(
+        scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost), all_views
+    )
 
 
 def _loose_rows(ply: PlyScene, reading: Reading) -> tuple[Gaussians, list[str]]:
@@ -288,7 +326,8 @@ def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> Scen
     gaussians, padding = _loose_rows(ply, reading)
     scene = LooseScene(gaussians, none, None, ())
     problem = "expected one Gaussian per pixel, found no cameras that have any"
-    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, (*ply_notes(ply.info), *padding))
+    said = (*ply_notes(ply.info), *padding)
+    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, said, Views(none, None, (), ()))
 
 
 def _lacks_cameras(clues: Clues) -> bool:
@@ -307,7 +346,7 @@ def _colour_notes(scene: PixelScene) -> list[str]:
     step = max(1, scene.pixels_per_view // 5000)
     colours = scene.gaussians.sh0.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
     photos = scene.images.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
-    valid = scene.valid.reshape(len(scene), -1)[:, ::step]
+    valid = scene.stored.reshape(len(scene), -1)[:, ::step]
     odd = [
         name
         for name, colour, photo, ok in zip(scene.names, colours, photos, valid, strict=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.da3 import holds_images
+from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.images import list_images
 
@@ -25,7 +26,7 @@ class SceneFiles:
     Args:
         ply: The Gaussians.
         cameras: Camera file or COLMAP folder; None if none was found.
-        images: Folder of images, or an ``.npz`` that holds them; None if none was found.
+        images: Folder of images, or the ``.npz`` or ``.torch`` that holds them; None if none was found.
     """
 
     ply: Path
@@ -43,8 +44,8 @@ def find_scene_files(
 
     Looked through are the given folder, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above
     it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and
-    ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` go before a folder, because they have the
-    Gaussians' size.
+    ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
+    are those that the model saw.
 
     Args:
         path: A ``.ply`` or a folder.
@@ -61,12 +62,16 @@ def find_scene_files(
     roots = list(dict.fromkeys(Path(os.path.realpath(root)) for root in (given, *_roots(ply))))
     camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
     image_path = _named(images)
-    if image_path is None and camera_path is not None and camera_path.suffix == ".npz" and holds_images(camera_path):
+    if image_path is None and camera_path is not None and _holds_images(camera_path):
         image_path = camera_path
     if image_path is None:
         folders = (root / place for root in roots for place in IMAGE_PLACES)
         image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
     return SceneFiles(ply, camera_path, image_path)
+
+
+def _holds_images(cameras: Path) -> bool:
+    return cameras.suffix == CHUNK or (cameras.suffix == ".npz" and holds_images(cameras))
 
 
 def _named(path: str | os.PathLike[str] | None) -> Path | None:

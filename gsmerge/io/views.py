@@ -9,8 +9,8 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.cameras.da3 import read_da3
 from gsmerge.io.cameras.estimate import estimate_cameras
+from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
 from gsmerge.io.cameras.sharp import SOURCE as SHARP
 from gsmerge.io.cameras.sharp import read_sharp
@@ -28,7 +28,7 @@ def cameras_of(ply: PlyScene, files: SceneFiles) -> CameraFile:
         SceneError: If there are none and they cannot be estimated.
     """
     if files.cameras is not None:
-        return read_cameras(files.cameras)
+        return read_cameras(files.cameras, scene=files.ply.stem)
     found = read_sharp(files.ply)
     if found is None and files.images is not None and files.images.is_dir():
         paths = list_images(files.images)
@@ -39,14 +39,14 @@ def cameras_of(ply: PlyScene, files: SceneFiles) -> CameraFile:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         raise SceneError(
             files.ply,
-            f"no cameras found beside it (looked for {places})",
+            f"no cameras found beside it (looked for {places}, one .torch chunk)",
             "name them with --cameras, or have views placed with --order none",
         )
     return found
 
 
 def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
-    """The images of the cameras: from the folder, an ``.npz``, or where the camera file itself says.
+    """The images of the cameras: from the folder, an ``.npz`` or ``.torch``, or where the camera file itself says.
 
     Args:
         files: Where the images are.
@@ -77,10 +77,12 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
         found = [find_image(folder, name) for name in camera_file.names]
         paths = [f for f in found if f is not None]
         return decode_images(paths, camera_file.names) if len(paths) == len(found) else None
-    if files.images.suffix != ".npz":
+    if files.images.suffix not in (".npz", CHUNK):
         return decode_images(files.images, camera_file.names)
     own = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
-    stored = camera_file.images if own else read_da3(files.images).images
+    stored = (camera_file if own else read_cameras(files.images, scene=files.ply.stem)).images
+    if own and stored is None and files.images.suffix == CHUNK:
+        return None
     if stored is None or len(stored) != len(camera_file):
         found_count = 0 if stored is None else len(stored)
         raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {found_count}")

@@ -13,6 +13,7 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
+from gsmerge.io import Reading
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -31,7 +32,17 @@ def readme_commands(root: Path) -> list[str]:
 
 
 def test_commands_are_the_documented_ones() -> None:
-    assert set(COMMANDS) == {"compact", "evaluate", "inspect", "segment", "render", "preview", "report", "chart"}
+    assert set(COMMANDS) == {
+        "compact",
+        "evaluate",
+        "inspect",
+        "segment",
+        "render",
+        "preview",
+        "report",
+        "stress",
+        "chart",
+    }
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
@@ -74,6 +85,7 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
             "output",
             "threads",
             "scene_scale",
+            "max_side",
         ):
             yield param.name, param.show_default
 
@@ -90,6 +102,12 @@ def test_told_defaults_are_the_library_s() -> None:
     assert told == real
 
 
+def test_told_sizes_are_the_readers_own(root: Path) -> None:
+    (param,) = (p for p in COMMANDS["compact"].params if p.name == "max_side")
+    assert param.show_default == str(Reading().max_side)
+    assert f"| `--max-side` | {Reading().max_side} |" in (root / "README.md").read_text()
+
+
 def test_readme_s_defaults_are_the_library_s(root: Path) -> None:
     rows = re.findall(r"^\| `--([a-z-]+)`[^|]*\| ([^|]*) \|", (root / "README.md").read_text(), re.MULTILINE)
     told = dict(rows)
@@ -101,7 +119,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
     """Merging and segmentation options carry the API's names."""
     fields = set(gsmerge.CompactOptions().to_dict())
     own = {"output", "overwrite", "report", "json", "quiet", "dry-run", "debug", "cameras", "images", "opacity"}
-    own |= {"dialect", "quats", "order", "scene-scale"}
+    own |= {"dialect", "quats", "order", "scene-scale", "max-side"}
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
     assert {name.replace("-", "_") for name in names} - fields == set()
 

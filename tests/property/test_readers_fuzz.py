@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import struct
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -276,6 +278,20 @@ def image_seed(suffix: str) -> bytes:
 
 
 IMAGE_SEEDS = [image_seed(suffix) for suffix in (".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm")]
+
+
+def chunk_seed() -> bytes:
+    rows = torch.cat([torch.tensor([[0.9, 0.9, 0.5, 0.5, 0, 0]]), torch.eye(4)[:3].reshape(1, 12)], 1)
+    stream = io.BytesIO()
+    picture = np.frombuffer(image_seed(".jpg"), np.uint8).copy()
+    torch.save([{"key": "a", "cameras": rows, "images": [torch.from_numpy(picture)]}], stream)
+    return stream.getvalue()
+
+
+@given(mutated(chunk_seed()))
+@fuzzed
+def test_mutated_chunks(data: bytes) -> None:
+    attempt("000000.torch", data, check_cameras)
 
 
 @given(st.sampled_from(IMAGE_SEEDS).flatmap(mutated))

@@ -30,6 +30,18 @@ def test_report(scene: PixelScene) -> None:
     assert report.options["density"] == 0.1
 
 
+def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
+    """What was put back from depth maps is merged, but is not the input's."""
+    missing = torch.zeros_like(scene.valid)
+    missing[:, 6:18, 8:24] = True
+    some = replace(scene, missing=missing)
+    before = scenes.compacted(some, fit="none").report
+    assert before.num_input == int((~missing).sum())
+    assert before.psnr_before == pytest.approx(scenes.psnr_of(some.file_gaussians, scene), abs=0.1)
+    assert before.psnr_before < scenes.psnr_of(scene.gaussians, scene) - 3
+    assert before.psnr_after > before.psnr_before
+
+
 def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     """Unless it is asked for."""
     full = scenes.compacted(scene).report

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsmerge.sampling import even_views, midpoint_views, subset
-from gsmerge.types import LooseScene
+from gsmerge.sampling import distinct_views, even_views, midpoint_views, subset
+from gsmerge.types import LooseScene, PixelScene
 from tests import scenes
 
 
@@ -65,3 +65,32 @@ def test_gaussians_in_no_order_all_stay() -> None:
     small = subset(loose, [2])
     assert len(small.gaussians) == len(scene.gaussians)
     assert np.array_equal(small.cameras.viewmats.numpy(), scene.cameras.viewmats[2:].numpy())
+
+
+def test_only_true_repeats_count_as_such() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
+    twice = subset(scene, [0, 1, 0, 2, 1])
+    assert distinct_views(scene) == [0, 1, 2]
+    assert distinct_views(twice) == [0, 1, 3]
+    assert isinstance(twice, PixelScene)
+    assert twice.images is not None
+    other_photo = twice.images.clone()
+    other_photo[2, 0, 0] = 0
+    assert distinct_views(replace(twice, images=other_photo)) == [0, 1, 2, 3]
+    other_depth = twice.gaussians.means.clone()
+    other_depth[-1] += 1
+    assert distinct_views(replace(twice, gaussians=replace(twice.gaussians, means=other_depth))) == [0, 1, 3, 4]
+    loose = LooseScene(scene.gaussians, twice.cameras, twice.images, twice.names)
+    assert distinct_views(loose) == [0, 1, 3]
+
+
+@pytest.mark.parametrize("settings", [{}, {"budget": "10%"}], ids=str)
+def test_repeats_change_nothing_but_the_share(settings: dict[str, str]) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(2))
+    one = scenes.compacted(scene, fit="none", **settings)
+    two = scenes.compacted(subset(scene, [0, 1, 1, 0]), fit="none", **settings)
+    if settings:  # a share of the file, which has twice as many Gaussians
+        assert len(two.gaussians) == pytest.approx(2 * len(one.gaussians), abs=1)
+    else:
+        assert scenes.identical(one.gaussians, two.gaussians)
+    assert any("count once" in note for note in two.report.notes)

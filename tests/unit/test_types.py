@@ -110,6 +110,16 @@ def test_scene() -> None:
     assert replace(scene(), images=None).images is None
 
 
+def test_what_the_file_has() -> None:
+    assert scene().num_missing == 0
+    assert len(scene().file_gaussians) == scene().num_gaussians == 24
+    missing = torch.zeros(2, 3, 4).bool()
+    missing[1, 2, 3] = missing[0, 0, 1] = True
+    some = replace(scene(), missing=missing)
+    assert (some.num_missing, some.num_gaussians, int(some.stored.sum())) == (2, 22, 22)
+    assert torch.equal(some.file_gaussians.means, torch.cat([gaussians(24).means[:1], gaussians(24).means[2:23]]))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -117,6 +127,7 @@ def test_scene() -> None:
         ({"valid": torch.ones(2, 4, 3).bool()}, "valid: expected shape"),
         ({"images": torch.zeros(2, 3, 4, 4)}, "images: expected shape"),
         ({"names": ("a",)}, "expected 2 view names, got 1"),
+        ({"missing": torch.ones(2, 4, 3).bool()}, "missing: expected shape"),
     ],
 )
 def test_wrong_scenes_are_refused(change: dict, message: str) -> None:

@@ -13,6 +13,8 @@ from gsmerge.io.cameras.da3 import read_da3
 from gsmerge.io.cameras.dump import is_dump, read_dump
 from gsmerge.io.cameras.inria import read_inria
 from gsmerge.io.cameras.long_lrm import read_long_lrm
+from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
+from gsmerge.io.cameras.re10k import read_re10k
 from gsmerge.io.cameras.trajectory import is_trajectory, read_trajectory
 from gsmerge.io.cameras.transforms import read_transforms
 from gsmerge.io.cameras.world_mirror import read_world_mirror
@@ -38,24 +40,26 @@ CAMERA_PLACES = (
 
 
 def find_cameras(folder: Path) -> Path | None:
-    """The first of the known camera files below a folder, None where there is none."""
+    """The first of the known camera files below a folder, or its only ``.torch`` chunk; None where there is none."""
     for place in CAMERA_PLACES:
         candidate = folder / place
         if candidate.is_file() or (candidate.is_dir() and is_colmap(candidate)):
             return candidate
-    return None
+    chunks = [chunk for chunk in folder.glob(f"*{CHUNK}") if chunk.is_file()]
+    return chunks[0] if len(chunks) == 1 else None
 
 
-def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
+def read_cameras(path: str | os.PathLike[str], *, scene: str | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
     ``transforms.json`` (nerfstudio, instant-ngp), COLMAP text and binary models, INRIA's ``cameras.json``,
     ``results.npz`` of Depth Anything 3, ``views.npz`` dumped from a running model, ``camera_params.json`` of
-    WorldMirror, the dataset file of Long-LRM, and text files with one pose per line. Poses become world-to-camera with
-    OpenCV axes.
+    WorldMirror, the dataset file of Long-LRM, ``.torch`` chunks of re10k, and text files with one pose per line. Poses
+    become world-to-camera with OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
+        scene: Which scene, where a file holds several (``.torch`` chunks); usually the name of the ``.ply``.
 
     Raises:
         SceneError: If there are no cameras, a file is damaged or incomplete, or a lens of an unknown kind.
@@ -79,9 +83,11 @@ def read_cameras(path: str | os.PathLike[str]) -> CameraFile:
         return read_colmap(path.parent)
     if path.suffix == ".npz":
         return read_dump(path) if is_dump(path) else read_da3(path)
+    if path.suffix == CHUNK:
+        return read_re10k(path, scene)
     if path.suffix == ".json":
         return _read_json(path)
-    raise SceneError(path, "expected cameras as .json, .npz or a COLMAP folder, found another kind of file")
+    raise SceneError(path, "expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file")
 
 
 def _read_json(path: Path) -> CameraFile:

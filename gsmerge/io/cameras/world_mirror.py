@@ -17,7 +17,7 @@ def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
 
     ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
     axes, intrinsics in pixels of the processed size, which the file does not tell: the images have it. ``camera_id``
-    is a number or the stem of the image's name.
+    is the stem of the image's name, or the image's number, by which the cameras are then sorted.
 
     Raises:
         SceneError: If the two lists do not name the same cameras, or a matrix is none.
@@ -26,7 +26,7 @@ def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     if poses.keys() != Ks.keys():
         odd = sorted(poses.keys() ^ Ks.keys())[0]
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
-    names = list(poses)
+    names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
     return make_camera_file(
         path, "camera_params.json", C2W_OPENCV, [poses[n] for n in names], [Ks[n] for n in names],
         [(0, 0)] * len(names), names,

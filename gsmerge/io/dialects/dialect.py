@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gsmerge.io.frame import Frame
-from gsmerge.io.layouts import Layout
+from gsmerge.io.layouts import MAY_BE_LOOSE, Layout
 from gsmerge.io.ply import PlyInfo
 from gsmerge.io.reading import QuatChoice
 
@@ -21,7 +21,7 @@ class Dialect:
         name: As on the command line.
         title: As people call it.
         opacity: How it stores opacities.
-        order: Order of its rows; "none": they belong to no pixels.
+        order: Order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels.
         kinds: Which pixels it keeps; see :class:`gsmerge.io.layouts.Layout`.
         frames: Where its Gaussians may lie, seen from the cameras.
         per_pixel: Gaussians per pixel.
@@ -70,7 +70,7 @@ class Dialect:
         if not header or info.opacity_encoding != self.opacity or (self.cameras and cameras not in self.cameras):
             return False
         if layout is None or frame is None:
-            return self.order == "none"
+            return self.order in MAY_BE_LOOSE
         order = self.order if len(layout.views) > 1 or self.order != "view-fastest" else "view-major"
         return (
             order == layout.order

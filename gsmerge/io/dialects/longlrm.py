@@ -9,5 +9,6 @@ LONGLRM = Dialect(
     degrees=(3,), byte_columns=("nx", "ny", "nz"),
 )  # fmt: skip
 LONGLRM_SORTED = Dialect(
-    "longlrm-sorted", "Long-LRM, sorted by opacity", "logit", "none", degrees=(3,), byte_columns=("nx", "ny", "nz")
-)
+    "longlrm-sorted", "Long-LRM, sorted by opacity", "logit", "unordered", ("pruned",), ("same", "scaled"),
+    degrees=(3,), byte_columns=("nx", "ny", "nz"),
+)  # fmt: skip

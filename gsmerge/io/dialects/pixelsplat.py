@@ -28,8 +28,8 @@ YONOSPLAT = Dialect(
     "yonosplat", "YoNoSplat", "raw", "view-fastest", ("trim", "pruned"), ("same", "scaled", "shifted", "other"),
     quats="camera",
 )  # fmt: skip
-VICASPLAT = Dialect("vicasplat", "VicaSplat", "logit", "none", degrees=(0, 4))
+VICASPLAT = Dialect("vicasplat", "VicaSplat", "logit", "unordered", ("pruned",), degrees=(0, 4))
 FLASH3D = Dialect("flash3d", "Flash3D", "raw", "layer-major", ("full",), _UPRIGHT, per_pixel=(2,))
 SPLATT3R = Dialect(
-    "splatt3r", "Splatt3R", "raw", "view-major", ("full",), ("same", "scaled", "shifted", "other"), quats="xyzw"
+    "splatt3r", "Splatt3R", "raw", "view-major", ("full",), ("same", "scaled", "shifted", "other"), quats="xyzw-root"
 )

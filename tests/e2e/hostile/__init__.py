@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import array_files, camera_files, camera_models, pictures, places, ply_files
+from . import array_files, camera_files, camera_models, chunks, pictures, places, ply_files
 from .array_files import MARKER
 from .case import Case
 
@@ -11,6 +11,7 @@ CASES: dict[str, Case] = {
     **camera_files.CASES,
     **camera_models.CASES,
     **array_files.CASES,
+    **chunks.CASES,
     **pictures.CASES,
     **places.CASES,
 }

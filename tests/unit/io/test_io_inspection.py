@@ -166,4 +166,6 @@ def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     assert "coverage" not in "\n".join(inspection_lines(alone.to_dict()))
     none = inspect(folder)
     assert none.estimate is None
-    assert "compact" not in "\n".join(inspection_lines(none.to_dict()))
+    lines = "\n".join(inspection_lines(none.to_dict()))
+    assert "alignment  not measured: " in lines
+    assert "compact    would refuse the scene as it is" in lines

@@ -14,7 +14,7 @@ from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats, make_camera_file
 from gsmerge.io.mapping import Mapping, counted, cover, patched, stretch
 from gsmerge.types import PixelScene
 
@@ -90,6 +90,32 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     assert np.allclose(loaded.pixel_scene().cameras.Ks, SMOOTH.K)
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
+
+
+@pytest.mark.parametrize("shape", ["larger", "cropped"])
+@pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+def test_photos_of_another_size_and_poses_read_in_another_way(
+    tmp_path: Path, true: tuple[str, str], shape: str
+) -> None:
+    """Larger photos with their cameras; cameras of the uncropped pictures."""
+    size, mapping = ((96, 72), stretch((96, 72), (48, 36))) if shape == "larger" else ((96, 54), None)
+    K, photos = original(SMOOTH, mapping or cover((96, 54), (48, 36)), size)
+    SMOOTH.save(tmp_path, images=mapping is None)
+    write_cameras(tmp_path, SMOOTH, K, size)
+    if mapping is not None:
+        write_photos(tmp_path, SMOOTH, photos)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    for frame, pose in zip(data["frames"], from_viewmats(SMOOTH.w2c, true), strict=True):
+        frame["transform_matrix"] = pose.tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    loaded = load_scene(tmp_path)
+    scene = loaded.pixel_scene()
+    assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c)
+    assert np.allclose(scene.cameras.Ks, SMOOTH.K)
+    assert loaded.cameras.convention == true
+    assert len(loaded.notes) == 2
+    assert "48 x 36" in loaded.notes[0]
+    assert f"the poses fit when read as {true[0]} matrices with {true[1]} axes" in loaded.notes[1]
 
 
 def test_cameras_larger_than_the_grid_and_no_photos(tmp_path: Path) -> None:

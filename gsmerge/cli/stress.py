@@ -1,0 +1,96 @@
+"""``gsmerge stress``: a user's own scene under bad conditions."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gsmerge.cli import options as opt
+from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
+from gsmerge.cli.held_out import held_out_views
+from gsmerge.cli.paths import check_output, input_files
+from gsmerge.cli.settings import reading_of, settings_of, told_as_usage
+
+if TYPE_CHECKING:
+    from gsmerge.stress import StressOutcome
+
+
+def stress(
+    scene: opt.SceneArgument,
+    cameras: opt.CamerasOption = None,
+    images: opt.ImagesOption = None,
+    opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
+    targets: opt.TargetsOption = None,
+    target_images: opt.TargetImagesOption = None,
+    cases: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="Only these cases.", show_default="all", rich_help_panel=opt.MEASURING),
+    ] = None,
+    effort: opt.EffortOption = None,
+    k: opt.KOption = None,
+    density: opt.DensityOption = None,
+    budget: opt.BudgetOption = None,
+    fit: opt.FitOption = None,
+    fit_steps: opt.FitStepsOption = None,
+    seed: opt.SeedOption = None,
+    threads: opt.ThreadsOption = None,
+    report: opt.ReportOption = None,
+    overwrite: opt.OverwriteOption = False,
+    json: opt.JsonOption = False,
+    quiet: opt.QuietOption = False,
+    debug: opt.DebugOption = False,
+) -> None:
+    """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
+    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    from gsmerge.io import atomic_output, find_scene_files, load_files
+    from gsmerge.report import document_head, to_json
+    from gsmerge.stress import stress as stress_scene
+
+    files = find_scene_files(scene, cameras=cameras, images=images)
+    if report is not None:
+        check_output(report, input_files(files), overwrite=overwrite)
+    chosen = {"effort": effort, "k": k, "density": density, "budget": budget, "fit": fit, "fit_steps": fit_steps}
+    settings = settings_of({**chosen, "seed": seed, "threads": threads})
+    load = load_files(files, opacity=opacity.value, reading=reading)
+    _, held_out = held_out_views(load, targets, target_images, None)
+    say_notes(load.notes, quiet=quiet or json)
+    names = None if cases is None else [name.strip() for name in cases.split(",")]
+    with (
+        announce_compilation(quiet=quiet or json),
+        stage_progress(quiet=quiet or json) as progress,
+        told_as_usage(),
+    ):
+        found = stress_scene(load, settings, targets=held_out, cases=names, reading=reading, progress=progress)
+    document = {
+        **document_head(),
+        "input": str(files.ply),
+        "options": settings.to_dict(),
+        "cases": [vars(outcome) for outcome in found],
+        "held": sum(outcome.held is True for outcome in found),
+        "failed": sum(outcome.held is False for outcome in found),
+        "notes": list(load.notes),
+    }
+    if report is not None:
+        with atomic_output(report, overwrite=overwrite) as temporary:
+            temporary.write_text(to_json(document))
+    if json:
+        sys.stdout.write(to_json(document))
+    elif not quiet:
+        print("\n".join(map(one_line, _lines(found))))
+
+
+def _lines(found: Sequence[StressOutcome]) -> list[str]:
+    """One line for each case, and how many held."""
+    marks = {True: "held", False: "FAILED", None: "-"}
+    width = max((len(outcome.words) for outcome in found), default=0)
+    lines = [f"{marks[o.held]:<7} {o.words:<{width}}  {o.found}" for o in found]
+    lines += [f"        wanted of '{o.words}': {o.wanted}" for o in found if o.held is False]
+    tried = [outcome for outcome in found if outcome.held is not None]
+    return [*lines, f"{sum(o.held is True for o in tried)} of {len(tried)} held"]

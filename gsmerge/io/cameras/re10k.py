@@ -1,0 +1,112 @@
+"""``.torch`` chunks of RealEstate10K as pixelSplat and its relatives read them: scenes with their photos."""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import MAX_VIEWS, check_file
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+from gsmerge.io.images import decode_photos
+
+SUFFIX = ".torch"
+_COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
+_MAX_PICKLE = 16 << 20  # bytes of a chunk's structure; its numbers lie elsewhere
+_MAX_PHOTOS = 1 << 30  # bytes of the decoded photos
+
+
+def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
+    """Cameras and photos of one scene of a chunk.
+
+    A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's size,
+    two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes. Nothing in it is
+    executed: only tensors and plain containers are read.
+
+    Args:
+        path: The chunk.
+        scene: Key of the scene; may be missing or another one where there is one scene only.
+
+    Raises:
+        SceneError: If it cannot be read, has no such scene, or an array has another shape than it should.
+    """
+    entry = _chosen(path, _load(path), scene)
+    rows = _rows(path, entry.get("cameras"))
+    Ks = np.tile(np.eye(3), (len(rows), 1, 1))
+    Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2] = rows[:, :4].T
+    names = [f"view {i}" for i in range(len(rows))]
+    photos = _photos(path, entry.get("images"), names)
+    size = (0, 0) if photos is None else (photos.shape[2], photos.shape[1])
+    poses = rows[:, 6:].reshape(-1, 3, 4)
+    return make_camera_file(path, "re10k chunk", W2C_OPENCV, poses, Ks, [size] * len(rows), names, photos)
+
+
+def _load(path: Path) -> list[Mapping[str, Any]]:
+    check_file(path)
+    problem = "expected a chunk written by torch.save, found"
+    if not zipfile.is_zipfile(path):
+        raise SceneError(path, f"{problem} something else")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise SceneError(path, f"{problem} packed members")
+        if max((m.file_size for m in members if m.filename.endswith(".pkl")), default=0) > _MAX_PICKLE:
+            raise SceneError(path, f"{problem} more than {_MAX_PICKLE >> 20} MiB of structure")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            data = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except SceneError:
+        raise
+    except Exception as error:  # whatever a damaged archive makes the libraries raise
+        raise SceneError(path, f"{problem} a damaged one, or objects, which are not read") from error
+    entries = data if isinstance(data, list) else [data]
+    if not entries or not all(isinstance(entry, Mapping) and "cameras" in entry for entry in entries):
+        raise SceneError(path, "expected a list of scenes with 'key', 'cameras' and 'images', found something else")
+    return entries
+
+
+def _chosen(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> Mapping[str, Any]:
+    if len(entries) == 1:
+        return entries[0]
+    found = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
+    if len(found) == 1:
+        return found[0]
+    keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
+    raise SceneError(
+        path,
+        f"expected one scene with the key {scene!r}, found {len(found)} among {len(entries)} ({keys}, ...)",
+        "name the .ply as its scene is named",
+    )
+
+
+def _rows(path: Path, cameras: Any) -> np.ndarray:
+    if not isinstance(cameras, torch.Tensor) or cameras.ndim != 2 or cameras.shape[1] != _COLUMNS:
+        shape = list(cameras.shape) if isinstance(cameras, torch.Tensor) else type(cameras).__name__
+        raise SceneError(path, f"expected cameras [v,{_COLUMNS}], found {shape}")
+    if not 0 < len(cameras) <= MAX_VIEWS:
+        raise SceneError(path, f"expected 1 to {MAX_VIEWS} cameras, found {len(cameras)}")
+    if not cameras.is_floating_point() or cameras.layout != torch.strided:
+        raise SceneError(path, f"expected cameras of numbers, found {cameras.dtype}")
+    return cameras.double().numpy()
+
+
+def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
+    """``[v,h,w,3]`` uint8; None where the chunk has none."""
+    if images is None or (isinstance(images, list | tuple) and not images):
+        return None
+    if not isinstance(images, list | tuple) or len(images) != len(names):
+        found = len(images) if isinstance(images, list | tuple) else type(images).__name__
+        raise SceneError(path, f"expected {len(names)} images, one per camera, found {found}")
+    limit = path.stat().st_size
+    for image in images:
+        plain = isinstance(image, torch.Tensor) and image.ndim == 1 and image.dtype == torch.uint8
+        if not plain or image.layout != torch.strided or image.numel() > limit or not image.is_contiguous():
+            raise SceneError(path, "expected images as tensors [bytes] of uint8, found others")
+    return decode_photos(path, names, [image.numpy() for image in images], _MAX_PHOTOS)

@@ -1,0 +1,83 @@
+"""`render` and `preview` look from where `compact` does: the cameras may be in another world than the Gaussians."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from .conftest import Run
+
+SCALE = 1.8
+
+
+@pytest.fixture
+def moved_scene(scene_copy: Path) -> Path:
+    """The made scene with the camera centres in larger units, and none of the targets."""
+    path = scene_copy / "transforms.json"
+    data = json.loads(path.read_text())
+    for frame in data["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= SCALE
+    path.write_text(json.dumps(data))
+    return scene_copy
+
+
+def psnr(folder: Path, photos: Path) -> float:
+    errors = []
+    for path in sorted(photos.iterdir()):
+        drawn = cv2.imread(str(folder / f"{path.stem}.png")).astype(float)
+        errors.append(((drawn - cv2.imread(str(path)).astype(float)) ** 2).mean())
+    return float(np.mean(10 * np.log10(255**2 / np.array(errors))))
+
+
+def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("compact", moved_scene, "--fit", "none", "--json")
+    assert outcome.code == 0, outcome.err
+    expected = json.loads(outcome.out)["psnr_input_views"]
+    photos = moved_scene / "images"
+    for name, key in (("scene.ply", "before"), ("scene.compact.ply", "after")):
+        outcome = run("render", moved_scene / name, "-o", tmp_path / name, "--json")
+        assert outcome.code == 0, outcome.err
+        assert any("read as: " in note for note in json.loads(outcome.out)["notes"])
+        assert psnr(tmp_path / name, photos) == pytest.approx(expected[key], abs=0.2)
+
+
+def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) -> None:
+    """A compact scene that went elsewhere tells no frame by itself."""
+    elsewhere = tmp_path / "small.ply"
+    assert run("compact", moved_scene, "--fit", "none", "-o", elsewhere, "--quiet").code == 0
+    found = {}
+    for name, more in (("own", ("--cameras", moved_scene / "transforms.json")), ("like", ("--frame-of", moved_scene))):
+        outcome = run("render", elsewhere, "-o", tmp_path / name, *more)
+        assert outcome.code == 0, outcome.err
+        found[name] = psnr(tmp_path / name, moved_scene / "images")
+    assert found["like"] > found["own"] + 3
+
+
+def test_preview_and_render_agree_with_photos_that_are_broken(moved_scene: Path, tmp_path: Path, run: Run) -> None:
+    photos = tmp_path / "photos"
+    (moved_scene / "images").rename(photos)
+    (moved_scene / "images").mkdir()
+    for path in photos.iterdir():
+        (moved_scene / "images" / path.name).write_bytes(path.read_bytes()[:100])
+    outcome = run("render", moved_scene, "-o", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert psnr(tmp_path / "out", photos) > 20
+    assert run("preview", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
+
+
+def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    path = scene_copy / "transforms.json"
+    data = json.loads(path.read_text())
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
+    path.write_text(json.dumps(data))
+    outcome = run("render", scene_copy, "-o", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert "the cameras do not fit the Gaussians and stand as their file has them" in outcome.err

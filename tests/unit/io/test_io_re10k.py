@@ -1,0 +1,192 @@
+"""``.torch`` chunks: cameras and photos of one scene among several."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from exports import export_rows, save_export, smooth_scene, turned
+from tiny_scene import Tiny
+
+from gsmerge.errors import SceneError
+from gsmerge.io import find_scene_files, load_scene, read_cameras
+from gsmerge.io.mapping import cover
+
+SMOOTH = smooth_scene(48, 36)
+
+
+def rows_of(tiny: Tiny) -> torch.Tensor:
+    """``[v,18]``: fx fy cx cy divided by the size, two zeros, world to camera."""
+    K = tiny.K / np.array([[tiny.width], [tiny.height], [1.0]])
+    head = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0], (len(tiny.names), 1))
+    return torch.from_numpy(np.concatenate([head, tiny.w2c[:, :3].reshape(-1, 12)], 1)).float()
+
+
+def jpeg(image: np.ndarray) -> torch.Tensor:
+    ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])
+    assert ok
+    return torch.from_numpy(data.reshape(-1).copy())
+
+
+def entry(tiny: Tiny, key: str) -> dict[str, Any]:
+    return {
+        "url": "", "timestamps": torch.arange(len(tiny.names)), "key": key, "cameras": rows_of(tiny),
+        "images": [jpeg(image) for image in tiny.images],
+    }  # fmt: skip
+
+
+def save(folder: Path, *entries: dict[str, Any]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.save(list(entries), folder / "000000.torch")
+    return folder / "000000.torch"
+
+
+def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
+    other = replace(SMOOTH, c2w=SMOOTH.c2w[::-1], images=SMOOTH.images[::-1])
+    save(tmp_path, entry(other, "b"), entry(SMOOTH, "a"))
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH), cameras=False, name="a.ply")
+    files = find_scene_files(tmp_path)
+    assert files.cameras == files.images == tmp_path / "000000.torch"
+    loaded = load_scene(tmp_path)
+    scene = loaded.pixel_scene()
+    assert scene.valid.all()
+    assert loaded.cameras is not None
+    assert loaded.cameras.source == "re10k chunk"
+    assert np.allclose(scene.cameras.Ks, SMOOTH.K, atol=1e-4)
+    assert np.allclose(scene.cameras.viewmats, SMOOTH.w2c, atol=1e-6)
+    assert np.abs(scene.images.numpy() * 255 - SMOOTH.images).mean() < 2
+    (tmp_path / "a.ply").rename(tmp_path / "c.ply")
+    with pytest.raises(SceneError, match=r"scene with the key 'c', found 0 among 2 \(b, a, \.\.\.\); name the \.ply"):
+        load_scene(tmp_path)
+
+
+def test_the_only_scene_needs_no_name(tmp_path: Path) -> None:
+    path = save(tmp_path, entry(SMOOTH, "a"))
+    assert len(read_cameras(path)) == len(read_cameras(path, scene="b")) == 3
+    torch.save(entry(SMOOTH, "a"), path)
+    assert len(read_cameras(path)) == 3
+
+
+def test_photos_that_were_cropped(tmp_path: Path) -> None:
+    """DepthSplat's file beside its dataset: resized, cropped and trimmed, turned into the first camera."""
+    tiny = smooth_scene(48, 48)
+    mapping = cover((96, 54), (48, 48))
+    matrix = np.array([[mapping.scale_x, 0, -mapping.left], [0, mapping.scale_y, -mapping.top], [0, 0, 1]])
+    photos = np.stack([
+        cv2.warpAffine(image, np.linalg.inv(matrix)[:2], (96, 54), borderMode=cv2.BORDER_REPLICATE)
+        for image in tiny.images
+    ])  # fmt: skip
+    whole = replace(tiny, K=np.linalg.inv(matrix) @ tiny.K, width=96, height=54, images=photos)
+    inner = np.arange(3 * 48 * 48).reshape(3, 48, 48)[:, 8:-8, 8:-8].reshape(3, -1)
+    rows = turned(export_rows(tiny, inner.T.reshape(-1)), tiny.w2c[0, :3, :3])
+    save(tmp_path, entry(whole, "scene"))
+    loaded = load_scene(save_export(tmp_path, tiny, rows, cameras=False))
+    assert loaded.alignment is not None
+    assert loaded.alignment.worst_px < 0.5
+    assert np.allclose(loaded.scene.cameras.Ks, tiny.K, atol=1e-3)
+    assert [d.name for d in loaded.dialects] == ["depthsplat"]
+
+
+def test_some_views_of_many(tmp_path: Path) -> None:
+    """A chunk holds the whole video; the file holds two of its views."""
+    poses = np.tile(SMOOTH.c2w[1], (8, 1, 1))
+    poses[:, 0, 3] += 3 + np.arange(8)
+    poses[2], poses[6] = SMOOTH.c2w[0], SMOOTH.c2w[2]
+    images = np.tile(SMOOTH.images[1], (8, 1, 1, 1))
+    images[2], images[6] = SMOOTH.images[0], SMOOTH.images[2]
+    save(tmp_path, entry(replace(SMOOTH, c2w=poses, images=images, names=("",) * 8), "scene"))
+    rows = export_rows(SMOOTH, np.arange(3 * 36 * 48).reshape(3, -1)[[0, 2]].reshape(-1))
+    loaded = load_scene(save_export(tmp_path, SMOOTH, rows, cameras=False))
+    assert loaded.scene.names == ("view 2", "view 6")
+    assert "2 of 8 views are in the file" in loaded.notes
+
+
+def test_without_photos(tmp_path: Path) -> None:
+    for images in ([], None):
+        save(tmp_path, entry(SMOOTH, "a") | {"images": images})
+        found = read_cameras(tmp_path / "000000.torch")
+        assert found.images is None
+        assert np.allclose(found.Ks[:, :2, :2].numpy(), (SMOOTH.K / np.array([[48], [36], [1.0]]))[:2, :2])
+    SMOOTH.save(tmp_path, cameras=False)
+    (tmp_path / "images").rename(tmp_path / "photos")
+    assert load_scene(tmp_path, images=tmp_path / "photos").pixel_scene().valid.all()
+
+
+class Payload:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (self.path,)
+
+
+def test_nothing_is_executed(tmp_path: Path) -> None:
+    for data in (Payload(tmp_path / "ran"), [{"key": "a", "cameras": Payload(tmp_path / "ran"), "images": []}]):
+        torch.save(data, tmp_path / "a.torch")
+        with pytest.raises(SceneError, match="a damaged one, or objects, which are not read"):
+            read_cameras(tmp_path / "a.torch")
+    torch.save([entry(SMOOTH, "a")], tmp_path / "a.torch", _use_new_zipfile_serialization=False)
+    with pytest.raises(SceneError, match="found something else"):
+        read_cameras(tmp_path / "a.torch")
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_truncated(tmp_path: Path, share: float) -> None:
+    path = save(tmp_path, entry(SMOOTH, "a"))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(SceneError, match="expected a chunk written by torch"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cameras": torch.zeros(3, 17)}, r"expected cameras \[v,18\], found \[3, 17\]"),
+        ({"cameras": torch.zeros(18)}, r"expected cameras \[v,18\], found \[18\]"),
+        ({"cameras": "many"}, r"expected cameras \[v,18\], found str"),
+        ({"cameras": torch.zeros(0, 18)}, "expected 1 to 10000 cameras, found 0"),
+        ({"cameras": torch.zeros(1, 18).expand(2**40, 18)}, "expected 1 to 10000 cameras"),
+        ({"cameras": torch.zeros(3, 18, dtype=torch.int32)}, "expected cameras of numbers"),
+        ({"cameras": torch.zeros(3, 18).to_sparse()}, "expected cameras of numbers"),
+        ({"cameras": torch.full((3, 18), torch.nan)}, "expected finite numbers"),
+        ({"cameras": torch.zeros(3, 18)}, "axes are not orthonormal"),
+        ({"images": [torch.zeros(4, dtype=torch.uint8)]}, "expected 3 images, one per camera, found 1"),
+        ({"images": "abc"}, "expected 3 images, one per camera, found str"),
+        ({"images": [torch.zeros(4)] * 3}, "expected images as tensors"),
+        ({"images": [torch.zeros(1, dtype=torch.uint8).expand(2**40)] * 3}, "expected images as tensors"),
+        ({"images": [torch.zeros(0, dtype=torch.uint8)] * 3}, "cannot be decoded"),
+        ({"images": [jpeg(SMOOTH.images[0])[:200]] * 3}, "cannot be decoded|as its header says"),
+        ({"images": [jpeg(SMOOTH.images[i][: 20 + i]) for i in range(3)]}, "view 1: expected images of one size"),
+    ],
+)
+def test_wrong_shapes(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = save(tmp_path, entry(SMOOTH, "a") | change)
+    with pytest.raises(SceneError, match=message):
+        read_cameras(path)
+
+
+def test_what_is_no_list_of_scenes(tmp_path: Path) -> None:
+    for data in ([], [1, 2], {"a": 1}, 5, torch.zeros(3), [entry(SMOOTH, "a"), {"key": "b"}]):
+        torch.save(data, tmp_path / "a.torch")
+        with pytest.raises(SceneError, match="expected a list of scenes"):
+            read_cameras(tmp_path / "a.torch")
+
+
+def test_packed_members_are_not_unpacked(tmp_path: Path) -> None:
+    path = save(tmp_path, entry(SMOOTH, "a"))
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(tmp_path / "b.torch", "w", zipfile.ZIP_DEFLATED) as target:
+        for member in source.infolist():
+            target.writestr(member.filename, source.read(member))
+    with pytest.raises(SceneError, match="found packed members"):
+        read_cameras(tmp_path / "b.torch")

@@ -1,0 +1,154 @@
+"""Files sorted by opacity: rows in no order, made on the rays of their pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from exports import export_rows, save_export, turned
+from tiny_scene import Tiny, make_tiny, rotation
+
+from gsmerge.io import load_scene
+from gsmerge.io.frame import SAME
+from gsmerge.types import SH_C0, LooseScene
+
+
+def scene_on_rays(views: int, jitter: float = 0.0, size: tuple[int, int] = (64, 48)) -> Tiny:
+    """Views of a waved surface from an arc, each Gaussian within ``jitter`` pixels of its pixel's centre."""
+    width, height = size
+    tiny, rng = make_tiny(width, height), np.random.default_rng(11)
+    y, x = np.mgrid[:height, :width] + 0.5
+    c2w, means, images = np.tile(np.eye(4), (views, 1, 1)), [], []
+    for i, turn in enumerate(np.linspace(-0.4, 0.4, views)):
+        c2w[i, :3, :3] = rotation(0.1 * turn + 0.03, -turn, 0.2 * turn)
+        c2w[i, :3, 3] = (2.5 * turn, 0.3 * turn**2, 0.4 * abs(turn))
+        depth = 3 + 0.4 * np.sin(x / 8 + i) * np.cos(y / 6)
+        pixels = np.stack([x, y, np.ones_like(x)], -1)
+        pixels[..., :2] += rng.uniform(-jitter, jitter, (height, width, 2))
+        world = (pixels @ np.linalg.inv(tiny.K).T * depth[..., None]).reshape(-1, 3) @ c2w[i, :3, :3].T + c2w[i, :3, 3]
+        color = 0.5 + 0.4 * np.sin(5 * world + np.array([0, 1, 2]))
+        means.append(world)
+        images.append((color * 255).round().astype(np.uint8).reshape(height, width, 3))
+    n = views * width * height
+    gaussians = replace(
+        tiny.gaussians[torch.arange(n) % len(tiny.gaussians)],
+        means=torch.from_numpy(np.concatenate(means)).float(),
+        opacities=torch.from_numpy(rng.permutation(np.linspace(0.02, 0.99, n))).float(),
+        sh0=(torch.from_numpy(np.stack(images).reshape(n, 1, 3) / 255.0).float() - 0.5) / SH_C0,
+    )
+    names = tuple(f"{i:02d}.png" for i in range(views))
+    return replace(tiny, c2w=c2w, images=np.stack(images), gaussians=gaussians, names=names)
+
+
+def by_opacity(tiny: Tiny, dropped: float) -> np.ndarray:
+    """Grid rows from the most opaque on, without the least opaque ones."""
+    opacities = tiny.gaussians.opacities.numpy()
+    return np.argsort(-opacities)[: round(len(opacities) * (1 - dropped))]
+
+
+def share_at_home(found: object, tiny: Tiny, kept: np.ndarray) -> float:
+    """Share of the file's rows that are at the pixel they were made for."""
+    at = np.full(len(kept), -1)
+    layout = found.recovery.best.layout  # type: ignore[attr-defined]
+    for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
+        at[rows] = view * tiny.width * tiny.height + pixels
+    return float((at == kept).mean())
+
+
+@pytest.mark.parametrize("photos", [True, False])
+@pytest.mark.parametrize("views", [3, 8])
+@pytest.mark.parametrize("dropped", [0.0, 0.3, 0.6])
+def test_rows_sorted_by_opacity_come_to_their_pixels(tmp_path: Path, views: int, dropped: float, photos: bool) -> None:
+    tiny = scene_on_rays(views)
+    kept = by_opacity(tiny, dropped)
+    folder = save_export(tmp_path, tiny, export_rows(tiny, kept))
+    if not photos:
+        for name in tiny.names:
+            (folder / "images" / name).unlink()
+        (folder / "images").rmdir()
+    loaded = load_scene(folder)
+    assert share_at_home(loaded, tiny, kept) >= 0.99
+    assert loaded.recovery is not None
+    assert loaded.recovery.best.layout.order == "unordered"
+    assert [d.name for d in loaded.dialects] == ["vicasplat"]
+    assert any("in no order" in note for note in loaded.notes)
+    scene = loaded.pixel_scene()
+    assert scene.num_gaussians == len(kept)
+
+
+def test_colours_decide_between_near_views() -> None:
+    """Two hundredths of a pixel off, eight views: some rows are nearer to a centre of another view."""
+    from functools import partial
+
+    from gsmerge.io.unordered import unordered_layout
+
+    tiny = scene_on_rays(8, 0.02)
+    tiny = replace(tiny, images=np.random.default_rng(0).integers(0, 256, tiny.images.shape, np.uint8))
+    kept = by_opacity(tiny, 0.2)
+    points, base = tiny.gaussians.means.double().numpy()[kept], tiny.images.reshape(-1, 3)[kept] / 255
+    photos = tiny.images.reshape(8, -1, 3) / 255
+    read = partial(unordered_layout, points, tiny.w2c, np.tile(tiny.K, (8, 1, 1)), tiny.width, tiny.height)
+    wrong = []
+    for color_of in (None, lambda rows, view, pixels: np.abs(base[rows] - photos[view, pixels]).mean(1)):
+        layout = read(color_of=color_of)
+        assert layout is not None
+        at = np.full(len(kept), -1)
+        for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
+            at[rows] = view * tiny.width * tiny.height + pixels
+        wrong.append(float((at != kept).mean()))
+    assert wrong[1] < 0.25 * wrong[0]
+    assert wrong[1] < 0.002
+
+
+def test_a_turned_world(tmp_path: Path) -> None:
+    """The first camera's axes: a frame that needs no pixels to be known."""
+    tiny = scene_on_rays(3)
+    kept = by_opacity(tiny, 0.3)
+    loaded = load_scene(save_export(tmp_path, tiny, turned(export_rows(tiny, kept), tiny.w2c[0, :3, :3])))
+    assert loaded.recovery is not None
+    assert loaded.recovery.best.frame.kind == "first"
+    assert share_at_home(loaded, tiny, kept) >= 0.99
+
+
+@pytest.mark.parametrize("views", [3, 8])
+@pytest.mark.parametrize("jitter", [0.25, 0.5])
+def test_rows_anywhere_in_their_pixels_stay_loose(tmp_path: Path, views: int, jitter: float) -> None:
+    tiny = scene_on_rays(views, jitter)
+    folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.3)))
+    for order in ("auto", "unordered"):
+        assert isinstance(load_scene(folder, order=order).scene, LooseScene)
+
+
+def test_many_views_make_chance(tmp_path: Path) -> None:
+    """Sixty views: most rows are within a twentieth of a pixel of some view's centre."""
+    tiny = scene_on_rays(60, 0.5, (32, 24))
+    folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.5)))
+    assert isinstance(load_scene(folder, dialect="vicasplat").scene, LooseScene)
+
+
+def test_the_told_order_and_dialect(tmp_path: Path) -> None:
+    tiny = scene_on_rays(3)
+    kept = by_opacity(tiny, 0.3)
+    rows = export_rows(tiny, kept, rest=45, normals="u1")
+    folder = save_export(tmp_path, tiny, rows)
+    for told in ({"order": "unordered"}, {"dialect": "longlrm-sorted"}, {"scene_scale": 1.0}):
+        loaded = load_scene(folder, **told)
+        assert share_at_home(loaded, tiny, kept) >= 0.99
+        assert [d.name for d in loaded.dialects] == ["longlrm-sorted"]
+    assert loaded.recovery is not None
+    assert loaded.recovery.best.frame.scale == SAME.scale
+    assert isinstance(load_scene(folder, order="view-major").scene, LooseScene)
+
+
+def test_rows_without_finite_positions(tmp_path: Path) -> None:
+    tiny = scene_on_rays(3)
+    kept = by_opacity(tiny, 0.3)
+    rows = export_rows(tiny, kept)
+    rows["x"][[0, 5, 700]] = np.nan
+    loaded = load_scene(save_export(tmp_path, tiny, rows))
+    finite = np.isfinite(rows["x"])
+    assert share_at_home(loaded, tiny, kept) >= 0.99 * finite.mean()
+    assert int(loaded.pixel_scene().valid.sum()) >= 0.99 * finite.sum()
