@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from gsmerge import __version__
+from gsmerge.cli.chart import chart
 from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
 from gsmerge.cli.evaluate import evaluate
@@ -28,7 +29,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview, report, stress):
+for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart):
     app.command()(command)
 
 

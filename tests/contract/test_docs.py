@@ -33,7 +33,17 @@ def readme_commands(root: Path) -> list[str]:
 
 
 def test_commands_are_the_documented_ones() -> None:
-    assert set(COMMANDS) == {"compact", "evaluate", "inspect", "segment", "render", "preview", "report", "stress"}
+    assert set(COMMANDS) == {
+        "compact",
+        "evaluate",
+        "inspect",
+        "segment",
+        "render",
+        "preview",
+        "report",
+        "stress",
+        "chart",
+    }
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage")
+HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage", "matplotlib")
 
 
 def run_python(code: str) -> str:
@@ -26,7 +26,7 @@ def loaded_after(code: str) -> set[str]:
         ["--help"],
         ["--version"],
         [],
-        *([name, "--help"] for name in ("compact", "inspect", "segment", "render", "preview")),
+        *([name, "--help"] for name in ("compact", "inspect", "segment", "render", "preview", "chart")),
     ],
     ids=" ".join,
 )

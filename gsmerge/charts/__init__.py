@@ -1,0 +1,1 @@
+"""Experiments over a grid of settings, what they measured, and charts and a page of it."""

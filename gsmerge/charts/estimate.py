@@ -1,0 +1,61 @@
+"""How long a grid will take, before it is run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import median
+
+from gsmerge.charts.experiment import Experiment
+from gsmerge.charts.places import Place
+from gsmerge.charts.record import INPUT, RunRecord
+from gsmerge.fit.options import STEPS
+from gsmerge.report import COST_COLOR_FIT, COST_FULL_FIT, COST_MERGE, COST_READ, COST_ROBUST, COST_SCORE, COST_SEGMENT
+
+BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
+COST_EVALUATE = 2.5  # scoring input and result: seconds per million pixels of all views
+COST_LPIPS = 12.0  # the same for each network
+
+
+def estimate_seconds(
+    runs: Sequence[tuple[str, Experiment, Place]],
+    stored: Mapping[str, RunRecord],
+    *,
+    threads: int,
+    lpips: Sequence[str] = (),
+) -> float:
+    """Wall time of runs, within a factor of about two; of merges that the folder has times of, those count.
+
+    Args:
+        runs: Key, experiment and scene of what is to be run.
+        stored: Finished runs by key, from which times are taken.
+        threads: Threads that would run.
+        lpips: Networks of the perceptual distance.
+    """
+    known: dict[tuple[str, str], list[float]] = {}
+    for record in stored.values():
+        if record.seconds is not None and record.error is None:
+            known.setdefault((record.scene, record.method), []).append(record.seconds)
+    total = 0.0
+    for _, experiment, place in runs:
+        pixels = place.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6
+        views = place.num_views or 1
+        share = min(1.0, (experiment.views or views) / views)
+        total += share * pixels * (COST_EVALUATE + COST_LPIPS * len(lpips)) / threads
+        times = known.get((place.name, experiment.method))
+        total += share * median(times) if times else _merge_seconds(experiment, share * pixels, views * share, threads)
+    places = {place.path: place for _, _, place in runs}
+    return total + sum(COST_READ * p.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6 for p in places.values())
+
+
+def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads: int) -> float:
+    """Of one merge; pixels in millions."""
+    if experiment.method == INPUT:
+        return 0.0
+    settings = experiment.settings
+    work = pixels * (COST_MERGE + COST_SCORE + COST_SEGMENT[settings.get("segmentation", "rdseg")])
+    fit = settings.get("fit", "full")
+    if fit == "full":
+        work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
+    else:
+        work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
+    return work / threads

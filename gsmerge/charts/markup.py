@@ -1,0 +1,94 @@
+"""HTML from plain values: everything that comes from files or names is escaped here."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+_TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
+PX_PER_PT = 1.75  # at most; drawings are not blown up beyond it
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table.
+
+    Args:
+        text: As it is; escaped later.
+        kind: Class of the cell.
+    """
+
+    text: str
+    kind: str = ""
+
+
+Row = Sequence[str | Cell]
+
+
+def text(value: object) -> str:
+    """Anything as text in HTML or in a quoted attribute."""
+    return escape(str(value), quote=True)
+
+
+def table(head: Sequence[str], rows: Sequence[Row], *, texts: Sequence[int] = (0,), ours: Sequence[int] = ()) -> str:
+    """A table.
+
+    Args:
+        head: Names of the columns.
+        rows: Cells of each row.
+        texts: Columns of words, set left; the rest are numbers.
+        ours: Rows that are ours.
+    """
+    words = set(texts)
+    top = "".join(
+        f'<th scope="col"{_class(["text"] if i in words else [])}>{text(name)}</th>' for i, name in enumerate(head)
+    )
+    body = []
+    for number, row in enumerate(rows):
+        cells = []
+        for i, cell in enumerate(row):
+            content, kind = (cell.text, cell.kind) if isinstance(cell, Cell) else (cell, "")
+            cells.append(f"<td{_class([*(['text'] if i in words else []), kind])}>{text(content)}</td>")
+        body.append(f"<tr{_class(['ours'] if number in ours else [])}>{''.join(cells)}</tr>")
+    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
+
+
+def _class(names: Sequence[str]) -> str:
+    told = " ".join(name for name in names if name)
+    return f' class="{text(told)}"' if told else ""
+
+
+def details(summary: str, content: str) -> str:
+    """Content that opens on request."""
+    return f"<details><summary>{text(summary)}</summary>{content}</details>"
+
+
+def data_uri(path: Path) -> str:
+    """A picture file as part of the page."""
+    return f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
+
+
+def inline_svg(svg: str, name: str, label: str) -> str:
+    """A drawing as part of the page: no prologue, no metadata, no addresses, names of its own, scaling.
+
+    Args:
+        svg: As matplotlib writes it.
+        name: Put before every id, because a page has several drawings.
+        label: What it shows, for those who cannot see it.
+    """
+    drawing = svg[svg.index("<svg") :]
+    drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)
+    drawing = re.sub(r"<!--.*?-->", "", drawing, flags=re.DOTALL)
+    drawing = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", drawing)
+    drawing = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", drawing)
+    opening, rest = drawing.split(">", 1)
+    box = re.search(r'viewBox="0 0 ([0-9.]+) [0-9.]+"', opening)
+    if box is None:
+        raise ValueError("expected a drawing with a viewBox from 0 0")
+    width = round(PX_PER_PT * float(box[1]))
+    style = f'style="max-width:{width}px" role="img" aria-label="{text(label)}"'
+    return f"<svg {box[0]} {style}>{rest.strip()}"

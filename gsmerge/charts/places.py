@@ -1,0 +1,100 @@
+"""The scenes of a grid as files: names, held-out views, and a hash of all that is read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmerge.charts.store import content_hash
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import SceneFiles, find_scene_files, read_cameras
+from gsmerge.io.scene_files import IMAGE_PLACES
+
+
+@dataclass(frozen=True)
+class Place:
+    """A scene before it is read.
+
+    Args:
+        path: As given.
+        name: For people; no two scenes of a grid have the same.
+        files: Gaussians, cameras, photos.
+        targets: Cameras of the held-out views; None without any.
+        target_images: Folder of their photos; None: found by their cameras.
+        num_views: Views of its camera file, an upper bound for those of the scene; None if unknown.
+        sha256: Of everything that is read.
+    """
+
+    path: Path
+    name: str
+    files: SceneFiles
+    targets: Path | None
+    target_images: Path | None
+    num_views: int | None
+    sha256: str
+
+
+def find_places(scenes: Sequence[Path], targets: str | None = None, target_images: str | None = None) -> list[Place]:
+    """Find the files of all scenes.
+
+    Args:
+        scenes: ``.ply`` files, or the folders that they are in.
+        targets: Cameras of the held-out views: one path for all scenes, or with ``{scene}`` (the scene as given),
+            ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it.
+        target_images: The same for the folder of their photos.
+
+    Raises:
+        SceneError: If a file is missing.
+        UsageError: If a scene is given twice or a template holds another name.
+    """
+    names = scene_names(scenes)
+    return [
+        _place(scene, name, _filled(targets, scene), _filled(target_images, scene))
+        for scene, name in zip(scenes, names, strict=True)
+    ]
+
+
+def scene_names(scenes: Sequence[Path]) -> list[str]:
+    """A short name for every scene: its own, or as many folders before it as tell them apart.
+
+    Raises:
+        UsageError: If a scene is given twice.
+    """
+    parts = [scene.absolute().with_suffix("").parts for scene in scenes]
+    for depth in range(1, max(map(len, parts), default=0) + 1):
+        names = ["/".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    if not scenes:
+        return []
+    raise UsageError("expected every scene once, got one twice")
+
+
+def _filled(template: str | None, scene: Path) -> Path | None:
+    if template is None:
+        return None
+    parent = scene if scene.is_dir() else scene.parent
+    try:
+        return Path(template.format(scene=scene, parent=parent, stem=scene.stem))
+    except (KeyError, IndexError, ValueError) as error:
+        raise UsageError(f"expected {{scene}}, {{parent}} or {{stem}} in braces, got {template}") from error
+
+
+def _place(scene: Path, name: str, targets: Path | None, target_images: Path | None) -> Place:
+    files = find_scene_files(scene)
+    if targets is not None and not targets.exists():
+        raise SceneError(targets, f"expected cameras of held-out views of {scene}, found nothing")
+    read = [files.ply, files.cameras, files.images, targets, target_images]
+    for path in (files.cameras, targets):
+        read += [] if path is None else _photos(path)
+    num_views = None if files.cameras is None else len(read_cameras(files.cameras))
+    once = dict.fromkeys(path for path in read if path is not None)
+    return Place(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
+
+
+def _photos(cameras: Path) -> list[Path]:
+    """Where the photos of a camera file may be found by its names or beside it."""
+    root = cameras if cameras.is_dir() else cameras.parent
+    named = [root / name for name in read_cameras(cameras).names if (root / name).is_file()]
+    return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]

@@ -1,0 +1,190 @@
+"""Means over scenes with their intervals, fronts, break-even, and who lies above whom at equal cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean and how far off it may be.
+
+    Args:
+        mean: Over the scenes.
+        low: Lower end of the interval; equal to the mean where one scene leaves nothing to estimate it from.
+        high: Upper end.
+        count: Scenes.
+    """
+
+    mean: float
+    low: float
+    high: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A rival's point against our curve at the same cost.
+
+    Args:
+        rival: Name of the rival's line.
+        cost: Mean cost of the point.
+        quality: Mean quality of the point, over the scenes where ours can be read at that cost.
+        ours: Ours at the same cost; None where no scene has so cheap a result of ours.
+        ahead: By how much ours is better, scene by scene: positive where ours is; None with ``ours``.
+        words: ``ours above``, ``rival above``, ``undecided`` or ``ours has none so cheap``.
+    """
+
+    rival: str
+    cost: float
+    quality: float
+    ours: float | None
+    ahead: Interval | None
+    words: str
+
+
+def t_factor(count: int, level: float = LEVEL) -> float:
+    """Half-width of a t interval in standard errors, for so many samples."""
+    return float(stdtrit(count - 1, 0.5 + level / 2))
+
+
+def mean_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
+    """The mean with its two-sided t interval (Student 1908), which few scenes make wide: 12.7 standard errors for two.
+
+    Raises:
+        ValueError: If there are no values.
+    """
+    if not len(values):
+        raise ValueError("expected at least one value, got none")
+    array = np.asarray(values, np.float64)
+    mean = float(array.mean())
+    if len(array) == 1:
+        return Interval(mean, mean, mean, 1)
+    half = t_factor(len(array), level) * float(array.std(ddof=1)) / math.sqrt(len(array))
+    return Interval(mean, mean - half, mean + half, len(array))
+
+
+def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float], level: float = LEVEL) -> Interval:
+    """Ours minus theirs over the scenes that both have: how hard a scene is cancels.
+
+    Raises:
+        ValueError: If no scene is in both.
+    """
+    return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs], level)
+
+
+def paired_intervals(values: NDArray[np.float64], level: float = LEVEL) -> list[Interval]:
+    """Intervals of conditions that were measured on the same scenes, without what the scenes differ by.
+
+    Scenes differ by several dB and conditions by tenths, so plain intervals would say nothing about conditions. Here
+    every scene's own mean is taken off first (Cousineau 2005), with the correction for it (Morey 2008).
+
+    Args:
+        values: ``[scenes, conditions]``.
+
+    Raises:
+        ValueError: If there are no scenes or no conditions.
+    """
+    num_scenes, num_conditions = values.shape
+    if num_conditions == 1 or num_scenes == 1:
+        return [mean_interval(column, level) for column in values.T.tolist()]
+    centred = values - values.mean(1, keepdims=True) + values.mean()
+    factor = math.sqrt(num_conditions / (num_conditions - 1))
+    plain = [mean_interval(column, level) for column in centred.T.tolist()]
+    return [Interval(i.mean, *_widened(i, factor), i.count) for i in plain]
+
+
+def _widened(interval: Interval, factor: float) -> tuple[float, float]:
+    half = factor * (interval.high - interval.mean)
+    return interval.mean - half, interval.mean + half
+
+
+def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+    """Points that no other beats: none is at most as dear and better, or cheaper and as good.
+
+    Args:
+        costs: Lower is better.
+        qualities: Higher is better.
+
+    Returns:
+        Indices by rising cost; of equal points the first.
+    """
+    best, front = -math.inf, []
+    for i in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i], i)):
+        if qualities[i] > best:
+            best = qualities[i]
+            front.append(i)
+    return front
+
+
+def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
+    """What a method reaches at a cost: its front, linear over the logarithm of the cost between two points.
+
+    Beyond the dearest point its quality stays, since paying more is not needed to have it.
+
+    Args:
+        costs: Positive.
+        qualities: Higher is better.
+        cost: Where to read it.
+
+    Returns:
+        None below the cheapest point.
+    """
+    front = pareto_front(costs, qualities)
+    if not front or cost < costs[front[0]]:
+        return None
+    at = np.log([costs[i] for i in front])
+    return float(np.interp(math.log(cost), at, [qualities[i] for i in front]))
+
+
+def judge(
+    rival: str,
+    points: Mapping[str, tuple[float, float]],
+    ours: Mapping[str, Sequence[tuple[float, float]]],
+    *,
+    higher: bool = True,
+) -> Verdict:
+    """Whether a rival's point lies above our curve at equal cost, scene by scene.
+
+    Args:
+        rival: Its name.
+        points: (cost, quality) of the point by scene.
+        ours: All (cost, quality) of ours by scene.
+        higher: Whether higher quality is better.
+
+    Returns:
+        A side is only named where zero lies outside the interval of the difference, or there is one scene alone.
+
+    Raises:
+        ValueError: If the rival has no point.
+    """
+    sign = 1.0 if higher else -1.0
+    read: dict[str, float] = {}
+    for scene, (cost, _) in points.items():
+        curve = ours.get(scene, ())
+        value = quality_at([c for c, _ in curve], [sign * q for _, q in curve], cost)
+        if value is not None:
+            read[scene] = value
+    mean_cost = float(np.exp(np.mean([math.log(cost) for cost, _ in points.values()])))
+    if not read:
+        quality = float(np.mean([q for _, q in points.values()]))
+        return Verdict(rival, mean_cost, quality, None, None, "ours has none so cheap")
+    theirs = {scene: sign * points[scene][1] for scene in read}
+    ahead = paired_difference(read, theirs)
+    words = "ours above" if ahead.low > 0 else "rival above" if ahead.high < 0 else "undecided"
+    mean_ours = sign * float(np.mean(list(read.values())))
+    return Verdict(rival, mean_cost, sign * float(np.mean(list(theirs.values()))), mean_ours, ahead, words)
+
+
+def break_even(seconds: float, ms_before: float, ms_after: float) -> float | None:
+    """Frames after which merging has paid for itself; None where the result renders no faster."""
+    saved = (ms_before - ms_after) / 1000
+    return seconds / saved if saved > 0 else None

@@ -1,0 +1,100 @@
+"""A headless Chromium driven over its debugging pipe: no port, no network, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update",
+    "--disable-background-networking", "--disable-sync", "--hide-scrollbars", "--remote-debugging-pipe",
+)  # fmt: skip
+PATIENCE = 60.0  # seconds
+
+
+class Browser:
+    """One page; ``call`` sends a command of the DevTools protocol, ``events`` are what came meanwhile."""
+
+    def __init__(self, write: int, read: int) -> None:
+        self.write, self.read, self.rest, self.number, self.session = write, read, b"", 0, ""
+        self.events: list[dict[str, Any]] = []
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        self.number += 1
+        message = {"id": self.number, "method": method, "params": params}
+        message |= {"sessionId": self.session} if self.session else {}
+        os.write(self.write, json.dumps(message).encode() + b"\0")
+        while (answer := self._message()).get("id") != self.number:
+            self.events.append(answer)
+        assert "error" not in answer, answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    def _message(self) -> dict[str, Any]:
+        while b"\0" not in self.rest:
+            part = os.read(self.read, 1 << 16)
+            assert part, "the browser went away"
+            self.rest += part
+        line, self.rest = self.rest.split(b"\0", 1)
+        message: dict[str, Any] = json.loads(line)
+        return message
+
+    def open(self, page: Path) -> None:
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        self.call("Page.navigate", url=page.as_uri())
+        end = time.monotonic() + PATIENCE
+        while self.run("document.readyState") != "complete" or self.run("location.protocol") != "file:":
+            assert time.monotonic() < end, "the page does not load"
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def press(self, key: str, code: int) -> None:
+        for kind in ("rawKeyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
+    def requests(self) -> list[str]:
+        """Addresses that the page asked for."""
+        sent = [event["params"] for event in self.events if event.get("method") == "Network.requestWillBeSent"]
+        return [params["request"]["url"] for params in sent]
+
+    def complaints(self) -> list[str]:
+        """Errors that the page's scripts or the browser reported."""
+        kinds = ("Runtime.exceptionThrown", "Log.entryAdded")
+        return [json.dumps(event["params"]) for event in self.events if event.get("method") in kinds]
+
+
+@contextmanager
+def browser(executable: str, profile: Path) -> Iterator[Browser]:
+    """A browser with a profile of its own, ended with the block."""
+    to_browser, from_browser = os.pipe(), os.pipe()
+
+    def connect() -> None:  # Chromium reads commands from descriptor 3 and answers on 4
+        read, write = os.dup(to_browser[0]), os.dup(from_browser[1])
+        os.dup2(read, 3)
+        os.dup2(write, 4)
+
+    command = [executable, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=silent, stderr=silent, close_fds=False, preexec_fn=connect)  # noqa: PLW1509 - it only moves descriptors
+    os.close(to_browser[0])
+    os.close(from_browser[1])
+    try:
+        yield Browser(to_browser[1], from_browser[0])
+    finally:
+        process.terminate()
+        process.wait()
+        os.close(to_browser[1])
+        os.close(from_browser[0])

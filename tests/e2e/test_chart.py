@@ -1,0 +1,260 @@
+"""``gsmerge chart`` on small made scenes: runs, resumes, draws, tells what failed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import gsmerge
+from gsmerge.charts import run as running
+from gsmerge.charts.store import read_runs
+
+from .conftest import Outcome, Run, listing
+
+TARGETS = ("--targets", "{parent}/targets/transforms.json")
+FAST = ("--budgets", "1%,2%", "--fit", "none", "--proxy-views", "0", "--lpips", "none")
+
+
+@pytest.fixture(scope="module")
+def results(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene, and the results of two merges and the input on it."""
+    from gsmerge.cli import main
+
+    folder = tmp_path_factory.mktemp("grid")
+    scene = make_scene(folder / "room", num_views=3, width=64, height=48)
+    assert main(["chart", str(scene), "--out", str(folder / "out"), *TARGETS, *FAST, "--proxy-views", "1", "-q"]) == 0
+    return folder
+
+
+@pytest.fixture
+def copied(results: Path, tmp_path: Path) -> Path:
+    """A copy that a test may spoil."""
+    return Path(shutil.copytree(results, tmp_path / "grid"))
+
+
+@pytest.fixture
+def merges(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """The settings of every merge from now on."""
+    seen: list[dict[str, Any]] = []
+    compact = running.compact
+
+    def watched(scene: Any, **settings: Any) -> Any:
+        seen.append(settings)
+        return compact(scene, **settings)
+
+    monkeypatch.setattr(running, "compact", watched)
+    return seen
+
+
+def again(run: Run, folder: Path, *options: object) -> Outcome:
+    return run("chart", folder / "room", "--out", folder / "out", *TARGETS, *FAST, *options)
+
+
+def test_what_a_grid_leaves_behind(results: Path) -> None:
+    records, notes = read_runs(results / "out")
+    assert notes == ()
+    assert [(r.method, dict(r.settings)) for r in records.values()] == [
+        ("input", {}),
+        ("gsmerge", {"budget": "1%", "fit": "none"}),
+        ("gsmerge", {"budget": "2%", "fit": "none"}),
+    ]
+    pixels = 3 * 64 * 48
+    for record in records.values():
+        assert record.error is None
+        assert (record.scene, record.views, record.num_input) == ("room", 3, pixels)
+        assert record.psnr_target is not None
+        assert record.psnr_target_visible is not None
+        assert record.ssim_context is not None
+        assert record.lpips_vgg_target is None
+        assert (record.render_ms or 0) > 0
+        assert record.environment["gsmerge"] == gsmerge.__version__
+        assert record.command.startswith("gsmerge chart ")
+        assert "--budgets 1%,2% --fit none" in record.command
+    first, one, two = records.values()
+    assert (first.ratio, one.count, two.count) == (1.0, pixels // 100, pixels // 50)
+    assert one.bytes is not None
+    assert two.bytes is not None
+    assert first.seconds == 0
+    assert one.seconds == pytest.approx(sum(v for k, v in one.stages.items() if k not in ("score", "input")))
+    page = (results / "out" / "index.html").read_text()
+    assert "3 runs on 1 scene(s): room" in page
+    assert page.count('<input type="range"') == 2
+    names = {path.name for path in (results / "out" / "charts").iterdir()}
+    assert {"quality-ratio.png", "quality-ratio.svg", "proxy.png", "break-even.svg", "stages.png"} <= names
+    assert not any(name.startswith(".") for name in listing(results / "out"))
+
+
+def test_the_bytes_are_those_of_the_file(results: Path, tmp_path: Path) -> None:
+    record = list(read_runs(results / "out")[0].values())[1]
+    result = gsmerge.compact(gsmerge.read_scene(results / "room"), budget="1%", fit="none")
+    gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
+    assert (tmp_path / "small.ply").stat().st_size == record.bytes
+
+
+def test_nothing_is_run_twice(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
+    before = (copied / "out" / "runs.jsonl").read_bytes()
+    page = (copied / "out" / "index.html").read_bytes()
+    outcome = again(run, copied)
+    assert outcome.code == 0, outcome.err
+    assert merges == []
+    assert (copied / "out" / "runs.jsonl").read_bytes() == before
+    assert "3 runs (0 new), " in outcome.out
+    assert len((copied / "out" / "index.html").read_bytes()) == pytest.approx(len(page), rel=0.01)
+
+
+def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
+    path = copied / "out" / "runs.jsonl"
+    path.write_bytes(path.read_bytes()[:-40])
+    outcome = again(run, copied)
+    assert outcome.code == 0, outcome.err
+    assert "the last line is incomplete and was dropped" in outcome.err
+    assert {settings["budget"] for settings in merges} == {"2%"}
+    assert len(read_runs(copied / "out")[0]) == 3
+
+
+def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
+    assert again(run, copied, "--rerun").code == 0
+    assert [s["budget"] for s in merges[-2:]] == ["1%", "2%"]
+    count = len(merges)
+    assert again(run, copied, "--seed", 1).code == 0
+    assert {settings["seed"] for settings in merges[count:]} == {1}
+    ply = copied / "room" / "scene.ply"
+    data = bytearray(ply.read_bytes())
+    data[-1] ^= 1
+    ply.write_bytes(bytes(data))
+    plan = json.loads(again(run, copied, "--dry-run", "--json").out)
+    assert plan["num_pending"] == 3
+
+
+def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    compact = running.compact
+
+    def broken(scene: Any, **settings: Any) -> Any:
+        if settings.get("budget") == "3%":
+            raise ValueError("two\nlines")
+        return compact(scene, **settings)
+
+    monkeypatch.setattr(running, "compact", broken)
+    options = ("--budgets", "3%,1%", "--out", copied / "new")
+    outcome = again(run, copied, *options)
+    assert outcome.code == 5
+    last = outcome.err.splitlines()[-1]
+    assert last == "gsmerge: error: 1 of 3 runs failed; the first: room: ValueError: two lines"
+    assert "3 runs (3 new, 1 failed)" in outcome.out
+    page = (copied / "new" / "index.html").read_text()
+    assert "ValueError: two lines" in page
+    monkeypatch.setattr(running, "compact", compact)
+    mended = again(run, copied, *options)  # what failed is tried again
+    assert mended.code == 0
+    assert "3 runs (1 new), " in mended.out
+
+
+def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run: Run) -> None:
+    bad = Path(shutil.copytree(copied / "room", copied / "bad"))
+    (bad / "scene.ply").write_text("ply\nThese are notes.\n")
+    outcome = run("chart", bad, copied / "room", "--out", copied / "out", *TARGETS, *FAST, "--quiet")
+    assert outcome.code == 5
+    assert outcome.err.startswith("gsmerge: error: 3 of 3 runs failed; the first: bad: ")
+    assert outcome.err.count("\n") == 1
+
+
+def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) -> None:
+    outcome = again(run, copied, "--views", "2,9", "--json")
+    assert outcome.code == 0
+    document = json.loads(outcome.out)
+    assert document["num_done"] == 3
+    assert document["notes"] == ["room has fewer views than asked for: 3 run(s) left out"]
+    assert {r["views"] for r in document["runs"] if r["views_asked"] == 2} == {2}
+
+
+def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> None:
+    before = listing(copied)
+    outcome = again(run, copied, "--budgets", "1%,5%", "--dry-run")
+    assert outcome.code == 0
+    assert "room: gsmerge, budget 5%, fit none" in outcome.out
+    assert "budget 1%" not in outcome.out
+    assert f"would write {copied / 'out'}: 1 of 3 runs to do" in outcome.out
+    assert "estimate    about" in outcome.out
+    assert listing(copied) == before
+    assert run("chart", copied / "room", "--out", copied / "none", "--dry-run").code == 0
+    assert not (copied / "none").exists()
+
+
+def test_drawing_alone(copied: Path, run: Run) -> None:
+    shutil.rmtree(copied / "out" / "charts")
+    shutil.rmtree(copied / "room")
+    outcome = run("chart", "--draw-only", "--out", copied / "out", "--json")
+    assert (outcome.code, outcome.err) == (0, "")
+    document = json.loads(outcome.out)
+    assert document["schema_version"] == 1
+    assert (document["num_runs"], document["num_done"], document["num_failed"]) == (3, 0, 0)
+    assert all(Path(path).stat().st_size > 1000 for path in document["charts"])
+    assert Path(document["page"]).is_file()
+
+
+def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run) -> None:
+    grid = copied / "grid.json"
+    grid.write_text('{"budgets": ["1%"], "densities": [0.02], "fit": "none"}')
+    outcome = run(
+        "chart",
+        copied / "room",
+        "--out",
+        copied / "out",
+        *TARGETS,
+        "--grid",
+        grid,
+        "--proxy-views",
+        0,
+        "--lpips",
+        "none",
+        "--json",
+    )
+    assert outcome.code == 0
+    assert {settings.get("density") for settings in merges} == {0.02}
+    assert json.loads(outcome.out)["num_done"] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        ((), 2, "expected scenes to run, or --draw-only"),
+        (("room", "--draw-only"), 2, "expected scenes to run, or --draw-only"),
+        (("--draw-only", "--dry-run"), 2, "expected something to run"),
+        (("--draw-only",), 2, "expected finished runs, found none"),
+        (("room", "--k", "9"), 2, "expected"),
+        (("room", "--views", "0"), 2, "views: expected numbers from 1"),
+        (("room", "room"), 2, "expected every scene once"),
+        (("nowhere",), 3, "nowhere"),
+        (("room", "--targets", "{scene}/none.json"), 3, "expected cameras of held-out views"),
+        (("room", "--targets", "{room}/none.json"), 2, "expected {scene}, {parent} or {stem}"),
+        (("room", "--lpips", "some"), 2, "--lpips"),
+        (("room", "--out", "room/scene.ply"), 2, "expected a folder, found the file"),
+        (("room", "--out", "room"), 2, "expected a folder of its own"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_wrong_usage(
+    options: tuple[str, ...], code: int, message: str, results: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(results)
+    before = listing(results)
+    outcome = run("chart", "--out", "new", *options)
+    assert outcome.code == code
+    assert message in outcome.err
+    assert outcome.err.count("\n") == 1
+    assert listing(results) == before
+
+
+def test_missing_matplotlib_is_told_before_anything_is_run(
+    copied: Path, merges: list[dict[str, Any]], run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.charts.draw.find_spec", lambda name: None)
+    outcome = again(run, copied, "--rerun")
+    assert (outcome.code, merges) == (1, [])
+    assert outcome.err == (
+        'gsmerge: error: charts need matplotlib, which is not installed: pip install "gsmerge[chart]"\n'
+    )

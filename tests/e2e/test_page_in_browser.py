@@ -1,0 +1,83 @@
+"""The page in a real browser: nothing is fetched, nothing complains, the slider follows keys and mouse."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from .browser import Browser, browser
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed"),
+    pytest.mark.skipif("GSMERGE_BROWSER" not in os.environ, reason="GSMERGE_BROWSER is not set"),
+]
+FIRST = "document.querySelector('.compare')"
+
+
+@pytest.fixture(scope="module")
+def shown(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    from gsmerge.cli import main
+
+    folder = tmp_path_factory.mktemp("page")
+    scene = make_scene(folder / "room", num_views=3, width=64, height=48)
+    options = ["--budgets", "2%", "--fit", "none,color", "--proxy-views", "1", "--lpips", "none", "--quiet"]
+    assert main(["chart", str(scene), "--out", str(folder / "out"), *options]) == 0
+    assert CHROMIUM is not None
+    with browser(CHROMIUM, folder / "profile") as opened:
+        opened.open(folder / "out" / "index.html")
+        yield opened
+
+
+def at(shown: Browser) -> str:
+    return str(shown.run(f"getComputedStyle({FIRST}).getPropertyValue('--at')"))
+
+
+def test_nothing_is_fetched_and_nothing_complains(shown: Browser) -> None:
+    assert [url for url in shown.requests() if not url.startswith(("file:", "data:", "about:"))] == []
+    assert shown.complaints() == []
+
+
+def test_pictures_and_drawings_have_a_size(shown: Browser) -> None:
+    assert shown.run("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    assert shown.run(
+        "[...document.querySelectorAll('figure > svg')].every(svg => svg.getBoundingClientRect().height > 90)"
+    )
+    assert shown.run("document.querySelectorAll('figure > svg').length") >= 4
+    assert shown.run("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_keys_move_the_slider(shown: Browser) -> None:
+    shown.run(f"{FIRST}.querySelector('input').focus()")
+    assert at(shown) == "50%"
+    for _ in range(3):
+        shown.press("ArrowRight", 39)
+    assert at(shown) == "53%"
+    clip = shown.run(f"getComputedStyle({FIRST}.querySelector('.left')).clipPath")
+    assert clip == "inset(0px 47% 0px 0px)"
+    told = shown.run(f"{FIRST}.querySelector('input').getAttribute('aria-valuetext')")
+    assert told.startswith("53 % input, the rest gsmerge")
+    shown.press("Home", 36)
+    assert at(shown) == "0%"
+
+
+def test_the_mouse_moves_the_slider(shown: Browser) -> None:
+    shown.run(f"{FIRST}.scrollIntoView()")
+    box = shown.run(f"JSON.parse(JSON.stringify({FIRST}.querySelector('.frame').getBoundingClientRect()))")
+    spot = {"x": box["x"] + 0.25 * box["width"], "y": box["y"] + box["height"] / 2, "button": "left", "clickCount": 1}
+    shown.call("Input.dispatchMouseEvent", type="mousePressed", **spot)
+    shown.call("Input.dispatchMouseEvent", type="mouseReleased", **spot)
+    assert abs(float(at(shown).rstrip("%")) - 25) <= 1
+
+
+def test_the_sides_can_be_chosen(shown: Browser) -> None:
+    choose = "(select => { select.value = '0'; select.dispatchEvent(new Event('input')); })"
+    shown.run(f"{choose}({FIRST}.querySelector('select'))")
+    assert shown.run(f"{FIRST}.querySelector('.left').alt").endswith(": photo")
+    assert shown.run(f"{FIRST}.querySelectorAll('.left').length") == 1

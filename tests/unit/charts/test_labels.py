@@ -1,0 +1,35 @@
+"""Names beside lines: apart from each other, near where they belong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.charts.draw.labels import spread
+from gsmerge.charts.draw.style import log_ticks, number
+
+
+def test_places_that_are_far_enough_stay() -> None:
+    assert spread([0.9, 0.1, 0.5], 0.1) == pytest.approx([0.9, 0.1, 0.5])
+    assert spread([], 0.1) == []
+
+
+def test_places_that_touch_are_moved_apart_evenly() -> None:
+    assert spread([0.5, 0.5], 0.1) == pytest.approx([0.45, 0.55])
+    assert spread([0.5, 0.52, 0.9], 0.1) == pytest.approx([0.46, 0.56, 0.9])
+
+
+def test_places_are_apart_in_order_and_near() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        wanted = rng.uniform(0, 1, rng.integers(2, 9)).tolist()
+        placed = spread(wanted, 0.07)
+        order = np.argsort(wanted, kind="stable")
+        assert (np.diff(np.array(placed)[order]) >= 0.07 - 1e-9).all()
+        assert np.mean(placed) == pytest.approx(np.mean(wanted))
+
+
+def test_ticks_are_round() -> None:
+    assert log_ticks(0.4, 25) == pytest.approx([0.5, 1, 2, 5, 10, 20])
+    assert log_ticks(0.001, 3000) == pytest.approx([0.001, 0.01, 0.1, 1, 10, 100, 1000])
+    assert [number(v) for v in (0.5, 20, 1000, 2500, 5e5, 2e6)] == ["0.5", "20", "1k", "2.5k", "500k", "2M"]
