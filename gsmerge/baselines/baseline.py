@@ -41,8 +41,8 @@ class Baseline:
 def own_gaussians(source: Source) -> Gaussians:
     """The Gaussians that the file has, without the rows that only stand in for missing or broken ones."""
     scene = source.scene
-    if isinstance(scene, PixelScene) and not bool(scene.valid.all()):
-        return scene.gaussians[scene.valid.reshape(-1)]
+    if isinstance(scene, PixelScene) and not bool(scene.stored.all()):
+        return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
 
 

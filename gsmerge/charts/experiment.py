@@ -49,6 +49,7 @@ class Grid:
         segmentations: Superpixel methods.
         fit: ``full``, ``color``, ``none``.
         efforts: ``fast``, ``default``, ``best``.
+        matches: Merging across views: ``overlap``, ``aabb``, ``none``.
         views: Numbers of views; "all" for all.
 
     Raises:
@@ -62,6 +63,7 @@ class Grid:
     segmentations: tuple[str, ...] = ("rdseg",)
     fit: tuple[str, ...] = ("full",)
     efforts: tuple[str, ...] = ("default",)
+    matches: tuple[str, ...] = ("overlap",)
     views: tuple[int | str, ...] = (ALL,)
 
     def __post_init__(self) -> None:
@@ -146,15 +148,15 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
     Returns:
         The combinations, the unmerged input first; one note per kind of combination that was left out.
     """
-    defaults = {"k": 1, "segmentation": "rdseg", "fit": "full", "effort": "default"}
+    defaults = {"k": 1, "segmentation": "rdseg", "fit": "full", "effort": "default", "match": "overlap"}
     sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"density": d} for d in grid.densities]
     out: list[tuple[str, dict[str, Any]]] = [(INPUT, {})]
     dropped: dict[str, int] = {}
     for method in grid.methods:
-        for k, segmentation, fit, effort, size in product(
-            grid.k, grid.segmentations, grid.fit, grid.efforts, sizes or [{}]
+        for *values, size in product(
+            grid.k, grid.segmentations, grid.fit, grid.efforts, grid.matches, sizes or [{}]
         ):
-            chosen = {"k": k, "segmentation": segmentation, "fit": fit, "effort": effort}
+            chosen = dict(zip(defaults, values, strict=True))
             why = _senseless(method, chosen, size, grid, sizes)
             if why is not None:
                 dropped[why] = dropped.get(why, 0) + 1
@@ -171,6 +173,7 @@ def _senseless(
     """Why a combination is left out; None if it is not."""
     if method != OURS:
         first = {"k": grid.k[0], "segmentation": grid.segmentations[0], "fit": grid.fit[0], "effort": grid.efforts[0]}
+        first |= {"match": grid.matches[0]}
         own = {"effort"} if method in FITTED else set()
         if any(chosen[name] != value for name, value in first.items() if name not in own):
             return f"{method} takes " + ("effort alone" if own else "a size alone")

@@ -260,7 +260,7 @@ def run_experiment(
         gaussians, seconds = result.gaussians, result.report.seconds
         notes = (*notes, *result.report.notes)
     scores: dict[str, Any] = {**measure(scene, gaussians, targets, options.evaluation)}
-    shown = scene.gaussians if gaussians is None else gaussians
+    shown = scene.file_gaussians if gaussians is None else gaussians
     count = scene.num_gaussians if gaussians is None else len(gaussians)
     return replace(
         blank,

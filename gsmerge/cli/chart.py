@@ -45,6 +45,7 @@ def chart(
     segmentations: Annotated[str | None, _list("Superpixel methods.", "rdseg")] = None,
     fit: Annotated[str | None, _list("What is fitted: full, color, none.", "full")] = None,
     efforts: Annotated[str | None, _list("Work put in: fast, default, best.", "default")] = None,
+    matches: Annotated[str | None, _list("Merging across views: overlap, aabb, none.", "overlap")] = None,
     views: Annotated[str | None, _list("Numbers of input views, evenly spread; all for all.", "all")] = None,
     grid: Annotated[
         Path | None, typer.Option(help="TOML or JSON file with these lists; options win.", rich_help_panel=GRID)
@@ -88,7 +89,7 @@ def chart(
         raise UsageError("expected scenes to run, or --draw-only without any")
     _check_out(out, scenes or [])
     lists = {"methods": methods, "k": k, "budgets": budgets, "densities": densities, "segmentations": segmentations}
-    lists |= {"fit": fit, "efforts": efforts, "views": views}
+    lists |= {"fit": fit, "efforts": efforts, "matches": matches, "views": views}
     from gsmerge.charts.draw import require_matplotlib
 
     if not dry_run:

