@@ -88,7 +88,7 @@ def _place(scene: Path, name: str, targets: Path | None, target_images: Path | N
     read = [files.ply, files.cameras, files.images, targets, target_images]
     for path in (files.cameras, targets):
         read += [] if path is None else _photos(path)
-    cameras = None if files.cameras is None else _cameras(files.cameras)
+    cameras = None if files.cameras is None else _cameras(files.cameras, files.ply.stem)
     num_views = None if cameras is None else len(cameras)
     once = dict.fromkeys(path for path in read if path is not None)
     return Place(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
@@ -102,9 +102,9 @@ def _photos(cameras: Path) -> list[Path]:
     return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
 
 
-def _cameras(path: Path) -> CameraFile | None:
+def _cameras(path: Path, scene: str | None = None) -> CameraFile | None:
     """None where the file cannot be read, which is told when the scene is."""
     try:
-        return read_cameras(path)
+        return read_cameras(path, scene=scene)
     except SceneError:
         return None
