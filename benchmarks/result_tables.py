@@ -37,8 +37,8 @@ def _head(parts: Mapping[str, Sequence[RunRecord]]) -> str:
 Everything here is measured by `{COMMAND}`, which is resumable; `--only PART` measures a part. Scenes:
 {", ".join(scenes)}: real photos and cameras with a real network's depth, written as feed-forward backbones write them.
 Figures are means over the scenes of held-out views midway between the input views, over the pixels that the input views
-have seen (the paper's supplement A), unless said otherwise; LPIPS is that of VGG, on two views of each scene. Seconds are
-the wall time of the merge alone: neither reading, writing nor scoring. Where a mean has an interval, it is the 95 % t
+have seen (the paper's supplement A), unless said otherwise; LPIPS is that of VGG, on two views of each scene. Seconds
+are the wall time of the merge alone: neither reading, writing nor scoring. Where a mean has an interval, it is the 95 % t
 interval over the scenes.
 
 Machine: {machine}."""
@@ -109,8 +109,8 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     ]  # fmt: skip
     head = ("method", "kept", "PSNR (dB)", *QUALITY[1:], "seconds", "ms a frame")
     return [
-        "## Ours and rivals\n\nPart `sizes`: `gsmerge chart` with `--methods` and `--budgets`; `unmerged-fit` is the input"
-        " after the same fit with fast effort, `paper` the paper's moment matching on its superpixels.\n\n"
+        "## Ours and rivals\n\nPart `sizes`: `gsmerge chart` with `--methods` and `--budgets`; `unmerged-fit` is the"
+        " input after the same fit with fast effort, `paper` the paper's moment matching on its superpixels.\n\n"
         + _table(head, rows)
         + "\n\n![quality against seconds](results/quality-seconds.png)\n\n"
         "![quality against ratio](results/quality-ratio.png)\n\n![seconds by stage](results/stages.png)\n\n"
@@ -157,8 +157,8 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         return []
     head = ("export", "method", "kept", *QUALITY)
     return [
-        "## Backbones (the paper's table of novel view synthesis)\n\nParts `ablation`, `da3`, `depthsplat`, `anysplat`: the"
-        " same scenes, written in the way of each exporter; all input views.\n\n" + _table(head, rows),
+        "## Backbones (the paper's table of novel view synthesis)\n\nParts `ablation`, `da3`, `depthsplat`, `anysplat`:"
+        " the same scenes, written in the way of each exporter; all input views.\n\n" + _table(head, rows),
         "### Without the visibility mask\n\n" + _table(head, bare),
         "### On the input views\n\n" + _table(head, own),
     ]
@@ -194,12 +194,7 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         pairs = [(before[s], after[s]) for s in before if s in after]
         if not pairs:
             continue
-
-        def both(name: str) -> tuple[float, float]:
-            return tuple(float(np.mean([getattr(p[i], name) or 0 for p in pairs])) for i in (0, 1))  # type: ignore[return-value]
-
-        counts, sizes, times = both("count"), both("bytes"), both("render_ms")
-        merge = both("seconds")[1]
+        counts, sizes, times, (_, merge) = (_pair_means(pairs, n) for n in ("count", "bytes", "render_ms", "seconds"))
         even = break_even(merge, *times)
         rows.append(
             (str(count), str(len(pairs)), f"{counts[0] / 1e6:.2f} M", f"{counts[1] / 1e6:.3f} M", human_bytes(sizes[0]),
@@ -223,6 +218,11 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         "break-even",
     )
     return ["## Storage, render time and break-even\n\nPart `views`, K = 1, on the processor.\n\n" + _table(head, rows)]
+
+
+def _pair_means(pairs: Sequence[tuple[RunRecord, RunRecord]], name: str) -> tuple[float, float]:
+    first, second = (float(np.mean([getattr(pair[i], name) or 0 for pair in pairs])) for i in (0, 1))
+    return first, second
 
 
 ABLATION = {
@@ -252,8 +252,8 @@ def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         return []
     head = ("variant", "kept", "PSNR (dB)", *QUALITY[1:], "seconds")
     return [
-        "## Ablation\n\nPart `ablation`, plain export, all views. The learned merger and refiner of the paper's table are"
-        " no part of this version; the fit stands in their place.\n\n" + _table(head, rows)
+        "## Ablation\n\nPart `ablation`, plain export, all views. The learned merger and refiner of the paper's table"
+        " are no part of this version; the fit stands in their place.\n\n" + _table(head, rows)
     ]
 
 
@@ -278,8 +278,8 @@ def _proxy(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not parts.get("sizes"):
         return []
     return [
-        "## Superpixels alone\n\nPart `sizes`: every pixel in the mean colour of its superpixel, PSNR against the photo.\n\n"
-        "![proxy PSNR against superpixels](results/proxy.png)"
+        "## Superpixels alone\n\nPart `sizes`: every pixel in the mean colour of its superpixel, PSNR against the"
+        " photo.\n\n![proxy PSNR against superpixels](results/proxy.png)"
     ]
 
 
@@ -327,8 +327,8 @@ def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
                 lost.append((r.scene, name, views, told, f"{before.psnr_target_visible:.2f}", f"{worse:+.2f}"))
     text = """## When not to use it
 
-- Where poses or depth are badly wrong, there is little to merge: on a roof terrace whose depth is mostly wrong the gain is
-  some tenths of a decibel, and a longer fit helps the input views alone.
+- Where poses or depth are badly wrong, there is little to merge: on a roof terrace whose depth is mostly wrong the gain
+  is some tenths of a decibel, and a longer fit helps the input views alone.
 - Where nobody looks from elsewhere: from the input views themselves a scene that was fitted to nothing shows its photos
   sharply, and a merged one is smoother (LPIPS of the input views above).
 - Without photos: the merge alone keeps less than the fit brings; expect the figures of `--fit none`.
@@ -344,4 +344,4 @@ def _missing() -> str:
 
 - Online reconstruction (`tab:online`, `fig:online`): views are not yet added to a state.
 - The learned merger, refiner and decoder (`tab:ablation`): not part of this version.
-- Posed against unposed Depth Anything 3 (`tab:da3_posed_unposed`), ReSplat and VolSplat: their exports need the models."""
+- Posed against unposed Depth Anything 3 (`tab:da3_posed_unposed`), ReSplat, VolSplat: exports that need the models."""

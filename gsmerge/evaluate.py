@@ -34,6 +34,7 @@ class EvaluateOptions:
         lpips: Networks of the perceptual distance, of "vgg" and "alex"; none: it is left out, which is much faster.
         lpips_views: At most so many views of each split get it, evenly spread; None: all.
         context: Also measure the input views.
+        own: Also measure the input itself.
         threads: Threads to use; None: all processors. The figures do not depend on it.
 
     Raises:
@@ -43,6 +44,7 @@ class EvaluateOptions:
     lpips: tuple[str, ...] = NETS
     lpips_views: int | None = None
     context: bool = True
+    own: bool = True
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -133,7 +135,7 @@ class Evaluation:
     """All results on the same views.
 
     Args:
-        results: The scene itself first, as "input".
+        results: The scene itself first, as "input", if it was measured.
         reference: "photos", or "renders of the input" where there are none.
         num_views: Views by split.
         notes: Things worth telling, one sentence each.
@@ -178,10 +180,11 @@ def evaluate(
         splits = _splits(scene, own, targets, options, near)
         judged = [(name, views, visible_pixels(points, views.cameras, near)) for name, views in splits.items()]
         out = []
-        for i, (name, gaussians) in enumerate({INPUT: own, **results}.items()):
+        every = {INPUT: own, **results} if options.own else dict(results)
+        for i, (name, gaussians) in enumerate(every.items()):
             out.append(_evaluated(name, gaussians, len(own), judged, options, near))
             if progress:
-                progress("evaluate", i + 1, 1 + len(results))
+                progress("evaluate", i + 1, len(every))
     counts = {name: len(views.names) for name, views in splits.items()}
     reference = "photos" if scene.images is not None else "renders of the input"
     return Evaluation(tuple(out), reference, counts, _notes(judged))

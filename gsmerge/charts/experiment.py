@@ -153,9 +153,7 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
     out: list[tuple[str, dict[str, Any]]] = [(INPUT, {})]
     dropped: dict[str, int] = {}
     for method in grid.methods:
-        for *values, size in product(
-            grid.k, grid.segmentations, grid.fit, grid.efforts, grid.matches, sizes or [{}]
-        ):
+        for *values, size in product(grid.k, grid.segmentations, grid.fit, grid.efforts, grid.matches, sizes or [{}]):
             chosen = dict(zip(defaults, values, strict=True))
             why = _senseless(method, chosen, size, grid, sizes)
             if why is not None:

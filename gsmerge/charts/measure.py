@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -73,7 +73,10 @@ def measure(
         targets: Held-out views; None without any.
         options: Which of the slow metrics are measured.
     """
-    found = evaluate(scene, {} if gaussians is None else {"result": gaussians}, targets, options)
+    if gaussians is None:
+        found = evaluate(scene, {}, targets, options)
+    else:
+        found = evaluate(scene, {"result": gaussians}, targets, replace(options, own=False))
     scores: dict[str, float] = {}
     for split in found.num_views:
         full, masked = found.results[-1].mean(split)

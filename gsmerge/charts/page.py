@@ -168,7 +168,7 @@ def _verdicts(tables: Sequence[VerdictTable]) -> str:
         answer = "no rival's point lies above ours" if not above else f"{above} rival point(s) lie above ours"
         sentence = (
             f"{one.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours, {undecided}"
-            f" undecided, {outside} cheaper than anything of ours)."
+            f" undecided, {outside} cheaper than anything of ours, so not compared)."
         )
         rows: list[Row] = [
             [

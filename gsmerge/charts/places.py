@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsmerge.charts.store import content_hash
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import SceneFiles, find_scene_files, read_cameras
+from gsmerge.io import CameraFile, SceneFiles, find_scene_files, read_cameras
 from gsmerge.io.scene_files import IMAGE_PLACES
 
 
@@ -88,13 +88,23 @@ def _place(scene: Path, name: str, targets: Path | None, target_images: Path | N
     read = [files.ply, files.cameras, files.images, targets, target_images]
     for path in (files.cameras, targets):
         read += [] if path is None else _photos(path)
-    num_views = None if files.cameras is None else len(read_cameras(files.cameras))
+    cameras = None if files.cameras is None else _cameras(files.cameras, files.ply.stem)
+    num_views = None if cameras is None else len(cameras)
     once = dict.fromkeys(path for path in read if path is not None)
     return Place(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
 
 
 def _photos(cameras: Path) -> list[Path]:
     """Where the photos of a camera file may be found by its names or beside it."""
+    read = _cameras(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
-    named = [root / name for name in read_cameras(cameras).names if (root / name).is_file()]
+    named = [root / name for name in (() if read is None else read.names) if (root / name).is_file()]
     return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
+
+
+def _cameras(path: Path, scene: str | None = None) -> CameraFile | None:
+    """None where the file cannot be read, which is told when the scene is."""
+    try:
+        return read_cameras(path, scene=scene)
+    except SceneError:
+        return None

@@ -32,51 +32,58 @@ def _list(help: str, default: str, name: str | None = None) -> Any:
     return typer.Option(*names, metavar="LIST", help=help, show_default=default, rich_help_panel=GRID)
 
 
+def _told(panel: str, help: str, **settings: Any) -> Any:
+    return typer.Option(help=help, rich_help_panel=panel, **settings)
+
+
+List = str | None
+Scenes = Annotated[
+    list[Path] | None, typer.Argument(metavar="SCENES", help=".ply files, or the folders that they are in.")
+]
+Methods = Annotated[List, _list("Methods: gsmerge and others to compare it with.", "gsmerge")]
+Ks = Annotated[List, _list("Gaussians per superpixel: 1 to 8, auto.", "1", "--k")]
+Budgets = Annotated[List, _list('Gaussians in the result, such as "0.5%,2%,40000".', "as density says")]
+Densities = Annotated[List, _list("Superpixels per pixel, beside the budgets.", "0.044")]
+Segmentations = Annotated[List, _list("Superpixel methods.", "rdseg")]
+Fits = Annotated[List, _list("What is fitted: full, color, none.", "full")]
+Efforts = Annotated[List, _list("Work put in: fast, default, best.", "default")]
+Matches = Annotated[List, _list("Merging across views: overlap, aabb, none.", "overlap")]
+NumViews = Annotated[List, _list("Numbers of input views, evenly spread; all for all.", "all")]
+GridFile = Annotated[Path | None, _told(GRID, "TOML or JSON file with these lists; options win.")]
+Targets = Annotated[
+    str | None,
+    _told(opt.INPUT, "Cameras of held-out photos: one file, or with {scene}, {parent} and {stem} of each scene in it."),
+]
+TargetImages = Annotated[str | None, _told(opt.INPUT, "Folder of those photos, in the same way.")]
+LpipsViews = Annotated[int, _told(MEASURING, "Measure it on at most so many views of each split.", min=1)]
+ProxyViews = Annotated[int, _told(MEASURING, "Photos per scene to measure superpixels on.", min=0)]
+Out = Annotated[Path, _told(opt.OUTPUT, "Results folder; runs that it has already are not repeated.")]
+Rerun = Annotated[bool, typer.Option("--rerun", help="Repeat runs that are done.", rich_help_panel=opt.OUTPUT)]
+DrawOnly = Annotated[
+    bool, typer.Option("--draw-only", help="Draw what the folder has; run nothing.", rich_help_panel=opt.OUTPUT)
+]
+
+
 def chart(
-    scenes: Annotated[
-        list[Path] | None, typer.Argument(metavar="SCENES", help=".ply files, or the folders that they are in.")
-    ] = None,
-    methods: Annotated[str | None, _list("Methods: gsmerge and others to compare it with.", "gsmerge")] = None,
-    k: Annotated[str | None, _list("Gaussians per superpixel: 1 to 8, auto.", "1", "--k")] = None,
-    budgets: Annotated[
-        str | None, _list('Gaussians in the result, such as "0.5%,2%,40000".', "as density says")
-    ] = None,
-    densities: Annotated[str | None, _list("Superpixels per pixel, beside the budgets.", "0.044")] = None,
-    segmentations: Annotated[str | None, _list("Superpixel methods.", "rdseg")] = None,
-    fit: Annotated[str | None, _list("What is fitted: full, color, none.", "full")] = None,
-    efforts: Annotated[str | None, _list("Work put in: fast, default, best.", "default")] = None,
-    matches: Annotated[str | None, _list("Merging across views: overlap, aabb, none.", "overlap")] = None,
-    views: Annotated[str | None, _list("Numbers of input views, evenly spread; all for all.", "all")] = None,
-    grid: Annotated[
-        Path | None, typer.Option(help="TOML or JSON file with these lists; options win.", rich_help_panel=GRID)
-    ] = None,
-    targets: Annotated[
-        str | None,
-        typer.Option(
-            help="Cameras of held-out photos: one file, or with {scene}, {parent} and {stem} of each scene in it.",
-            rich_help_panel=opt.INPUT,
-        ),
-    ] = None,
-    target_images: Annotated[
-        str | None, typer.Option(help="Folder of those photos, in the same way.", rich_help_panel=opt.INPUT)
-    ] = None,
+    scenes: Scenes = None,
+    methods: Methods = None,
+    k: Ks = None,
+    budgets: Budgets = None,
+    densities: Densities = None,
+    segmentations: Segmentations = None,
+    fit: Fits = None,
+    efforts: Efforts = None,
+    matches: Matches = None,
+    views: NumViews = None,
+    grid: GridFile = None,
+    targets: Targets = None,
+    target_images: TargetImages = None,
     lpips: opt.LpipsOption = None,
-    lpips_views: Annotated[
-        int, typer.Option(min=1, help="Measure it on at most so many views of each split.", rich_help_panel=MEASURING)
-    ] = 2,
-    proxy_views: Annotated[
-        int, typer.Option(min=0, help="Photos per scene to measure superpixels on.", rich_help_panel=MEASURING)
-    ] = 2,
-    out: Annotated[
-        Path,
-        typer.Option(help="Results folder; runs that it has already are not repeated.", rich_help_panel=opt.OUTPUT),
-    ] = Path("charts"),
-    rerun: Annotated[
-        bool, typer.Option("--rerun", help="Repeat runs that are done.", rich_help_panel=opt.OUTPUT)
-    ] = False,
-    draw_only: Annotated[
-        bool, typer.Option("--draw-only", help="Draw what the folder has; run nothing.", rich_help_panel=opt.OUTPUT)
-    ] = False,
+    lpips_views: LpipsViews = 2,
+    proxy_views: ProxyViews = 2,
+    out: Out = Path("charts"),
+    rerun: Rerun = False,
+    draw_only: DrawOnly = False,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
     json: opt.JsonOption = False,
@@ -85,42 +92,46 @@ def chart(
     debug: opt.DebugOption = False,
 ) -> None:
     """Run a grid of settings over scenes, resumable, and draw charts and a page of all results in the folder."""
-    if draw_only == bool(scenes):
-        raise UsageError("expected scenes to run, or --draw-only without any")
-    _check_out(out, scenes or [])
+    given = scenes or []
+    _check_usage(given, out, draw_only=draw_only, dry_run=dry_run)
+    if draw_only:
+        _tell(_drawn(out, [], 0), as_json=json, quiet=quiet)
+        return
+    from gsmerge.charts.run import RunOptions
+
     lists = {"methods": methods, "k": k, "budgets": budgets, "densities": densities, "segmentations": segmentations}
     lists |= {"fit": fit, "efforts": efforts, "matches": matches, "views": views}
-    from gsmerge.charts.draw import require_matplotlib
-
-    if not dry_run:
-        require_matplotlib()
-    done: list[RunRecord] = []
-    notes: list[str] = []
-    if not draw_only:
-        from gsmerge.charts.run import RunOptions
-
-        nets, missing = _networks(lpips)
-        typed: dict[str, Any] = {**lists, "grid": grid, "targets": targets, "target_images": target_images}
-        typed |= {"lpips": lpips and lpips.value, "lpips_views": lpips_views, "seed": seed, "threads": threads}
-        command = _command(scenes or [], out, typed)
-        with told_as_usage():
-            told = RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun, command)
-        plan, stored, notes = _planned(scenes or [], _grid(grid, lists), out, targets, target_images, told)
-        if dry_run:
-            _print_plan(plan, stored, told, out, notes, as_json=json)
-            return
-        notes = [*missing, *notes]
-        say_notes(notes, quiet=quiet or json)
-        done, more = _run(plan, out, told, quiet=quiet or json)
-        say_notes(more, quiet=quiet or json)
-        notes += more
-    elif dry_run:
-        raise UsageError("--dry-run: expected something to run, got --draw-only")
-    document = _drawn(out, notes, len(done))
-    _tell(document, as_json=json, quiet=quiet)
+    typed: dict[str, Any] = {**lists, "grid": grid, "targets": targets, "target_images": target_images}
+    typed |= {"lpips": lpips and lpips.value, "lpips_views": lpips_views, "proxy_views": proxy_views}
+    command = _command(given, out, {**typed, "seed": seed, "threads": threads})
+    nets, missing = _networks(lpips)
+    with told_as_usage():
+        told = RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun, command)
+    plan, stored, notes = _planned(given, _grid(grid, lists), out, targets, target_images, told)
+    notes = [*missing, *notes]
+    if dry_run:
+        _print_plan(plan, stored, told, out, notes, as_json=json)
+        return
+    say_notes(notes, quiet=quiet or json)
+    done, more = _run(plan, out, told, quiet=quiet or json)
+    say_notes(more, quiet=quiet or json)
+    _tell(_drawn(out, [*notes, *more], len(done)), as_json=json, quiet=quiet)
     failed = [record for record in done if record.error is not None]
     if failed:
         raise BatchError(f"{len(failed)} of {len(done)} runs failed; the first: {failed[0].scene}: {failed[0].error}")
+
+
+def _check_usage(scenes: Sequence[Path], out: Path, *, draw_only: bool, dry_run: bool) -> None:
+    """What can be refused before anything heavy is loaded."""
+    if draw_only == bool(scenes):
+        raise UsageError("expected scenes to run, or --draw-only without any")
+    if draw_only and dry_run:
+        raise UsageError("--dry-run: expected something to run, got --draw-only")
+    _check_out(out, scenes)
+    if not dry_run:
+        from gsmerge.charts.draw import require_matplotlib
+
+        require_matplotlib()
 
 
 def _check_out(out: Path, scenes: Sequence[Path]) -> None:
