@@ -26,6 +26,7 @@ from gsmerge.io.layouts import Layout, depth_layout, exact_layouts, relabelled, 
 MARGIN = 2.0  # by which the best reading must beat the next one
 SHUFFLED_MARGIN = 5.0  # and by which it must beat pixels dealt out at random
 COLOR_MARGIN = 1.5  # by which the colours must beat the next reading's and random ones, where pixels do not decide
+ENOUGH, FEW = 24, 0.05  # finite rows that a reading can be told from; less will do where they are no such small share
 _UNCONFIRMED = 0.9  # of the colours' distance from random pixels: as good as random
 _VARIES = 0.01  # mean distance of colours from random pixels below which photos say nothing
 _SIMPLER = 1.15  # a simpler frame wins unless it is worse than this factor ...
@@ -77,7 +78,7 @@ def recover(clues: Clues, *, exact_frames: bool = False) -> Recovery | None:
         clues: What there is.
         exact_frames: Only look where the cameras stand where their file has them and no pixel is missing: quick.
     """
-    if clues.order == "none":
+    if clues.order == "none" or _says_nothing(clues):
         return None
     layouts = list(_exact(clues))
     found: list[Evidence] = []
@@ -100,6 +101,12 @@ def recover(clues: Clues, *, exact_frames: bool = False) -> Recovery | None:
     if not _stands_out(best, shuffled_px):
         return None
     return Recovery(best, runner_up, margin, None, _confirmed(color_error(clues, best.layout), shuffled_color))
+
+
+def _says_nothing(clues: Clues) -> bool:
+    """Whether so few of many rows are finite that any reading would do."""
+    finite = int(clues.valid.sum())
+    return finite < ENOUGH and finite < FEW * len(clues.gaussians)
 
 
 def _by_colors(clues: Clues, rivals: list[Evidence]) -> Recovery | None:
