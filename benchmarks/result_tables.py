@@ -38,8 +38,8 @@ Everything here is measured by `{COMMAND}`, which is resumable; `--only PART` me
 {", ".join(scenes)}: real photos and cameras with a real network's depth, written as feed-forward backbones write them.
 Figures are means over the scenes of held-out views midway between the input views, over the pixels that the input views
 have seen (the paper's supplement A), unless said otherwise; LPIPS is that of VGG, on two views of each scene. Seconds
-are the wall time of the merge alone: neither reading, writing nor scoring. Where a mean has an interval, it is the 95 % t
-interval over the scenes.
+are the wall time of the merge alone: neither reading, writing nor scoring. Intervals are 95 % t
+intervals over the scenes.
 
 Machine: {machine}."""
 

@@ -159,7 +159,7 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
             if why is not None:
                 dropped[why] = dropped.get(why, 0) + 1
                 continue
-            known = chosen if method == OURS else {"effort": effort} if method in FITTED else {}
+            known = chosen if method == OURS else {"effort": chosen["effort"]} if method in FITTED else {}
             told = {name: value for name, value in known.items() if value != defaults[name]}
             out.append((method, told if method in WHOLE else size | told))
     return out, [f"{why}: {count} combination(s) left out" for why, count in dropped.items()]

@@ -85,7 +85,7 @@ def evaluate(
             check_output(path, inputs, overwrite=overwrite)
     nets, missing = networks(lpips)
     with told_as_usage():
-        options = EvaluateOptions(nets, lpips_views, context, threads)
+        options = EvaluateOptions(nets, lpips_views, context, threads=threads)
     load = load_files(files, opacity=opacity.value, reading=reading)
     measured, held_out = held_out_views(load, targets, target_images, views)
     plys = {name: read_ply(path) for name, path in zip(file_names(paths), paths, strict=True)}
