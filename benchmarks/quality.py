@@ -14,23 +14,16 @@ import json
 import math
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from shared_scenes import Targets, export, read_targets, scene_folders
 
 import gsmerge
-from gsmerge.canonical import canonicalise
-from gsmerge.fit import FitOptions, fit
 from gsmerge.metrics import psnr, ssim
 from gsmerge.perceptual import INSTALL, lpips, lpips_available
-from gsmerge.photos import scene_photos
-from gsmerge.threads import use_threads
-from gsmerge.types import Gaussians, PixelScene
+from gsmerge.types import Gaussians
 
-PAPER = {"rule": "paper", "robust": False, "match": "none", "fit": "none", "prune": 0.0, "min_opacity": 0.0}
 LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...
 
 
@@ -45,17 +38,6 @@ def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> t
         return means
     chosen = range(0, len(images), math.ceil(len(images) / LPIPS_VIEWS))
     return *means, float(np.mean([lpips(images[i], targets.images[i], "vgg", targets.masks[i]) for i in chosen]))
-
-
-def fitted_unmerged(scene: PixelScene, options: FitOptions) -> tuple[Gaussians, int, float]:
-    """The input itself after the fit, the steps that it made and its seconds: what merging has to be better than."""
-    with use_threads(None), torch.no_grad():
-        canonical, frame = canonicalise(scene)
-        start = time.perf_counter()
-        photos = scene_photos(canonical), scene_photos(canonical, 2)
-        gaussians, report = fit(canonical.gaussians, photos, options, len(canonical.gaussians))
-        assert report is not None
-        return frame.leave(gaussians), report.steps, time.perf_counter() - start
 
 
 def main() -> None:
@@ -76,7 +58,7 @@ def main() -> None:
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_targets(folder)
         row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
         if args.paper:
-            row["paper"] = score(gsmerge.compact(scene, density=0.044, **PAPER).gaussians, targets, args.lpips)
+            row["paper"] = score(gsmerge.compact(scene, method="paper").gaussians, targets, args.lpips)
         if args.ply:
             row["other"] = score(gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians, targets, args.lpips)
         start = time.perf_counter()
@@ -88,11 +70,12 @@ def main() -> None:
         row["input views"] = f"{report.psnr_before:.2f} -> {report.psnr_after:.2f}"
         row["seconds"] = f"{seconds:.1f}"
         if args.unmerged_fit:
-            own = gsmerge.CompactOptions().with_settings(settings).fit
+            steps = gsmerge.CompactOptions().with_settings(settings).fit.steps
             for name, limit in (("equal steps", None), ("equal time", report.seconds["fit"])):
-                other, steps, spent = fitted_unmerged(scene, replace(own, fit_steps=own.steps, time_budget=limit))
-                row[f"unmerged, {name}"] = score(other, targets, args.lpips)
-                row[f"unmerged, {name}, steps"] = f"{steps} in {spent:.1f} s, ours {report.seconds['fit']:.1f} s"
+                other = gsmerge.compact(scene, method="unmerged-fit", fit_steps=steps, time_budget=limit)
+                row[f"unmerged, {name}"] = score(other.gaussians, targets, args.lpips)
+                made, spent = other.report.choices["fit"]["steps"], other.report.seconds["fit"]
+                row[f"unmerged, {name}, steps"] = f"{made} in {spent:.1f} s, ours {report.seconds['fit']:.1f} s"
         row["choice"] = report.choices.get("merge", "-")
         row["fit"] = report.choices.get("fit")
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}

@@ -8,7 +8,8 @@ import numpy as np
 
 from gsmerge.charts.figures import make_verdicts
 from gsmerge.charts.record import INPUT, RunRecord
-from gsmerge.charts.statistics import break_even, mean_interval
+from gsmerge.charts.statistics import mean_interval
+from gsmerge.compare import break_even
 from gsmerge.report import human_bytes
 
 Row = Sequence[str]
@@ -195,7 +196,7 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         if not pairs:
             continue
         counts, sizes, times, (_, merge) = (_pair_means(pairs, n) for n in ("count", "bytes", "render_ms", "seconds"))
-        even = break_even(merge, *times)
+        even = break_even(merge, times[0] / 1000, times[1] / 1000)
         rows.append(
             (str(count), str(len(pairs)), f"{counts[0] / 1e6:.2f} M", f"{counts[1] / 1e6:.3f} M", human_bytes(sizes[0]),
              human_bytes(sizes[1]), f"{sizes[0] / sizes[1]:.1f} x", f"{times[0]:.0f}", f"{times[1]:.1f}",

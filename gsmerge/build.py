@@ -60,7 +60,16 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     if source.scene.images is None:
         return gaussians
     with journal.stage("fit"):
-        return _fitted(gaussians, source.scene, grouping, options, journal)
+        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal)
+
+
+def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Gaussians:
+    """Every Gaussian as it is, fitted to the photos: what remains to be done where none has to go.
+
+    Merging those that share a superpixel and splitting others would only blur, pass after pass.
+    """
+    with journal.stage("fit"):
+        return _fitted(scene.gaussians, scene, (len(scene.gaussians), True), options, journal)
 
 
 def _merged_features(
@@ -104,14 +113,19 @@ def _matched(features: FeatureGaussians, options: CompactOptions, journal: Journ
 
 
 def _fitted(
-    gaussians: Gaussians, scene: PixelScene | LooseScene, grouping: Grouping, options: CompactOptions, journal: Journal
+    gaussians: Gaussians,
+    scene: PixelScene | LooseScene,
+    goal: tuple[int, bool],
+    options: CompactOptions,
+    journal: Journal,
 ) -> Gaussians:
-    """Gaussians that no photo shows left out, the rest fitted to the photos."""
+    """Gaussians that no photo shows left out, the rest fitted to the photos; ``goal``: how many, whether exactly."""
+    wanted, exact = goal
     photos = scene_photos(scene), scene_photos(scene, 2)
     journal.choices["begun_with"] = len(gaussians)
     # where nothing grows to the number asked for, nothing may fall below it either
-    settings = replace(options.fit, prune=0.0) if grouping.exact and not options.fit.grows else options.fit
-    gaussians, report = fit(gaussians, photos, settings, grouping.wanted, options.seed, journal.fit_progress)
+    settings = replace(options.fit, prune=0.0) if exact and not options.fit.grows else options.fit
+    gaussians, report = fit(gaussians, photos, settings, wanted, options.seed, journal.fit_progress)
     if report:
         journal.choices["fit"] = asdict(report)
         if not report.accepted:

@@ -13,7 +13,7 @@ import torch
 
 from gsmerge.allocate import RegionTree
 from gsmerge.baselines import Baseline, check_scene, find_baseline, unused_notes
-from gsmerge.build import Source, build
+from gsmerge.build import Source, build, keep_all
 from gsmerge.canonical import Frame
 from gsmerge.contribution import ContributionOptions
 from gsmerge.curve import LONG, SHORT, measure_curve
@@ -238,6 +238,8 @@ def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
     options, canvas = work.options, work.canvas
     if work.baseline is not None:
         gaussians = work.baseline.run(work.source, canvas, options, canvas.usual if count is None else count, journal)
+    elif count is not None and isinstance(work.source.scene, LooseScene) and count >= len(work.source.scene.gaussians):
+        gaussians = keep_all(work.source.scene, options, journal)
     else:
         with journal.stage("segment"):
             if count is None:

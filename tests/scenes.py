@@ -18,6 +18,7 @@ from gsmerge import Cameras, Gaussians, PixelScene, compact, render
 from gsmerge.geometry import covariances, quat_to_rotmat
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.pipeline import CompactReport, CompactResult
+from gsmerge.sampling import subset
 from gsmerge.types import SH_C0, FeatureGaussians
 
 Texture = Callable[[np.ndarray], np.ndarray]
@@ -196,16 +197,9 @@ def names(count: int) -> tuple[str, ...]:
 
 def take_views(scene: PixelScene, order: Sequence[int]) -> PixelScene:
     """The scene's views in another order, repeated or left out."""
-    size = scene.pixels_per_view
-    rows = torch.cat([torch.arange(view * size, (view + 1) * size) for view in order])
-    index = torch.tensor(order)
-    return PixelScene(
-        scene.gaussians[rows],
-        scene.cameras[index],
-        None if scene.images is None else scene.images[index],
-        scene.valid[index],
-        names(len(order)),
-    )
+    taken = subset(scene, order)
+    assert isinstance(taken, PixelScene)
+    return replace(taken, names=names(len(order)))
 
 
 def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Gaussians:

@@ -31,7 +31,8 @@ from gsmerge.charts.series import (
     usual_size,
     usual_views,
 )
-from gsmerge.charts.statistics import Verdict, break_even, judge, paired_intervals
+from gsmerge.charts.statistics import Verdict, judge, paired_intervals
+from gsmerge.compare import break_even
 from gsmerge.journal import STAGES
 
 RATIOS = (0.0045, 0.22)  # of rivals' points that are judged: 0.5 % to 20 %, and what rounding does
@@ -290,7 +291,7 @@ def _payback(records: Sequence[RunRecord]) -> Payback | None:
     for name, group in rows.items():
         seconds = float(np.mean([r.seconds for r in group if r.seconds is not None]))
         after = float(np.mean([r.render_ms for r in group if r.render_ms is not None]))
-        even = break_even(seconds, before, after) if after < (1 - NOISE) * before else None
+        even = break_even(seconds, before / 1000, after / 1000) if after < (1 - NOISE) * before else None
         found.append((name, seconds, after, even))
     caption = (
         "Time to render so many frames, the merge included, on the processor that ran the grid. Dots: frames after"

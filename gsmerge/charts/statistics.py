@@ -182,9 +182,3 @@ def judge(
     words = "ours above" if ahead.low > 0 else "rival above" if ahead.high < 0 else "undecided"
     mean_ours = sign * float(np.mean(list(read.values())))
     return Verdict(rival, mean_cost, sign * float(np.mean(list(theirs.values()))), mean_ours, ahead, words)
-
-
-def break_even(seconds: float, ms_before: float, ms_after: float) -> float | None:
-    """Frames after which merging has paid for itself; None where the result renders no faster."""
-    saved = (ms_before - ms_after) / 1000
-    return seconds / saved if saved > 0 else None

@@ -111,7 +111,7 @@ def _run(
 ) -> dict[str, Any]:
     """Read, compact and write; returns the report."""
     from gsmerge import pipeline
-    from gsmerge.io import atomic_output, load_files, write_ply
+    from gsmerge.io import atomic_output, kept_comments, load_files, write_ply
     from gsmerge.memory import release_memory
     from gsmerge.report import report_document
 
@@ -119,6 +119,7 @@ def _run(
     with atomic_output(out, overwrite=overwrite) as temporary:
         loaded = load_files(files, opacity=opacity, reading=reading)
         recognised, notes, scene = _recognised(loaded), loaded.notes, loaded.scene
+        comments = kept_comments(loaded.ply)
         del loaded  # which knows the row of every pixel
         release_memory()
         if len(scene):
@@ -140,11 +141,11 @@ def _run(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
-        write_ply(temporary, result.gaussians, overwrite=True)
+        write_ply(temporary, result.gaussians, overwrite=True, comments=comments)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
     for path, level in coarser:
         with atomic_output(path, overwrite=overwrite) as temporary:
-            write_ply(temporary, level.gaussians, overwrite=True)
+            write_ply(temporary, level.gaussians, overwrite=True, comments=comments)
     return report_document(
         result.report,
         input_path=files.ply,

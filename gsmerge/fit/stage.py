@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from gsmerge.fit.color import draw, fit_colors, seen
 from gsmerge.fit.device import engine_for
 from gsmerge.fit.full import Progress, fit_full
@@ -10,8 +14,11 @@ from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
 from gsmerge.fit.state import gaussians_of, start_state
 from gsmerge.photos import Photos
+from gsmerge.render import composite, plan_view, prepare
+from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
+CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
 
@@ -45,15 +52,39 @@ def fit(
     if options.fit == "full":
         kept = gaussians[keep]
         fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device))
+        fitted, report = _better_of(kept, fitted, report, photos[0])
         if report.accepted:
             return fitted, report
         if options.grows:  # the stages before left room for a growth that did not happen
             state = grow_to(start_state(kept), photos[1], count)
             grown = gaussians_of(state.x, state.splats.shN)
             fitted, report = fit_colors(grown, draw(grown, photos[1]), photos[1], options, seed)
-            return (fitted if report.accepted else kept), report
-    gaussians, report = fit_colors(gaussians, drawn, photos[1], options, seed)
-    return gaussians[keep], report
+            return _better_of(kept, fitted, report, photos[0]) if report.accepted else (kept, report)
+    fitted, report = fit_colors(gaussians, drawn, photos[1], options, seed)
+    return _better_of(gaussians[keep], fitted[keep], report, photos[0])
+
+
+def _better_of(before: Gaussians, after: Gaussians, report: FitReport, photos: Photos) -> tuple[Gaussians, FitReport]:
+    """The fitted Gaussians, but where they began if the held-out blocks hardly gained and the photos as a whole lost.
+
+    Gaussians that were fitted already are where steps of the usual size only stir.
+    """
+    if not report.accepted or report.holdout_after - report.holdout_before >= CLOSE:
+        return after, report
+    if _photos_error(after, photos) <= _photos_error(before, photos):
+        return after, report
+    return before, replace(report, method="none", accepted=False, stopped="the photos as a whole were shown worse")
+
+
+def _photos_error(gaussians: Gaussians, photos: Photos) -> float:
+    """Mean squared error of all photos."""
+    splats = prepare(gaussians)
+
+    def one_view(view: int) -> float:
+        image, _ = composite(plan_view(splats, **photos.camera(view)))
+        return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
+
+    return float(np.mean(parallel_map(one_view, range(len(photos)))))
 
 
 def start_share(options: FitOptions) -> float:

@@ -6,7 +6,7 @@ from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
 from gsmerge.io.images import read_images
 from gsmerge.io.placed import Placed, place_views
-from gsmerge.io.ply import PlyInfo, PlyScene, ply_notes, read_ply
+from gsmerge.io.ply import PlyInfo, PlyScene, kept_comments, ply_notes, read_ply
 from gsmerge.io.ply_writer import write_ply
 from gsmerge.io.reading import AUTO, Reading
 from gsmerge.io.recover import Recovery
@@ -31,6 +31,7 @@ __all__ = [
     "atomic_output",
     "check_alignment",
     "find_scene_files",
+    "kept_comments",
     "load_files",
     "load_scene",
     "place_views",

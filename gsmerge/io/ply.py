@@ -35,6 +35,8 @@ from gsmerge.io.ply_layout import (
 from gsmerge.threads import parallel_map
 from gsmerge.types import SH_C0, Gaussians
 
+RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+
 OpacityChoice = Literal["auto", "logit", "raw"]
 
 
@@ -96,6 +98,11 @@ class PlyScene:
     gaussians: Gaussians
     valid: torch.Tensor
     info: PlyInfo
+
+
+def kept_comments(info: PlyInfo) -> tuple[str, ...]:
+    """Comments of a file's header that say how its Gaussians are to be rendered, to be passed on."""
+    return tuple(comment for comment in info.comments if comment.startswith(RENDER_COMMENT) and comment.isascii())
 
 
 def ply_notes(info: PlyInfo) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ def write_ply(
     *,
     overwrite: bool = False,
     sh_degree: int | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write Gaussians in INRIA's column order, binary little-endian float32.
 
@@ -39,18 +41,22 @@ def write_ply(
         gaussians: Finite values.
         overwrite: Replace an existing file.
         sh_degree: Drop harmonics above this degree; None keeps all.
+        comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
 
     Raises:
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, or fewer harmonics than asked for.
+        ValueError: If there is NaN or inf, fewer harmonics than asked for, or a comment is no line of ASCII.
     """
+    if not all(comment.isascii() and comment.isprintable() for comment in comments):
+        raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
     num_higher = (degree + 1) ** 2 - 1
     names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher))]
     names += ["opacity", *SCALES, *QUATS]
-    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}", f"element vertex {len(gaussians)}"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}"]
+    header += [*(f"comment {comment}" for comment in comments), f"element vertex {len(gaussians)}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
     block = max(1, BLOCK_BYTES // (4 * len(names)))
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:

@@ -9,7 +9,7 @@ import pytest
 import scenes
 import torch
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians, LooseScene, PixelScene, compact
 
 SCENES = {"wall": scenes.wall, "planes": scenes.two_planes, "room": scenes.room}
 
@@ -121,3 +121,16 @@ def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None
     fine = replace(clean.cameras[:1], Ks=Ks[:1], width=4 * clean.cameras.width, height=4 * clean.cameras.height)
     before, after = (scenes.images_of(g, fine)[1].mean() for g in (faint.gaussians, found))
     assert after == pytest.approx(before, rel=0.1)
+
+
+# 46: a compact scene compacted once more
+
+
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}], ids=str)
+def test_a_second_pass_neither_blurs_nor_darkens(scene: PixelScene, settings: dict) -> None:
+    once = scenes.compacted(scene, density=0.044, **settings).gaussians
+    loose = LooseScene(once, scene.cameras, scene.images, scene.names)
+    twice = compact(loose, budget=len(once), **settings).gaussians
+    assert 0.99 * len(once) <= len(twice) <= len(once)  # what no photo shows goes
+    assert scenes.psnr_of(twice, scene) > scenes.psnr_of(once, scene) - 0.2
+    assert coverage(twice, scene)[1] == pytest.approx(coverage(once, scene)[1], abs=1 / 255)

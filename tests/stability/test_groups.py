@@ -269,3 +269,25 @@ def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
         return float(image[pole].mean() - image[wall].mean())
 
     assert contrast(scenes.compacted(scene, **settings).gaussians) >= 0.5 * contrast(scene.gaussians) > 0.1
+
+
+# 39: a centimetre and a kilometre in one scene
+
+
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}], ids=str)
+def test_near_and_far_details_are_both_kept(settings: dict) -> None:
+    """A card five centimetres away before a landscape two kilometres away, textured alike in the image."""
+    near, far = scenes.waves(1), scenes.waves(2)
+    surfaces = [
+        scenes.plane(0.05, lambda p: near(p * 60), right=0.0),
+        scenes.plane(2000.0, lambda p: far(p / 700)),
+    ]
+    cameras = scenes.arc(3, span=0.004)
+    scene = scenes.make_scene(surfaces, cameras)
+    found = scenes.compacted(scene, **settings).gaussians
+    is_near = (scenes.trace(surfaces, cameras)[1] < 1).reshape(scene.valid.shape)
+    drawn = [scenes.images_of(gaussians, cameras)[0].clip(0, 1) for gaussians in (found, scene.gaussians)]
+    for part in (is_near, ~is_near):
+        inner = part[:, 1:, 1:] & part[:, :-1, :-1] & part[:, 1:, :-1] & part[:, :-1, 1:]
+        detail = [np.abs(np.diff(i, axis=1)[:, :, 1:]) + np.abs(np.diff(i, axis=2)[:, 1:]) for i in drawn]
+        assert detail[0][inner].mean() > 0.8 * detail[1][inner].mean() > 0

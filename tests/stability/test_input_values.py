@@ -10,6 +10,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
+from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_ply, read_scene, write_ply
 from gsmerge.types import Gaussians
@@ -165,3 +166,18 @@ def test_coordinates_far_from_the_origin(scene_copy: Path) -> None:
     assert after.dtype == torch.float64
     back = after - torch.tensor(list(shift.values()), dtype=torch.float64)
     assert torch.allclose(back, before.double(), rtol=0, atol=1e-6)
+
+
+def test_the_way_to_render_is_passed_on(scene_copy: Path, tmp_path: Path) -> None:
+    """Case 43: files whose Gaussians carry a filter of their own say so in the header."""
+    ply = scene_copy / "scene.ply"
+    head, rows = ply.read_bytes().split(b"end_header\n", 1)
+    head = head.replace(b"element vertex", b"comment SplatRenderMode: mip\ncomment of no use\nelement vertex")
+    ply.write_bytes(head + b"end_header\n" + rows)
+    out = tmp_path / "small.ply"
+    assert main(["compact", str(scene_copy), "-o", str(out), "--fit", "none", "--superpixels", "20", "-q"]) == 0
+    comments = read_ply(out).info.comments
+    assert "SplatRenderMode: mip" in comments
+    assert "of no use" not in comments
+    with pytest.raises(ValueError, match="lines of ASCII"):
+        write_ply(tmp_path / "bad.ply", read_ply(out).gaussians, comments=["one\nelement vertex 5"])

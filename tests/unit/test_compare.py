@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 
 from gsmerge.before_after import comparison_document, comparison_html, comparison_markdown
 from gsmerge.compare import Comparison, Side, Storage, break_even, compare
@@ -17,7 +18,6 @@ from gsmerge.report import to_json
 from gsmerge.speed import Speed, measure_speeds, overdraw, resized
 from gsmerge.types import PixelScene
 from gsmerge.weights import view_weights
-from tests import scenes
 
 PLAIN = EvaluateOptions(lpips=())
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -17,7 +18,6 @@ from gsmerge.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate
 from gsmerge.report import to_json
 from gsmerge.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
 from gsmerge.types import Gaussians, LooseScene, PixelScene
-from tests import scenes
 
 PLAIN = EvaluateOptions(lpips=())
 

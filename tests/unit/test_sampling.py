@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 import torch
 
 from gsmerge.sampling import distinct_views, even_views, midpoint_views, subset
 from gsmerge.types import LooseScene, PixelScene
-from tests import scenes
 
 
 @pytest.mark.parametrize(

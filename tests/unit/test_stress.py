@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scenes
 import torch
 
 from gsmerge.errors import SceneError
@@ -19,7 +20,6 @@ from gsmerge.options import CompactOptions
 from gsmerge.stress import CASES, changes, run, stress
 from gsmerge.stress.changes import Judged
 from gsmerge.types import LooseScene, PixelScene
-from tests import scenes
 
 FAST = CompactOptions().with_settings({"fit": "none", "robust": False})
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scenes
 
 from gsmerge.sampling import subset
 from gsmerge.types import Cameras, LooseScene
 from gsmerge.visibility import context_points, visible_pixels
-from tests import scenes
 
 
 def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:

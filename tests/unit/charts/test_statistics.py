@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gsmerge.charts.statistics import (
-    break_even,
     judge,
     mean_interval,
     paired_difference,
@@ -130,9 +129,3 @@ def test_nothing_is_said_where_ours_has_nothing_as_cheap() -> None:
     found = judge("random", {"a": (0.1, 30.0)}, OURS)
     assert (found.ours, found.ahead, found.quality) == (None, None, 30)
     assert found.words == "ours has none so cheap"
-
-
-def test_break_even() -> None:
-    assert break_even(7.0, 80.0, 10.0) == pytest.approx(100)
-    assert break_even(7.0, 10.0, 10.0) is None
-    assert break_even(7.0, 10.0, 12.0) is None
