@@ -152,3 +152,26 @@ def test_architecture_names_every_module(root: Path) -> None:
     text = (root / "docs" / "architecture.md").read_text()
     modules = {path.stem for path in (root / "gsmerge").iterdir() if not path.name.startswith("_")} - {"py"}
     assert {name for name in modules if f"`{name}`" not in text and f"`{name}/`" not in text} == set()
+
+
+def stability_rows(root: Path) -> list[tuple[str, str]]:
+    """Number and test column of every case."""
+    rows = [line.split("|") for line in (root / "docs" / "stability.md").read_text().splitlines()]
+    return [(row[1].strip(), row[4]) for row in rows if len(row) > 5 and row[1].strip()[:1].isdigit()]
+
+
+def test_every_stability_case_is_listed(root: Path) -> None:
+    numbers = [int(n) for case, _ in stability_rows(root) for n in case.split(",")]
+    assert numbers == list(range(1, 56))
+
+
+def test_stability_cases_name_tests_that_are_there(root: Path) -> None:
+    for case, tests in stability_rows(root):
+        folder = ""
+        for name, words in re.findall(r"`([\w/*]+)`(?:: ([\w, ]+))?", tests):
+            folder = str(Path(name).parent) if "/" in name else folder
+            files = list((root / "tests").glob(f"{folder}/{Path(name).name}.py"))
+            assert files, f"case {case}: {name}"
+            text = "".join(file.read_text() for file in files)
+            for word in filter(None, re.split(r"[, ]+", words)):
+                assert re.search(rf"def test_\w*{word}", text), f"case {case}: {name} has no test of {word}"
