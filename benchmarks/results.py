@@ -56,6 +56,7 @@ PARTS = (
             ("--methods", f"gsmerge,{FAST_RIVALS}", *SIZES),
             ("--budgets", "4.4%", "--efforts", "fast,best", "--proxy-views", "0"),
             ("--budgets", "4.4%", "--fit", "color,none", "--proxy-views", "0"),
+            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "robust=false", "--proxy-views", "0"),
             ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", "--proxy-views", "0"),
             ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", "--proxy-views", "0"),
         ),

@@ -51,6 +51,7 @@ class Grid:
         efforts: ``fast``, ``default``, ``best``.
         matches: Merging across views: ``overlap``, ``aabb``, ``none``.
         views: Numbers of views; "all" for all.
+        fixed: Any other settings of ours, each "name=value", the same in all runs.
 
     Raises:
         ValueError: If a list is empty that must not be, or a value is none that can be.
@@ -65,17 +66,36 @@ class Grid:
     efforts: tuple[str, ...] = ("default",)
     matches: tuple[str, ...] = ("overlap",)
     views: tuple[int | str, ...] = (ALL,)
+    fixed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not value and f.name not in ("budgets", "densities"):
+            if not value and f.name not in ("budgets", "densities", "fixed"):
                 raise ValueError(f"{f.name}: expected at least one value, got none")
             if len(set(value)) < len(value):
                 raise ValueError(f"{f.name}: expected every value once, got {', '.join(map(str, value))}")
         for value in self.views:
             if value != ALL and not (isinstance(value, int) and value >= 1):
                 raise ValueError(f'views: expected numbers from 1 or "all", got {value!r}')
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The fixed settings by name.
+
+        Raises:
+            UsageError: If one is no "name=value".
+        """
+        found = {}
+        for text in self.fixed:
+            name, sign, value = text.partition("=")
+            if not (name and sign):
+                raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
+            try:
+                found[name] = json.loads(value)
+            except ValueError:
+                found[name] = value
+        return found
 
 
 _PARSERS: dict[str, Any] = {
@@ -161,6 +181,7 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
                 continue
             known = chosen if method == OURS else {"effort": chosen["effort"]} if method in FITTED else {}
             told = {name: value for name, value in known.items() if value != defaults[name]}
+            told |= grid.settings if method == OURS else {}
             out.append((method, told if method in WHOLE else size | told))
     return out, [f"{why}: {count} combination(s) left out" for why, count in dropped.items()]
 

@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -48,6 +49,10 @@ Segmentations = Annotated[List, _list("Superpixel methods.", "rdseg")]
 Fits = Annotated[List, _list("What is fitted: full, color, none.", "full")]
 Efforts = Annotated[List, _list("Work put in: fast, default, best.", "default")]
 Matches = Annotated[List, _list("Merging across views: overlap, aabb, none.", "overlap")]
+Fixed = Annotated[
+    list[str] | None,
+    _told(GRID, "Any other setting of compact for all runs of ours; may be repeated.", metavar="NAME=VALUE"),
+]
 NumViews = Annotated[List, _list("Numbers of input views, evenly spread; all for all.", "all")]
 GridFile = Annotated[Path | None, _told(GRID, "TOML or JSON file with these lists; options win.")]
 Targets = Annotated[
@@ -75,6 +80,7 @@ def chart(
     efforts: Efforts = None,
     matches: Matches = None,
     views: NumViews = None,
+    fixed: Fixed = None,
     grid: GridFile = None,
     targets: Targets = None,
     target_images: TargetImages = None,
@@ -101,13 +107,13 @@ def chart(
 
     lists = {"methods": methods, "k": k, "budgets": budgets, "densities": densities, "segmentations": segmentations}
     lists |= {"fit": fit, "efforts": efforts, "matches": matches, "views": views}
-    typed: dict[str, Any] = {**lists, "grid": grid, "targets": targets, "target_images": target_images}
+    typed: dict[str, Any] = {**lists, "fixed": fixed, "grid": grid, "targets": targets, "target_images": target_images}
     typed |= {"lpips": lpips and lpips.value, "lpips_views": lpips_views, "proxy_views": proxy_views}
     command = _command(given, out, {**typed, "seed": seed, "threads": threads})
     nets, missing = _networks(lpips)
     with told_as_usage():
         told = RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun, command)
-    plan, stored, notes = _planned(given, _grid(grid, lists), out, targets, target_images, told)
+    plan, stored, notes = _planned(given, _grid(grid, lists, fixed), out, targets, target_images, told)
     notes = [*missing, *notes]
     if dry_run:
         _print_plan(plan, stored, told, out, notes, as_json=json)
@@ -142,10 +148,11 @@ def _check_out(out: Path, scenes: Sequence[Path]) -> None:
         raise UsageError(f"--out: expected a folder of its own, got the scene {out}")
 
 
-def _grid(file: Path | None, lists: dict[str, str | None]) -> Grid:
+def _grid(file: Path | None, lists: dict[str, str | None], fixed: Sequence[str] | None) -> Grid:
     from gsmerge.charts.experiment import Grid, parse_grid, read_grid
 
-    return parse_grid(lists, Grid() if file is None else read_grid(file))
+    base = Grid() if file is None else read_grid(file)
+    return parse_grid(lists, replace(base, fixed=tuple(fixed)) if fixed else base)
 
 
 def _networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
@@ -162,8 +169,8 @@ def _command(scenes: Sequence[Path], out: Path, told: dict[str, Any]) -> str:
     """The command line that does the same, without what was left at its default."""
     words = ["gsmerge", "chart", *map(str, scenes), "--out", str(out)]
     for name, value in told.items():
-        if value is not None:
-            words += [f"--{name.replace('_', '-')}", str(value)]
+        for one in value if isinstance(value, list) else [] if value is None else [value]:
+            words += [f"--{name.replace('_', '-')}", str(one)]
     return shlex.join(words)
 
 

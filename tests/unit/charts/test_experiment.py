@@ -118,3 +118,18 @@ def test_files_that_hold_no_grid(text: str, message: str, tmp_path: Path) -> Non
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="expected a TOML or JSON file"):
         read_grid(tmp_path / "grid.toml")
+
+
+def test_fixed_settings_are_those_of_ours_alone() -> None:
+    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "seed=3"))
+    combinations, _ = grid_settings(grid)
+    assert combinations[1:] == [
+        ("gsmerge", {"budget": "1%", "robust": False, "match": "none", "seed": 3}),
+        ("random", {"budget": "1%"}),
+    ]
+
+
+@pytest.mark.parametrize("text", ["robust", "=1", ""])
+def test_fixed_settings_are_names_and_values(text: str) -> None:
+    with pytest.raises(UsageError, match="NAME=VALUE"):
+        grid_settings(Grid(fixed=(text,)))
