@@ -10,6 +10,7 @@ from gsmerge.kernels.interleave import cheapest_views
 
 MAX_BACK = 0.01  # share of the steps that may go back; of rows in no such order a quarter or more do
 MIN_CHANGES = 0.3  # share of the steps that change the view: fewer are views one after the other
+PROBES, PROBE = 5, 4000  # pieces of a file that are looked at first, and the rows of each
 MAX_VIEWS = 127
 MAX_CELLS = 300_000_000  # rows times views that are worth the memory
 
@@ -35,10 +36,14 @@ def interleaved_layout(
     views = len(viewmats)
     if not 1 < views <= MAX_VIEWS or len(points) < MIN_BLOCK * views or len(points) * views > MAX_CELLS:
         return None
+    starts = np.linspace(0, max(0, len(points) - PROBE), PROBES).astype(int)
+    pieces = [points[start : start + PROBE] for start in starts] if len(points) > PROBES * PROBE else []
+    # quick for the many files that have no such order: a few pieces tell
+    if not all(_forward(_pixels_in_views(p, viewmats, Ks, width, height))[1] for p in pieces):
+        return None
     pixels = _pixels_in_views(points, viewmats, Ks, width, height)
-    chosen = np.empty(len(points), np.int64)
-    back = cheapest_views(pixels, np.zeros(pixels.shape, np.int8), chosen)
-    if back > MAX_BACK * len(points) or np.mean(chosen[1:] != chosen[:-1]) < MIN_CHANGES:
+    chosen, goes_forward = _forward(pixels)
+    if not goes_forward:
         return None
     mine = pixels[np.arange(len(points)), chosen]
     rows, cells = [], []
@@ -60,6 +65,13 @@ def interleaved_layout(
         rows=tuple(rows),
         pixels=tuple(cells),
     )
+
+
+def _forward(pixels: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The best view ``[n]`` of every row, and whether its pixels then only go forward, from view to view."""
+    chosen = np.empty(len(pixels), np.int64)
+    back = cheapest_views(pixels, np.zeros(pixels.shape, np.int8), chosen)
+    return chosen, bool(back <= MAX_BACK * len(pixels) and np.mean(chosen[1:] != chosen[:-1]) >= MIN_CHANGES)
 
 
 def _pixels_in_views(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> np.ndarray:
