@@ -50,6 +50,12 @@ def _table(head: Row, rows: Sequence[Row]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def _section(title: str, parts: str, words: str, table: str, *figures: str) -> str:
+    """A section with the command that makes it, its table and its charts."""
+    shown = [f"![{name}](results/{name}.png)" for name in figures]
+    return "\n\n".join(filter(None, [f"## {title}", f"Made by `{COMMAND} --only {parts}`. {words}", table, *shown]))
+
+
 def _mean(records: Sequence[RunRecord], name: str, digits: int = 2) -> str:
     values = [v for r in records if (v := getattr(r, name)) is not None]
     return f"{np.mean(values):.{digits}f}" if values else "-"
@@ -109,14 +115,9 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         for some in (groups[k] for k in order)
     ]  # fmt: skip
     head = ("method", "kept", "PSNR (dB)", *QUALITY[1:], "seconds", "ms a frame")
-    return [
-        "## Ours and rivals\n\nPart `sizes`: `gsmerge chart` with `--methods` and `--budgets`; `unmerged-fit` is the"
-        " input after the same fit with fast effort, `paper` the paper's moment matching on its superpixels.\n\n"
-        + _table(head, rows)
-        + "\n\n![quality against seconds](results/quality-seconds.png)\n\n"
-        "![quality against ratio](results/quality-ratio.png)\n\n![seconds by stage](results/stages.png)\n\n"
-        "![break-even frames](results/break-even.png)"
-    ]
+    figures = ("quality-seconds", "quality-ratio", "stages", "break-even")
+    words = "`unmerged-fit` is the input after the same fit with fast effort, `paper` the paper's moment matching."
+    return [_section("Ours and rivals", "sizes", words, _table(head, rows), *figures)]
 
 
 def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -157,9 +158,10 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not rows:
         return []
     head = ("export", "method", "kept", *QUALITY)
+    words = "The same scenes, written in the way of each exporter; all input views."
+    title = "Backbones (the paper's table of novel view synthesis)"
     return [
-        "## Backbones (the paper's table of novel view synthesis)\n\nParts `ablation`, `da3`, `depthsplat`, `anysplat`:"
-        " the same scenes, written in the way of each exporter; all input views.\n\n" + _table(head, rows),
+        _section(title, "ablation da3 depthsplat anysplat", words, _table(head, rows)),
         "### Without the visibility mask\n\n" + _table(head, bare),
         "### On the input views\n\n" + _table(head, own),
     ]
@@ -176,12 +178,8 @@ def _views(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         for some in _grouped(at, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
             rows.append((str(count), str(len(some)), _words(some[0]), _share(some), *_quality(some)))
     head = ("views", "scenes", "method", "kept", *QUALITY)
-    return [
-        "## By number of input views\n\nPart `views`: evenly spread contexts, targets midway between them; scenes with"
-        " fewer views are left out of the row.\n\n"
-        + _table(head, rows)
-        + "\n\n![quality against views](results/quality-views.png)\n\n![count against views](results/count-views.png)"
-    ]
+    words = "Evenly spread contexts, targets midway between them; scenes with fewer views are left out of a row."
+    return [_section("By number of input views", "views", words, _table(head, rows), "quality-views", "count-views")]
 
 
 def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -218,7 +216,8 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         "merge s",
         "break-even",
     )
-    return ["## Storage, render time and break-even\n\nPart `views`, K = 1, on the processor.\n\n" + _table(head, rows)]
+    words = "K = 1, on the processor."
+    return [_section("Storage, render time and break-even", "views", words, _table(head, rows))]
 
 
 def _pair_means(pairs: Sequence[tuple[RunRecord, RunRecord]], name: str) -> tuple[float, float]:
@@ -252,10 +251,11 @@ def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not rows:
         return []
     head = ("variant", "kept", "PSNR (dB)", *QUALITY[1:], "seconds")
-    return [
-        "## Ablation\n\nPart `ablation`, plain export, all views. The learned merger and refiner of the paper's table"
-        " are no part of this version; the fit stands in their place.\n\n" + _table(head, rows)
-    ]
+    words = (
+        "Plain export, all views. The learned merger and refiner of the paper's table are no part of this version; the"
+        " fit stands in their place."
+    )
+    return [_section("Ablation", "ablation", words, _table(head, rows))]
 
 
 def _voxels(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -269,19 +269,15 @@ def _voxels(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         shares = [r.count / (plain[r.scene].count or 1) for r in some if r.scene in plain and r.count]
         name = "voxelised" if some[0].method == INPUT else f"voxelised, then merged, K = {some[0].settings.get('k', 1)}"
         rows.append((name, f"{100 * np.mean(shares):.1f} %", *_quality(some)))
-    text = (
-        "## Merging what is voxelised already\n\nPart `anysplat`; kept is the share of the Gaussians before voxels.\n\n"
-    )
-    return [text + _table(("method", "kept", *QUALITY), rows)]
+    title, words = "Merging what is voxelised already", "Kept is the share of the Gaussians before voxels."
+    return [_section(title, "ablation anysplat", words, _table(("method", "kept", *QUALITY), rows))]
 
 
 def _proxy(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not parts.get("sizes"):
         return []
-    return [
-        "## Superpixels alone\n\nPart `sizes`: every pixel in the mean colour of its superpixel, PSNR against the"
-        " photo.\n\n![proxy PSNR against superpixels](results/proxy.png)"
-    ]
+    words = "Every pixel in the mean colour of its superpixel, PSNR against the photo."
+    return [_section("Superpixels alone", "sizes", words, "", "proxy")]
 
 
 def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -304,7 +300,7 @@ def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         *(f"{q}, ours" for q in QUALITY),
         "seconds",
     )
-    return ["## Scene by scene\n\nPart `ablation`, defaults (K = 1, 4.4 %).\n\n" + _table(head, rows)]
+    return [_section("Scene by scene", "ablation", "Defaults (K = 1, 4.4 %).", _table(head, rows))]
 
 
 def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
