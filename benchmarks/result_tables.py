@@ -132,7 +132,12 @@ def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
             ahead = "-" if verdict.ahead is None else f"{verdict.ahead.mean:+.{d}f}"
             rows.append((f"{verdict.rival}, {label}", f"{verdict.quality:.{d}f}", ours, ahead, verdict.words))
         above = [row[0] for row in rows if row[3] != "-" and float(row[3]) < 0]
-        told = "No rival's mean lies above ours." if not above else f"Above ours on the mean: {'; '.join(above)}."
+        cheaper = sum(row[2] == "-" for row in rows)
+        told = f"Of {len(rows) - cheaper} points none lies above ours on the mean."
+        if above:
+            told = f"Above ours on the mean: {'; '.join(above)}."
+        if cheaper:
+            told += f" {cheaper} points are cheaper than anything of ours, so not compared."
         out.append(f"### {table.title}\n\n{told}\n\n" + _table(("rival", "rival", "ours", "ahead", "verdict"), rows))
     return ["## Is any rival above ours at equal cost?", *out] if out else []
 
