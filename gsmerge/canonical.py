@@ -89,7 +89,16 @@ def find_loose_frame(scene: LooseScene) -> Frame:
     return Frame(means.median(0).values, 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
 
 
+def scene_frame(scene: PixelScene | LooseScene) -> Frame:
+    """The canonical frame of a scene of either kind.
+
+    Raises:
+        ValueError: As :func:`find_frame` and :func:`find_loose_frame`.
+    """
+    return find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)
+
+
 def canonicalise(scene: Scene) -> tuple[Scene, Frame]:
     """The scene in its canonical frame, and the frame."""
-    frame = find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)
+    frame = scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gsmerge.canonical import find_frame, find_loose_frame
-from gsmerge.evaluate import INPUT, NEAR, EvaluateOptions, Evaluation, Views, evaluate
+from gsmerge.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate, near_plane
 from gsmerge.speed import Speed, measure_speeds, overdraw
 from gsmerge.types import Gaussians, LooseScene, PixelScene
 
@@ -105,12 +104,12 @@ def compare(
     Raises:
         ValueError: If a size is not positive, or as :func:`gsmerge.evaluate`.
     """
-    quality = evaluate(scene, results, targets, options)
-    near = NEAR * (find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)).unit
     own = max(scene.cameras.width, scene.cameras.height)
     sides = (own, 2 * own) if long_sides is None else long_sides
     if not sides or min(sides) < 1:
         raise ValueError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
+    quality = evaluate(scene, results, targets, options)
+    near = near_plane(scene)
     every = {INPUT: scene.file_gaussians, **results}
     threads = None if options is None else options.threads
     speeds = measure_speeds(every, scene.cameras, sides, near, threads=threads)

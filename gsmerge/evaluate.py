@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsmerge.canonical import find_frame, find_loose_frame
+from gsmerge.canonical import scene_frame
 from gsmerge.metrics import psnr, ssim
 from gsmerge.perceptual import lpips
 from gsmerge.render import render
@@ -175,7 +175,7 @@ def evaluate(
         raise ValueError("expected a scene with views, got none")
     own = scene.file_gaussians
     with use_threads(options.threads):
-        near = NEAR * (find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)).unit
+        near = near_plane(scene)
         points = context_points(scene, near)
         splits = _splits(scene, own, targets, options, near)
         judged = [(name, views, visible_pixels(points, views.cameras, near)) for name, views in splits.items()]
@@ -188,6 +188,15 @@ def evaluate(
     counts = {name: len(views.names) for name, views in splits.items()}
     reference = "photos" if scene.images is not None else "renders of the input"
     return Evaluation(tuple(out), reference, counts, _notes(judged))
+
+
+def near_plane(scene: PixelScene | LooseScene) -> float:
+    """Nearest depth that is drawn where a scene and its results are compared, world units.
+
+    Raises:
+        ValueError: If there is no valid Gaussian or no view.
+    """
+    return NEAR * scene_frame(scene).unit
 
 
 def _notes(judged: Sequence[tuple[str, Views, NDArray[np.bool_]]]) -> tuple[str, ...]:

@@ -47,6 +47,7 @@ def contact_sheet(
     *,
     most_views: int = 4,
     min_width: int = 320,
+    near: float = 0.01,
 ) -> Picture:
     """One row per view: the photo where there is one, then each scene from the same camera.
 
@@ -56,6 +57,7 @@ def contact_sheet(
         photos: ``[c,h,w,3]`` of the same cameras, or None.
         most_views: Rows at most, evenly spread over the cameras.
         min_width: Small renders are enlarged by a whole factor until a tile has this many columns.
+        near: Nearest depth that is drawn, world units.
 
     Returns:
         ``[h,w,3]`` 8 bit RGB. Every render is labelled with its number of Gaussians, and with its PSNR against
@@ -63,7 +65,7 @@ def contact_sheet(
     """
     ids = pick_views(len(cameras), most_views)
     factor = max(1, -(-min_width // cameras.width))
-    renders = [render(gaussians, cameras[ids]).images.clamp(0, 1) for _, gaussians in scenes]
+    renders = [render(gaussians, cameras[ids], near=near).images.clamp(0, 1) for _, gaussians in scenes]
     rows = []
     for row, view in enumerate(ids):
         tiles = [] if photos is None else [_tile(photos[view], f"photo, view {view}", factor)]

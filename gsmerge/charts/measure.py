@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from gsmerge.charts.store import picture_path
-from gsmerge.evaluate import EvaluateOptions, Views, evaluate
+from gsmerge.evaluate import EvaluateOptions, Views, evaluate, near_plane
 from gsmerge.io import SceneLoad, atomic_output, read_targets
 from gsmerge.preview import Picture, pick_views, to_picture
 from gsmerge.render import render
@@ -87,12 +87,12 @@ def measure(
     return scores
 
 
-def time_render(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Milliseconds that one view takes to render: the median over a few views."""
+def time_render(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
+    """Milliseconds that one view takes to render: the median over a few views; ``near`` in world units."""
     seconds = []
     for view in pick_views(len(cameras), MOST_TIMED):
         start = time.perf_counter()
-        render(gaussians, cameras[[view]])
+        render(gaussians, cameras[[view]], near=near)
         seconds.append(time.perf_counter() - start)
     return 1000 * float(np.median(seconds))
 
@@ -118,9 +118,9 @@ def keep_pictures(
         if targets is None
         else (targets.cameras, targets.images, targets.names)
     )
-    ids = pick_views(len(names), MOST_PICTURES)
+    ids, near = pick_views(len(names), MOST_PICTURES), near_plane(scene)
     for i, view in enumerate(ids):
-        image = render(gaussians, cameras[[view]]).images[0].clamp(0, 1)
+        image = render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
         _write(picture_path(folder, key, i, "render"), to_picture(image))
         if photos is None:
             continue

@@ -21,7 +21,7 @@ from gsmerge.charts.proxies import measure_proxies, read_proxies, wanted_proxies
 from gsmerge.charts.record import INPUT, RunRecord
 from gsmerge.charts.store import append_run, experiment_key, read_runs
 from gsmerge.errors import GsmergeError
-from gsmerge.evaluate import EvaluateOptions, Views
+from gsmerge.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.io import load_files
 from gsmerge.pipeline import compact
 from gsmerge.threads import available_threads, use_threads
@@ -262,6 +262,7 @@ def run_experiment(
     scores: dict[str, Any] = {**measure(scene, gaussians, targets, options.evaluation)}
     shown = scene.file_gaussians if gaussians is None else gaussians
     count = scene.num_gaussians if gaussians is None else len(gaussians)
+    seen_from = scene.cameras if targets is None else targets.cameras
     return replace(
         blank,
         views=len(scene),
@@ -271,7 +272,7 @@ def run_experiment(
         bytes=file_bytes(count, shown.sh_degree),
         seconds=sum(value for name, value in seconds.items() if name not in SCORING),
         stages=dict(seconds),
-        render_ms=time_render(shown, scene.cameras if targets is None else targets.cameras),
+        render_ms=time_render(shown, seen_from, near_plane(scene)),
         pictures=keep_pictures(folder, blank.key, blank.scene_sha256, shown, ready.scene, ready.targets),
         notes=notes,
         **scores,

@@ -149,13 +149,15 @@ def _write(
 ) -> None:
     from gsmerge.before_after import comparison_html, comparison_markdown
     from gsmerge.cli.pictures import png_bytes
+    from gsmerge.evaluate import near_plane
     from gsmerge.io import atomic_output
     from gsmerge.preview import contact_sheet
     from gsmerge.report import to_json
 
     if path.suffix == ".html":
         parts = [("before", scene.file_gaussians), *gaussians.items()]
-        text = comparison_html(document, png_bytes(contact_sheet(parts, scene.cameras, scene.images, most_views=2)))
+        sheet = contact_sheet(parts, scene.cameras, scene.images, most_views=2, near=near_plane(scene))
+        text = comparison_html(document, png_bytes(sheet))
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)
     with atomic_output(path, overwrite=overwrite) as temporary:

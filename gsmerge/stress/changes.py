@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.canonical import find_frame, find_loose_frame
+from gsmerge.canonical import scene_frame
 from gsmerge.evaluate import Views
 from gsmerge.sampling import even_views, subset
 from gsmerge.types import SH_C0, Cameras, Gaussians, LooseScene, PixelScene
@@ -56,7 +56,7 @@ def repeated(given: Judged) -> Judged:
 
 def moved(given: Judged, factor: float, shift: Sequence[float]) -> Judged:
     """The world scaled, and moved by so many units of its own size."""
-    offset = torch.tensor(shift, dtype=torch.float64) * _unit(given.scene) * factor
+    offset = torch.tensor(shift, dtype=torch.float64) * scene_frame(given.scene).unit * factor
     scene, judges = given.scene, given.judges
     means = factor * scene.gaussians.means.double() + offset
     gaussians = replace(scene.gaussians, means=means, scales=scene.gaussians.scales * factor)
@@ -64,10 +64,6 @@ def moved(given: Judged, factor: float, shift: Sequence[float]) -> Judged:
     if judges is not None:
         judges = replace(judges, cameras=_moved_cameras(judges.cameras, factor, offset))
     return Judged(scene, judges)
-
-
-def _unit(scene: PixelScene | LooseScene) -> float:
-    return (find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)).unit
 
 
 def _moved_cameras(cameras: Cameras, factor: float, offset: Tensor) -> Cameras:
