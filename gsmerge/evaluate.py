@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmerge.canonical import scene_frame
 from gsmerge.metrics import psnr, ssim
-from gsmerge.perceptual import lpips
+from gsmerge.perceptual import lpips, min_size
 from gsmerge.render import render
 from gsmerge.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
@@ -136,7 +136,8 @@ class Evaluation:
 
     Args:
         results: The scene itself first, as "input", if it was measured.
-        reference: "photos", or "renders of the input" where there are none.
+        reference: "photos"; "renders of the input" where there are none, "photos, and renders of the input in its own
+            views" where there are none of those alone.
         num_views: Views by split.
         notes: Things worth telling, one sentence each.
     """
@@ -181,13 +182,20 @@ def evaluate(
         judged = [(name, views, visible_pixels(points, views.cameras, near)) for name, views in splits.items()]
         out = []
         every = {INPUT: own, **results} if options.own else dict(results)
+        _image(own[:1], scene.cameras, 0, near)  # loads the kernels, which is no one's time
         for i, (name, gaussians) in enumerate(every.items()):
             out.append(_evaluated(name, gaussians, len(own), judged, options, near))
             if progress:
                 progress("evaluate", i + 1, len(every))
     counts = {name: len(views.names) for name, views in splits.items()}
-    reference = "photos" if scene.images is not None else "renders of the input"
-    return Evaluation(tuple(out), reference, counts, _notes(judged))
+    return Evaluation(tuple(out), _reference(scene, counts), counts, _notes(judged))
+
+
+def _reference(scene: PixelScene | LooseScene, splits: Mapping[str, int]) -> str:
+    """What results are compared with, in words."""
+    if scene.images is not None or "context" not in splits:
+        return "photos"
+    return "photos, and renders of the input in its own views" if "target" in splits else "renders of the input"
 
 
 def near_plane(scene: PixelScene | LooseScene) -> float:
@@ -261,7 +269,8 @@ def _score(
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
     found = Quality(psnr=psnr(image, photo, mask), ssim=_ssim(image, photo, mask))
-    return replace(found, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in nets})
+    large = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
+    return replace(found, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in large})
 
 
 def _ssim(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None) -> float | None:

@@ -120,6 +120,15 @@ def lpips_available(net: str = "vgg") -> bool:
     return _find_weights(net) is not None
 
 
+def min_size(net: str) -> int:
+    """Pixels per side of the smallest image that ``net`` can look at.
+
+    Raises:
+        ValueError: If ``net`` is unknown.
+    """
+    return _architecture(net).min_size
+
+
 def _architecture(net: str) -> _Architecture:
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")

@@ -16,7 +16,7 @@ from gsmerge.types import Cameras, Gaussians
 from gsmerge.weights import view_weights
 
 VIEWS, REPEATS = 3, 3  # that are drawn: evenly spread, each so many times
-_LEAST_REPEATED = 2.0  # seconds; what takes longer is drawn once
+_MOST_REPEATED = 2.0  # seconds; what takes longer is drawn once
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def measure_speeds(
         near: Nearest depth that is drawn, world units.
         threads: To draw with on the processor; None: all.
     """
-    few = cameras[sorted({int((i + 0.5) * len(cameras) / VIEWS) for i in range(VIEWS)})]
+    few = cameras[_some(len(cameras))]
     found: dict[str, list[Speed]] = {name: [] for name in scenes}
     with use_threads(threads) as used:
         for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
@@ -79,15 +79,19 @@ def measure_speeds(
     return {name: tuple(speeds) for name, speeds in found.items()}
 
 
+def _some(num_views: int) -> list[int]:
+    """The views that are drawn, evenly spread."""
+    return sorted({int((i + 0.5) * num_views / VIEWS) for i in range(VIEWS)})
+
+
 def _turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
     """Seconds per view of each scene, one after the other and again."""
     quickest = {name: np.full(len(views), np.inf) for name in scenes}
-    for name, gaussians in scenes.items():  # compiles, and fills caches
+    for gaussians in scenes.values():  # compiles, and fills caches
         _draw(gaussians, views[[0]], near)
-        quickest[name][:] = np.inf
     for turn in range(REPEATS):
         for name, gaussians in scenes.items():
-            if turn and quickest[name].max() > _LEAST_REPEATED:
+            if turn and quickest[name].max() > _MOST_REPEATED:
                 continue
             for view in range(len(views)):
                 quickest[name][view] = min(quickest[name][view], _draw(gaussians, views[[view]], near))
@@ -106,7 +110,7 @@ def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
     """Gaussians that are blended into a pixel, on average over some of the views: what drawing is made of."""
     splats, entries, pixels = prepare(gaussians), 0, 0
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
-    for view in sorted({int((i + 0.5) * len(cameras) / VIEWS) for i in range(VIEWS)}):
+    for view in _some(len(cameras)):
         plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
         entries += len(view_weights(plan).lanes)
         pixels += cameras.width * cameras.height

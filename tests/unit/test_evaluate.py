@@ -162,6 +162,21 @@ def test_pictures_too_small_for_ssim() -> None:
     assert score.full.psnr is not None
 
 
+def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = []
+    monkeypatch.setattr("gsmerge.evaluate.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
+    score = evaluate(scene, {}, None, EvaluateOptions()).results[0].scores[0]
+    assert (score.full.lpips_vgg, score.full.lpips_alex) == (0.5, None)
+    assert looked == ["vgg"]
+
+
+def test_what_results_are_compared_with(scene: PixelScene) -> None:
+    bare = replace(scene, images=None)
+    assert evaluate(bare, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
+    assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
+
+
 def test_means_leave_out_what_was_not_measured(found: Evaluation) -> None:
     full, masked = found.results[1].mean("target")
     scores = [s for s in found.results[1].scores if s.split == "target"]
