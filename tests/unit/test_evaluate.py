@@ -164,7 +164,7 @@ def test_pictures_too_small_for_ssim() -> None:
 
 def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
-    monkeypatch.setattr("gsmerge.evaluate.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
+    monkeypatch.setitem(evaluate.__globals__, "lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
     score = evaluate(scene, {}, None, EvaluateOptions()).results[0].scores[0]
     assert (score.full.lpips_vgg, score.full.lpips_alex) == (0.5, None)
