@@ -61,7 +61,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
     Raises:
         UsageError: If a scene is given twice.
     """
-    parts = [scene.absolute().with_suffix("").parts for scene in scenes]
+    parts = [(*scene.absolute().parent.parts, _stem(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0) + 1):
         names = ["/".join(part[-depth:]) for part in parts]
         if len(set(names)) == len(names):
@@ -71,13 +71,18 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
     raise UsageError("expected every scene once, got one twice")
 
 
+def _stem(scene: Path) -> str:
+    """Its name; of a file without the extension. Folders may have dots in theirs."""
+    return scene.stem if scene.suffix == ".ply" else scene.name
+
+
 def _filled(template: str | None, scene: Path) -> Path | None:
     if template is None:
         return None
     parent = scene if scene.is_dir() else scene.parent
     try:
-        return Path(template.format(scene=scene, parent=parent, stem=scene.stem))
-    except (KeyError, IndexError, ValueError) as error:
+        return Path(template.format(scene=scene, parent=parent, stem=_stem(scene)))
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise UsageError(f"expected {{scene}}, {{parent}} or {{stem}} in braces, got {template}") from error
 
 

@@ -11,8 +11,8 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes, stage_progress
-from gsmerge.cli.held_out import file_names, held_out_views, networks
-from gsmerge.cli.paths import check_output, input_files
+from gsmerge.cli.held_out import file_names, held_out_views, networks, require_views
+from gsmerge.cli.paths import check_outputs, input_files
 from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import UsageError
 
@@ -79,14 +79,12 @@ def evaluate(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     paths = results or []
-    inputs = (*input_files(files), *paths)
-    for path in (csv, report):
-        if path is not None:
-            check_output(path, inputs, overwrite=overwrite)
+    check_outputs((csv, report), (*input_files(files), *paths, targets, target_images), overwrite=overwrite)
     nets, missing = networks(lpips)
     with told_as_usage():
         options = EvaluateOptions(nets, lpips_views, context, threads=threads)
     load = load_files(files, opacity=opacity.value, reading=reading)
+    require_views(load)
     measured, held_out = held_out_views(load, targets, target_images, views)
     plys = {name: read_ply(path) for name, path in zip(file_names(paths), paths, strict=True)}
     notes = [*load.notes, *missing]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli.options import Lpips
 from gsmerge.cli.settings import told_as_usage
-from gsmerge.errors import UsageError
+from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.evaluate import Views
@@ -26,6 +26,17 @@ def networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
 
     nets = tuple(net for net in _NETS[Lpips.both] if lpips_available(net))
     return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
+
+
+def require_views(load: SceneLoad) -> None:
+    """Refuse a scene that there are no cameras of.
+
+    Raises:
+        SceneError: If it has no views.
+    """
+    if len(load.scene) == 0:
+        problem = "expected cameras to measure from, found none beside it"
+        raise SceneError(load.files.ply, problem, "name them with --cameras")
 
 
 def held_out_views(
@@ -57,6 +68,12 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """A short name for each file: its own where no two are alike, otherwise its path."""
+    """A short name for each file: its own where no two are alike, otherwise its path.
+
+    Raises:
+        UsageError: If a file is given twice.
+    """
+    if len(set(paths)) < len(paths):
+        raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]
     return short if len(set(short)) == len(short) else [str(path) for path in paths]

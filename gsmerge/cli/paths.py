@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,27 @@ def _is_photo(path: Path) -> bool:
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """What is read: Gaussians, cameras, photos."""
     return tuple(path for path in (files.ply, files.cameras, files.images) if path is not None)
+
+
+def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
+    """:func:`check_output` for several files, of which no two may be the same; None: not asked for.
+
+    Raises:
+        UsageError: If two are the same, or as :func:`check_output`.
+        SceneError: As :func:`check_output`.
+    """
+    from gsmerge.io.cameras.read import find_cameras
+
+    given = [path for path in inputs if path is not None]
+    inside = [found for path in given if path.is_dir() and (found := find_cameras(path)) is not None]
+    known, seen = (*given, *inside), set[str]()
+    for output in outputs:
+        if output is None:
+            continue
+        check_output(output, known, overwrite=overwrite)
+        if os.path.realpath(output) in seen:
+            raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
+        seen.add(os.path.realpath(output))
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:

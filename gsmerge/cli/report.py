@@ -12,7 +12,7 @@ import typer
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say, say_notes
 from gsmerge.cli.held_out import file_names, held_out_views, networks
-from gsmerge.cli.paths import check_output, input_files
+from gsmerge.cli.paths import check_outputs, input_files
 from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import SceneError, UsageError
 
@@ -89,7 +89,8 @@ def report(
     for path in output or []:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
-        check_output(path, (*input_files(files), *after, *(compact_report or [])), overwrite=overwrite)
+    inputs = (*input_files(files), *after, *(compact_report or []), targets, target_images)
+    check_outputs(output or [], inputs, overwrite=overwrite)
     seconds = _merge_seconds(after, merge_seconds, compact_report)
     nets, missing = networks(lpips)
     load = load_files(files, opacity=opacity.value, reading=reading)

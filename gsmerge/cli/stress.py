@@ -10,8 +10,8 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
-from gsmerge.cli.held_out import held_out_views
-from gsmerge.cli.paths import check_output, input_files
+from gsmerge.cli.held_out import held_out_views, require_views
+from gsmerge.cli.paths import check_outputs, input_files
 from gsmerge.cli.settings import reading_of, settings_of, told_as_usage
 
 if TYPE_CHECKING:
@@ -54,11 +54,11 @@ def stress(
     from gsmerge.stress import stress as stress_scene
 
     files = find_scene_files(scene, cameras=cameras, images=images)
-    if report is not None:
-        check_output(report, input_files(files), overwrite=overwrite)
+    check_outputs([report], (*input_files(files), targets, target_images), overwrite=overwrite)
     chosen = {"effort": effort, "k": k, "density": density, "budget": budget, "fit": fit, "fit_steps": fit_steps}
     settings = settings_of({**chosen, "seed": seed, "threads": threads})
     load = load_files(files, opacity=opacity.value, reading=reading)
+    require_views(load)
     _, held_out = held_out_views(load, targets, target_images, None)
     say_notes(load.notes, quiet=quiet or json)
     names = None if cases is None else [name.strip() for name in cases.split(",")]

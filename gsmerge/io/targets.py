@@ -88,7 +88,7 @@ def read_targets(
         as_tensor(photos),
         chosen.names,
         tuple(places),
-        tuple(inverse[view] for view in range(len(load.scene))) if len(inverse) == len(load.scene) else None,
+        tuple(inverse[view] for view in range(len(load.scene))) if 0 < len(inverse) == len(load.scene) else None,
     )
 
 
@@ -169,6 +169,8 @@ def _spread(viewmats: np.ndarray) -> float:
 
 def _repeated(moved: np.ndarray, cameras: Cameras) -> dict[int, int]:
     """Views that stand where one of the scene's does and look the same way, and which one that is."""
+    if len(cameras) == 0:
+        return {}
     ours = cameras.viewmats.double().numpy()
     limit = _SAME_POSE * _spread(ours)
     near = np.linalg.norm(_centres(moved)[:, None] - _centres(ours), axis=2) <= limit

@@ -72,6 +72,33 @@ def test_a_trajectory_with_both_kinds_of_views(scene_copy: Path, run: Run) -> No
     assert [Path(name).stem for name in held] == [Path(frames[i]["file_path"]).stem for i in (1, 5)]
 
 
+@pytest.mark.parametrize("given", ["targets", "targets/transforms.json"])
+def test_no_input_is_replaced(given: str, scene_copy: Path, run: Run) -> None:
+    cameras = scene_copy / "targets" / "transforms.json"
+    before = cameras.read_bytes()
+    for flags in (("evaluate", scene_copy), ("stress", scene_copy), ("report", scene_copy, scene_copy / "scene.ply")):
+        flag = "-o" if flags[0] == "report" else "--report"
+        path = cameras.with_suffix(".json")
+        outcome = run(*flags, "--targets", scene_copy / given, flag, path, "--overwrite")
+        assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+        assert "other than the input" in outcome.err
+    assert cameras.read_bytes() == before
+
+
+def test_outputs_are_files_of_their_own(scene_copy: Path, run: Run) -> None:
+    both = ("--csv", scene_copy / "a", "--report", scene_copy / "a")
+    assert "got it twice" in run("evaluate", scene_copy, "--lpips", "none", *both).err
+    assert "got scene.ply twice" in run("evaluate", scene_copy, "scene.ply", "scene.ply").err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "stress"])
+def test_a_scene_without_cameras(command: str, scene_copy: Path, run: Run) -> None:
+    (scene_copy / "transforms.json").unlink()
+    outcome = run(command, scene_copy / "scene.ply", "--order", "none", "--targets", scene_copy / "targets")
+    assert outcome.code == 3
+    assert "scene.ply: expected cameras to measure from" in outcome.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

@@ -17,6 +17,7 @@ def test_names_are_as_short_as_can_be() -> None:
     assert scene_names([Path("a/room"), Path("b/fern.ply")]) == ["room", "fern"]
     assert scene_names([Path("a/scene.ply"), Path("b/scene.ply")]) == ["a/scene", "b/scene"]
     assert scene_names([]) == []
+    assert scene_names([Path("room.1"), Path("room.2")]) == ["room.1", "room.2"]
     with pytest.raises(UsageError, match="every scene once"):
         scene_names([Path("a"), Path("./a")])
 
@@ -38,8 +39,9 @@ def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
     assert find_places([scene_copy])[0].num_views is None
     with pytest.raises(SceneError, match="expected cameras of held-out views"):
         find_places([scene_copy], "{scene}/nothing.json")
-    with pytest.raises(UsageError, match="in braces"):
-        find_places([scene_copy], "{}/targets")
+    for template in ("{}/targets", "{scene.foo}/targets", "{stem[foo]}", "{"):
+        with pytest.raises(UsageError, match="in braces"):
+            find_places([scene_copy], template)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from tiny_scene import FLIP, Tiny, make_tiny, rotation
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, read_targets
 from gsmerge.io.targets import similarity
+from gsmerge.types import LooseScene
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +114,13 @@ def test_no_such_file(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
     with pytest.raises(SceneError, match="expected cameras of held-out views"):
         read_targets(load, tmp_path / "transforms.json")
+
+
+def test_targets_of_a_scene_without_views(tiny: Tiny, tmp_path: Path) -> None:
+    load = load_scene(tiny.save(tmp_path / "scene"))
+    bare = replace(load, scene=LooseScene(load.scene.gaussians, load.scene.cameras[[]], None, ()))
+    targets = read_targets(bare, write_views(tmp_path / "held", {"q": between(tiny)}, tiny))
+    assert (len(targets), targets.context_places) == (1, None)
 
 
 def test_similarity_of_one_place_keeps_the_scale(tiny: Tiny) -> None:
