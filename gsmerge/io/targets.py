@@ -15,7 +15,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes, photo_size
 from gsmerge.io.images import as_tensor
-from gsmerge.io.poses import with_poses
+from gsmerge.io.poses import reread, with_poses
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.io.views import stored_photos
@@ -55,7 +55,8 @@ def read_targets(
     """Read held-out photos and their cameras.
 
     Views that the scene was made of are left out. Where the file has those too, under the same names, their poses tell
-    how its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras.
+    how its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras. Poses
+    that the scene's cameras have in another convention than their format are read in that one here, too.
 
     Args:
         load: The scene, with what was found on reading it.
@@ -68,8 +69,9 @@ def read_targets(
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    read = read_cameras(path)
-    world, shared = _world(read, _shared_views(read, load.scene.names), load)
+    read = read_cameras(path, scene=load.files.ply.stem)
+    tried = [(one, *_world(one, _shared_views(one, load.scene.names), load)) for one in _readings(read, load)]
+    read, world, shared = next((found for found in tried if found[2]), tried[0])
     moved = world.move_cameras(read.viewmats.numpy())
     shared |= _repeated(moved, load.scene.cameras)
     places = [i for i in range(len(read)) if i not in shared]
@@ -90,6 +92,14 @@ def read_targets(
         tuple(places),
         tuple(inverse[view] for view in range(len(load.scene))) if 0 < len(inverse) == len(load.scene) else None,
     )
+
+
+def _readings(read: CameraFile, load: SceneLoad) -> list[CameraFile]:
+    """The file as it may be meant, the likeliest first: as the scene's cameras of the same format had to be read."""
+    own = load.cameras
+    if own is None or own.source != read.source or own.convention == read.convention:
+        return [read]
+    return [reread(read, own.convention), read]
 
 
 def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | None) -> Path | None:

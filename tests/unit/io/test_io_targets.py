@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from tiny_scene import FLIP, Tiny, make_tiny, rotation
+from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, read_targets
@@ -82,6 +83,32 @@ def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, tmp_path: Path) -> 
     assert len(targets) == 1
     assert targets.context_places is None
     assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0].numpy()), between(tiny), atol=1e-9)
+
+
+@pytest.mark.parametrize("all_views", [False, True])
+def test_poses_in_the_convention_that_the_scene_s_own_are_in(all_views: bool, tiny: Tiny, tmp_path: Path) -> None:
+    folder = tiny.save(tmp_path / "scene")
+    flip_poses(folder / "transforms.json")
+    load = load_scene(folder)
+    assert any("OpenCV axes" in note for note in load.notes)
+    views = dict(zip(stems(tiny), tiny.c2w, strict=True)) if all_views else {}
+    path = write_views(tmp_path / "all", views | {"held": between(tiny)}, tiny)
+    if all_views:  # by the book, and the shared views say so
+        assert_between(read_targets(load, path).cameras.viewmats[0], tiny)
+    flip_poses(path)
+    assert_between(read_targets(load, path).cameras.viewmats[0], tiny)
+
+
+def flip_poses(path: Path) -> None:
+    """Write poses with OpenCV axes in place of the format's."""
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
+    path.write_text(json.dumps(document))
+
+
+def assert_between(viewmat: Tensor, tiny: Tiny) -> None:
+    assert np.allclose(np.linalg.inv(viewmat.numpy()), between(tiny), atol=1e-6)
 
 
 def test_views_of_other_names_that_stand_in_the_same_place_are_no_targets(tiny: Tiny, tmp_path: Path) -> None:
