@@ -32,6 +32,7 @@ def pick_views(num_views: int, most: int) -> list[int]:
 
 def label(picture: Picture, text: str) -> Picture:
     """The picture under a dark band with a line of text, shortened until it fits."""
+    text = text.encode("utf-8", "replace").decode()  # OpenCV does not survive halves of characters
     face, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42
     while len(text) > 1 and cv2.getTextSize(text, face, scale, 1)[0][0] > picture.shape[1] - 8:
         text = text[:-1]

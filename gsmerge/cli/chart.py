@@ -282,7 +282,7 @@ def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     command = shlex.join(["gsmerge", "chart", "--draw-only", "--out", str(out)])
     page = make_page(records, figures, drawings, verdicts, out, command=command)
     with atomic_output(out / PAGE, overwrite=True) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="replace")
     return {
         **document_head(),
         "output": str(out),

@@ -133,7 +133,7 @@ def _tell(
     for path, text in ((report, to_json(document)), (csv, evaluation_csv(document))):
         if path is not None:
             with atomic_output(path, overwrite=overwrite) as temporary:
-                temporary.write_text(text)
+                temporary.write_text(text, encoding="utf-8", errors="replace")
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, say, say_notes
+from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
 from gsmerge.cli.held_out import file_names, held_out_views, networks
 from gsmerge.cli.paths import check_outputs, input_files
 from gsmerge.cli.settings import reading_of, told_as_usage
@@ -162,7 +162,7 @@ def _write(
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)
     with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 def _tell(document: Mapping[str, Any], notes: Sequence[str], *, written: bool, as_json: bool, quiet: bool) -> None:
@@ -172,7 +172,7 @@ def _tell(document: Mapping[str, Any], notes: Sequence[str], *, written: bool, a
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet and not written:
-        sys.stdout.write(comparison_markdown(document))
+        print("\n".join(map(one_line, comparison_markdown(document).rstrip().split("\n"))))
     if not (quiet or as_json):
         for note in notes if written else ():
             say(f"note: {note}")

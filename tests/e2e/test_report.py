@@ -56,6 +56,19 @@ def test_a_scene_without_cameras(scene_copy: Path, small: Path, run: Run) -> Non
     assert any("placed" in note for note in document["notes"])
 
 
+def test_names_that_are_no_text(scene_copy: Path, small: Path, run: Run) -> None:
+    odd = small.rename(scene_copy / "odd\udcff\x1b[31m.ply")
+    outputs = [scene_copy / f"report{suffix}" for suffix in (".md", ".html", ".json")]
+    flags = ("--lpips", "none", "--sizes", "32")
+    outcome = run("report", scene_copy, odd, *flags, *(part for path in outputs for part in ("-o", path)))
+    assert outcome.code == 0, outcome.err
+    assert all("odd" in path.read_text(encoding="utf-8") for path in outputs)
+    outcome = run("report", scene_copy, odd, *flags)
+    assert outcome.code == 0, outcome.err
+    assert r"odd\udcff\x1b[31m.ply" in outcome.out
+    assert run("evaluate", scene_copy, odd, "--lpips", "none", "--csv", scene_copy / "a.csv").code == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
