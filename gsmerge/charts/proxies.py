@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -112,6 +113,9 @@ def read_proxies(folder: Path) -> tuple[dict[str, Proxy], Sequence[str]]:
 
 def _proxy(value: Mapping[str, Any]) -> Proxy | None:
     try:
-        return Proxy(**value)
+        made = Proxy(**value)
     except TypeError:
         return None
+    texts = all(isinstance(text, str) for text in (made.key, made.scene, made.segmentation))
+    numbers = (made.superpixels, made.share, made.views, made.psnr)
+    return made if texts and all(isinstance(n, int | float) and math.isfinite(n) for n in numbers) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
@@ -12,6 +13,25 @@ METRICS = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 SPLITS = ("context", "target")
 SCORES = tuple(f"{metric}_{split}{part}" for metric in METRICS for split in SPLITS for part in ("", "_visible"))
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "lpips_alex": False}
+
+
+_TEXTS = ("key", "scene", "scene_sha256", "method", "command")
+_TABLES = {"settings": (str, int, float, bool), "environment": (str,), "stages": (int, float)}  # and their values
+_LISTS = ("pictures", "notes")
+
+
+def _fits(name: str, value: object) -> bool:
+    """Whether a value read from JSON is of the kind that a field has."""
+    if name in _TEXTS:
+        return isinstance(value, str)
+    if name in _TABLES:
+        return isinstance(value, Mapping) and all(isinstance(inner, _TABLES[name]) for inner in value.values())
+    if name in _LISTS:
+        return isinstance(value, list | tuple) and all(isinstance(inner, str) for inner in value)
+    if name == "error":
+        return value is None or isinstance(value, str)
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return value is None or number
 
 
 @dataclass(frozen=True)
@@ -98,12 +118,15 @@ class RunRecord:
         """The record that :meth:`to_dict` gave, through JSON.
 
         Raises:
-            ValueError: If it is of another schema version or a field is missing.
+            ValueError: If it is of another schema version, or a field is missing or of another kind.
         """
         version = values.get("schema_version")
         if version != SCHEMA_VERSION:
             raise ValueError(f"expected a run record of schema version {SCHEMA_VERSION}, got {version!r}")
         known = {f.name: values[f.name] for f in fields(RunRecord) if f.name in values}
+        odd = next((name for name, value in known.items() if not _fits(name, value)), None)
+        if odd is not None:
+            raise ValueError(f"expected a run record, got one with another {odd}")
         for name in ("pictures", "notes"):
             known[name] = tuple(known.get(name, ()))
         try:

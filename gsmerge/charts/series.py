@@ -92,6 +92,33 @@ def _word(name: str, value: Any) -> str:
     return f"K = {value}" if name == "k" else str(value) if name == "segmentation" else f"{name} {value}"
 
 
+def newest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
+    """One record for each scene, method, settings and number of views, so that no scene counts twice in a mean.
+
+    A folder has several where the files of a scene changed, other scenes of the same name were run by another command,
+    or LPIPS or seed were set differently: the last one stays.
+
+    Args:
+        records: In the order in which they were made.
+
+    Returns:
+        Those that stay, and a note for each name of scenes that others were left out of.
+    """
+    content = {record.scene: record.scene_sha256 for record in records}
+    foreign: dict[str, int] = {}
+    found: dict[tuple[str, LineKey, str, int | None], RunRecord] = {}
+    for record in records:
+        if record.scene_sha256 != content[record.scene]:
+            foreign[record.scene] = foreign.get(record.scene, 0) + 1
+            continue
+        found[record.scene, line_key(record), size_label(record), record.views_asked] = record
+    notes = [
+        f"{name}: {count} run(s) left out, which read other files or held-out views than the last one of that name"
+        for name, count in foreign.items()
+    ]
+    return list(found.values()), notes
+
+
 def usable(records: Sequence[RunRecord]) -> list[RunRecord]:
     """Those that did not fail."""
     return [record for record in records if record.error is None]

@@ -101,7 +101,7 @@ def chart(
     given = scenes or []
     _check_usage(given, out, draw_only=draw_only, dry_run=dry_run)
     if draw_only:
-        _tell(_drawn(out, [], 0), as_json=json, quiet=quiet)
+        _tell(_drawn(out, [], 0), 0, as_json=json, quiet=quiet)
         return
     from gsmerge.charts.run import RunOptions
 
@@ -121,7 +121,7 @@ def chart(
     say_notes(notes, quiet=quiet or json)
     done, more = _run(plan, out, told, quiet=quiet or json)
     say_notes(more, quiet=quiet or json)
-    _tell(_drawn(out, [*notes, *more], len(done)), as_json=json, quiet=quiet)
+    _tell(_drawn(out, [*notes, *more], len(done)), len(notes) + len(more), as_json=json, quiet=quiet)
     failed = [record for record in done if record.error is not None]
     if failed:
         raise BatchError(f"{len(failed)} of {len(done)} runs failed; the first: {failed[0].scene}: {failed[0].error}")
@@ -268,6 +268,7 @@ def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     from gsmerge.charts.figures import make_figures, make_verdicts
     from gsmerge.charts.page import make_page
     from gsmerge.charts.proxies import read_proxies
+    from gsmerge.charts.series import newest
     from gsmerge.charts.store import CHARTS, PAGE, read_runs
     from gsmerge.io import atomic_output
     from gsmerge.report import document_head
@@ -276,7 +277,7 @@ def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     proxies, more = read_proxies(out)
     if not stored:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
-    records = list(stored.values())
+    records, passed = newest(list(stored.values()))
     figures, verdicts = make_figures(records, list(proxies.values())), make_verdicts(records)
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "chart", "--draw-only", "--out", str(out)])
@@ -292,12 +293,15 @@ def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
         "num_done": num_done,
         "num_failed": sum(record.error is not None for record in records),
         "runs": [record.to_dict() for record in records],
-        "notes": [*notes, *(note for note in (*told, *more) if note not in notes)],
+        "notes": [*notes, *(note for note in (*told, *more, *passed) if note not in notes)],
     }
 
 
-def _tell(document: dict[str, Any], *, as_json: bool, quiet: bool) -> None:
+def _tell(document: dict[str, Any], num_said: int, *, as_json: bool, quiet: bool) -> None:
+    """What was drawn, and the notes but for the first ones, which were said before."""
     from gsmerge.report import to_json
+
+    say_notes(document["notes"][num_said:], quiet=quiet or as_json)
 
     if as_json:
         sys.stdout.write(to_json(document))

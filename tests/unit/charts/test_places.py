@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,21 @@ def test_estimates_grow_with_the_work(made_scene: Path) -> None:
     usual = estimate(place)
     assert estimate(place, settings={"fit": "none"}) < usual < estimate(place, settings={"effort": "best"})
     assert estimate(place, views=2) < usual < estimate(place, lpips=("vgg",))
+
+
+def test_proxies_of_other_kinds_of_values_are_passed_over(tmp_path: Path) -> None:
+    good = {
+        "key": "a",
+        "scene": "room",
+        "segmentation": "slic",
+        "superpixels": 9,
+        "share": 0.1,
+        "views": 1,
+        "psnr": 20.0,
+    }
+    lines = [good, good | {"key": "b", "psnr": "20"}, good | {"key": "c", "scene": None}, {"key": "d"}]
+    (tmp_path / "proxies.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert list(read_proxies(tmp_path)[0]) == ["a"]
 
 
 def test_proxies_fill_superpixels_with_their_means(made_scene: Path, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from gsmerge.charts.series import (
     line_key,
     line_names,
     metrics_of,
+    newest,
     score_of,
     size_label,
     usual_size,
@@ -36,6 +37,18 @@ def test_lines_are_methods_with_their_settings() -> None:
     assert point.y.mean == pytest.approx(np.mean([26, 24.01, 21.02]))
     assert point.y.count == 3
     assert point.y.high - point.y.low < 0.2  # the scenes' own level, 5 dB apart, is taken off
+
+
+def test_no_scene_counts_twice() -> None:
+    first, other = make_record("fern", "gsmerge", {"k": 2}), make_record("fox", "gsmerge", {"k": 2})
+    again = replace(first, key="another seed", psnr_target_visible=20.0)
+    few = replace(first, key="few", views_asked=3)
+    assert newest([first, other, again, few]) == ([again, other, few], [])
+    changed = replace(first, key="changed", scene_sha256="ff" * 32)
+    records, notes = newest([first, few, other, changed])
+    assert records == [other, changed]
+    assert len(notes) == 1
+    assert notes[0].startswith("fern: 2 run(s) left out")
 
 
 def test_names_tell_only_what_differs() -> None:

@@ -82,6 +82,21 @@ def test_lines_of_another_version_are_passed_over(tmp_path: Path) -> None:
     assert "2 line(s) of another version" in notes[0]
 
 
+@pytest.mark.parametrize(
+    "odd",
+    [{"pictures": None}, {"settings": "k"}, {"stages": {"fit": "long"}}, {"ratio": "4%"}, {"count": True},
+     {"scene": 3}, {"notes": [1]}, {"psnr_target": float("inf")}],
+    ids=str,
+)  # fmt: skip
+def test_lines_of_other_kinds_of_values_are_passed_over(odd: dict[str, object], tmp_path: Path) -> None:
+    append_run(tmp_path, record("1", psnr_target=20.5, stages={"fit": 2}))
+    with (tmp_path / RUNS).open("a") as file:
+        file.write(json.dumps(record("2").to_dict() | odd) + "\n")
+    found, notes = read_runs(tmp_path)
+    assert list(found) == ["1"]
+    assert "1 line(s) of another version" in notes[0]
+
+
 def test_long_lines_are_cut_back_to_the_right_place(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     append_line(path, {"a": 1})
