@@ -108,7 +108,9 @@ def _speed_rows(every: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
             threads = f", {speed['threads']} threads" if speed["threads"] else ""
             faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
             frames = speed.get("break_even_frames")
-            earned = "" if frames is None else f"{frames:,.0f} frames ({side['merge_seconds']:.1f} s of merging)"
+            merge, earned = side.get("merge_seconds"), ""
+            if merge is not None:
+                earned = "never" if frames is None else f"{frames:,.0f} frames ({merge:.1f} s of merging)"
             size = f"{speed['width']} x {speed['height']}"
             yield side["name"], speed["device"] + threads, size, f"{1000 * speed['seconds']:.1f}", faster, earned
 

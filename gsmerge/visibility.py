@@ -12,6 +12,7 @@ from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
+_ROWS = 1 << 18  # points at a time: all of them, in every thread, would not fit
 _DILATION = 3  # pixels per side of the square that every sample marks
 
 
@@ -55,12 +56,14 @@ def visible_pixels(points: Points, cameras: Cameras, near: float) -> NDArray[np.
     size = np.array([cameras.width, cameras.height])
 
     def one_view(view: int) -> NDArray[np.bool_]:
-        image = (points @ viewmats[view, :3, :3].T + viewmats[view, :3, 3]) @ Ks[view].T
-        image = image[image[:, 2] > near]
-        pixels = np.floor(image[:, :2] / image[:, 2:])
-        pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
-        hit[pixels[:, 1], pixels[:, 0]] = 1
+        for first in range(0, len(points), _ROWS):
+            some = points[first : first + _ROWS]
+            image = (some @ viewmats[view, :3, :3].T + viewmats[view, :3, 3]) @ Ks[view].T
+            image = image[image[:, 2] > near]
+            pixels = np.floor(image[:, :2] / image[:, 2:])
+            pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
+            hit[pixels[:, 1], pixels[:, 0]] = 1
         return cv2.dilate(hit, np.ones((_DILATION, _DILATION), np.uint8)) > 0
 
     return np.stack(parallel_map(one_view, range(len(cameras))))

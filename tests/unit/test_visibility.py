@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import scenes
 
+from gsmerge import visibility
 from gsmerge.sampling import subset
 from gsmerge.types import Cameras, LooseScene
 from gsmerge.visibility import context_points, visible_pixels
@@ -24,7 +26,9 @@ def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
     return mask
 
 
-def test_mask_is_that_of_the_slow_loop() -> None:
+@pytest.mark.parametrize("rows", [100, 1 << 18])
+def test_mask_is_that_of_the_slow_loop(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(visibility, "_ROWS", rows)
     scene = scenes.make_scene(scenes.two_planes(), scenes.arc(2, 24, 18))
     held_out = scenes.arc(3, 24, 18, span=3.0)
     points = context_points(scene, 0.01)

@@ -92,9 +92,14 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
         raise SceneError(path, f"expected cameras [v,{_COLUMNS}], found {shape}")
     if not 0 < len(cameras) <= MAX_VIEWS:
         raise SceneError(path, f"expected 1 to {MAX_VIEWS} cameras, found {len(cameras)}")
-    if not cameras.is_floating_point() or cameras.layout != torch.strided:
+    if not (cameras.is_floating_point() and _has_values(cameras)):
         raise SceneError(path, f"expected cameras of numbers, found {cameras.dtype}")
-    return cameras.double().numpy()
+    return cameras.detach().double().numpy()
+
+
+def _has_values(tensor: torch.Tensor) -> bool:
+    """Whether its numbers are there, one after the other: a chunk may hold tensors of other kinds."""
+    return tensor.layout == torch.strided and tensor.device.type == "cpu"
 
 
 def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
@@ -107,6 +112,6 @@ def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
     limit = path.stat().st_size
     for image in images:
         plain = isinstance(image, torch.Tensor) and image.ndim == 1 and image.dtype == torch.uint8
-        if not plain or image.layout != torch.strided or image.numel() > limit or not image.is_contiguous():
+        if not plain or not _has_values(image) or image.numel() > limit or not image.is_contiguous():
             raise SceneError(path, "expected images as tensors [bytes] of uint8, found others")
     return decode_photos(path, names, [image.numpy() for image in images], _MAX_PHOTOS)

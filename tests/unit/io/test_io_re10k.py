@@ -176,6 +176,20 @@ def test_wrong_shapes(tmp_path: Path, change: dict[str, Any], message: str) -> N
         read_cameras(path)
 
 
+def test_tensors_that_want_gradients_or_have_no_numbers(tmp_path: Path) -> None:
+    given = entry(SMOOTH, "a")
+    wanted = read_cameras(save(tmp_path, given)).viewmats
+    assert torch.equal(
+        read_cameras(save(tmp_path, given | {"cameras": rows_of(SMOOTH).requires_grad_()})).viewmats, wanted
+    )
+    empty = torch.empty(len(SMOOTH.names), 18, device="meta")
+    with pytest.raises(SceneError, match="expected cameras of numbers"):
+        read_cameras(save(tmp_path, given | {"cameras": empty}))
+    images = [torch.empty(9, dtype=torch.uint8, device="meta") for _ in SMOOTH.names]
+    with pytest.raises(SceneError, match="expected images as tensors"):
+        read_cameras(save(tmp_path, given | {"images": images}))
+
+
 def test_what_is_no_list_of_scenes(tmp_path: Path) -> None:
     for data in ([], [1, 2], {"a": 1}, 5, torch.zeros(3), [entry(SMOOTH, "a"), {"key": "b"}]):
         torch.save(data, tmp_path / "a.torch")
