@@ -185,14 +185,25 @@ def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | Non
 
 
 def _usual(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
-    """Runs of the usual size and number of views by the name of their line, ours first."""
+    """Runs of the usual size and number of views by the name of their line, ours first, all over the same scenes."""
     size, views = usual_size(records), usual_views(records)
     chosen = [r for r in records if stands_for_all(r, size) and r.views_asked == views]
     names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
     found: dict[str, list[RunRecord]] = {}
     for record in sorted(chosen, key=lambda r: (r.method != OURS, len(line_key(r)[1]))):
         found.setdefault(names[line_key(record)], []).append(record)
-    return found
+    return _over_common(found)
+
+
+def _over_common(rows: dict[str, list[RunRecord]]) -> dict[str, list[RunRecord]]:
+    """Rows that have at least half of the scenes, over those that all of these have; as they are where none is left."""
+    scenes = {name: {record.scene for record in group} for name, group in rows.items()}
+    least = 0.5 * len(set().union(*scenes.values()))
+    kept = {name: own for name, own in scenes.items() if len(own) >= least}
+    common = set.intersection(*kept.values()) if kept else set()
+    if not common:
+        return rows
+    return {name: [record for record in rows[name] if record.scene in common] for name in kept}
 
 
 def _size_words(records: Sequence[RunRecord]) -> str:

@@ -161,7 +161,7 @@ def judge(
         higher: Whether higher quality is better.
 
     Returns:
-        A side is only named where zero lies outside the interval of the difference, or there is one scene alone.
+        A side is only named where zero lies outside the interval of the difference, or the rival has one scene alone.
 
     Raises:
         ValueError: If the rival has no point.
@@ -180,5 +180,7 @@ def judge(
     theirs = {scene: sign * points[scene][1] for scene in read}
     ahead = paired_difference(read, theirs)
     words = "ours above" if ahead.low > 0 else "rival above" if ahead.high < 0 else "undecided"
+    if len(read) == 1 < len(points):  # one scene of several says nothing about the others
+        words = "undecided"
     mean_ours = sign * float(np.mean(list(read.values())))
     return Verdict(rival, mean_cost, sign * float(np.mean(list(theirs.values()))), mean_ours, ahead, words)

@@ -130,6 +130,18 @@ def test_all_figures() -> None:
     assert [line.name for line in counts.panels[0].lines] == ["gsmerge", "input"]  # all others meet the same budget
 
 
+def test_bars_and_break_even_are_over_the_same_scenes() -> None:
+    records = [r for r in make_grid() if not (r.scene == "fox" and r.method == "voxel")]
+    records = [r for r in records if not (r.scene != "fern" and r.method == "random")]
+    slow = [replace(r, seconds=100.0, stages={"fit": 100.0}) if r.scene == "fox" and r.seconds else r for r in records]
+    stages, payback = (f for f in make_figures(slow) if isinstance(f, Bars | Payback))
+    assert isinstance(stages, Bars)
+    assert isinstance(payback, Payback)
+    assert stages.rows == tuple(name for name, *_ in payback.rows) == ("gsmerge", "gsmerge, no fit", "voxel")
+    assert stages.stages["fit"][0] == pytest.approx(4.8)
+    assert payback.rows[0][1] == pytest.approx(6)
+
+
 def test_figures_need_their_data() -> None:
     assert make_figures([]) == []
     failed = [replace(r, error="out of memory") for r in make_grid()]
