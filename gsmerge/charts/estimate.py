@@ -5,11 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import median
 
-from gsmerge.charts.experiment import Experiment
+from gsmerge.charts.experiment import OURS, Experiment
 from gsmerge.charts.places import Place
 from gsmerge.charts.record import INPUT, RunRecord
 from gsmerge.fit.options import STEPS
-from gsmerge.report import COST_COLOR_FIT, COST_FULL_FIT, COST_MERGE, COST_READ, COST_ROBUST, COST_SCORE, COST_SEGMENT
+from gsmerge.report import (
+    COST_COLOR_FIT,
+    COST_FULL_FIT,
+    COST_MERGE,
+    COST_READ,
+    COST_RIVAL,
+    COST_RIVAL_STEP,
+    COST_RIVALS,
+    COST_ROBUST,
+    COST_SCORE,
+    COST_SEGMENT,
+)
 
 BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
 COST_EVALUATE = 2.5  # scoring input and result: seconds per million pixels of all views
@@ -22,6 +33,7 @@ def estimate_seconds(
     *,
     threads: int,
     lpips: Sequence[str] = (),
+    lpips_views: int | None = None,
 ) -> float:
     """Wall time of runs, within a factor of about two; of merges that the folder has times of, those count.
 
@@ -30,6 +42,7 @@ def estimate_seconds(
         stored: Finished runs by key, from which times are taken.
         threads: Threads that would run.
         lpips: Networks of the perceptual distance.
+        lpips_views: Views of each split that get it; None: all.
     """
     known: dict[tuple[str, str], list[float]] = {}
     for record in stored.values():
@@ -40,7 +53,8 @@ def estimate_seconds(
         pixels = place.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6
         views = place.num_views or 1
         share = min(1.0, (experiment.views or views) / views)
-        total += share * pixels * (COST_EVALUATE + COST_LPIPS * len(lpips)) / threads
+        looked_at = min(1.0, (lpips_views or views) / max(share * views, 1.0))
+        total += share * pixels * (COST_EVALUATE + looked_at * COST_LPIPS * len(lpips)) / threads
         times = known.get((place.name, experiment.method))
         total += share * median(times) if times else _merge_seconds(experiment, share * pixels, views * share, threads)
     places = {place.path: place for _, _, place in runs}
@@ -52,10 +66,20 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     if experiment.method == INPUT:
         return 0.0
     settings = experiment.settings
+    if experiment.method != OURS:
+        return _rival_seconds(experiment.method, STEPS[settings.get("effort", "default")], pixels, views, threads)
     work = pixels * (COST_MERGE + COST_SCORE + COST_SEGMENT[settings.get("segmentation", "rdseg")])
     fit = settings.get("fit", "full")
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
     else:
         work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
+    return work / threads
+
+
+def _rival_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
+    """The same of another method than ours."""
+    work = pixels * (COST_RIVALS.get(method, COST_RIVAL) + COST_SCORE + COST_COLOR_FIT * (method == "unmerged-color"))
+    if method == "unmerged-fit":
+        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_RIVAL_STEP)
     return work / threads

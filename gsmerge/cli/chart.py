@@ -231,7 +231,8 @@ def _print_plan(
 
     runs = [run for run in plan.runs if run[0] in plan.pending]
     threads = options.threads or available_threads()
-    seconds = estimate_seconds(runs, stored, threads=threads, lpips=options.lpips)
+    nets, most = options.lpips, options.lpips_views
+    seconds = estimate_seconds(runs, stored, threads=threads, lpips=nets, lpips_views=most)
     proxies = sum(map(len, plan.proxies.values()))
     if as_json:
         document = {

@@ -72,7 +72,8 @@ def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
 
 
 def estimate(place: Place, **options: object) -> float:
-    experiment = Experiment(place.path, "gsmerge", options.pop("settings", {}), options.pop("views", None))  # type: ignore[arg-type]
+    method = str(options.pop("method", "gsmerge"))
+    experiment = Experiment(place.path, method, options.pop("settings", {}), options.pop("views", None))  # type: ignore[arg-type]
     return estimate_seconds([("key", experiment, place)], {}, threads=2, **options)  # type: ignore[arg-type]
 
 
@@ -81,6 +82,9 @@ def test_estimates_grow_with_the_work(made_scene: Path) -> None:
     usual = estimate(place)
     assert estimate(place, settings={"fit": "none"}) < usual < estimate(place, settings={"effort": "best"})
     assert estimate(place, views=2) < usual < estimate(place, lpips=("vgg",))
+    assert usual < estimate(place, lpips=("vgg",), lpips_views=1) < estimate(place, lpips=("vgg",))
+    costs = [estimate(place, method=name) for name in ("random", "unmerged-color", "greedy", "unmerged-fit")]
+    assert costs == sorted(costs)
 
 
 def test_proxies_of_other_kinds_of_values_are_passed_over(tmp_path: Path) -> None:
