@@ -75,6 +75,9 @@ class Grid:
                 raise ValueError(f"{f.name}: expected at least one value, got none")
             if len(set(value)) < len(value):
                 raise ValueError(f"{f.name}: expected every value once, got {', '.join(map(str, value))}")
+        for value in self.densities:
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"densities: expected numbers, got {value!r}")
         for value in self.views:
             if value != ALL and not (isinstance(value, int) and value >= 1):
                 raise ValueError(f'views: expected numbers from 1 or "all", got {value!r}')

@@ -14,7 +14,7 @@ from gsmerge.io.cameras import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes, photo_size
-from gsmerge.io.images import as_tensor
+from gsmerge.io.images import as_tensor, find_image
 from gsmerge.io.poses import reread, with_poses
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
@@ -80,7 +80,7 @@ def read_targets(
     chosen = select_views(read, places)
     photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
     if photos is None:
-        raise SceneError(path, f"no photo found for {chosen.names[0]}", "name their folder with --target-images")
+        raise SceneError(path, f"no photo found for {_missing(path, chosen)}", "name their folder with --target-images")
     straight, photos, _ = as_pinholes(chosen, photos)
     assert photos is not None
     at_size = to_cameras(straight, photo_size(photos))
@@ -100,6 +100,12 @@ def _readings(read: CameraFile, load: SceneLoad) -> list[CameraFile]:
     if own is None or own.source != read.source or own.convention == read.convention:
         return [read]
     return [reread(read, own.convention), read]
+
+
+def _missing(path: Path, cameras: CameraFile) -> str:
+    """The first view that has no photo where the camera file says."""
+    root = path if path.is_dir() else path.parent
+    return next((name for name in cameras.names if find_image(root, name) is None), cameras.names[0])
 
 
 def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | None) -> Path | None:

@@ -101,6 +101,7 @@ def test_toml_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ('{"densities": ["a"]}', "densities: expected numbers, got 'a'"),
         ("{", "found a mistake"),
         ("[]", "found no table"),
         ('{"kk": [1]}', "found kk"),

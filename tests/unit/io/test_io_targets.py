@@ -137,6 +137,14 @@ def test_photos_elsewhere(tiny: Tiny, tmp_path: Path) -> None:
         read_targets(load, cameras, tmp_path / "nowhere")
 
 
+def test_the_photo_that_is_missing_is_named(tiny: Tiny, tmp_path: Path) -> None:
+    load = load_scene(tiny.save(tmp_path / "scene"))
+    path = write_views(tmp_path / "held", {"q": between(tiny), "r": between(tiny)}, tiny)
+    (path.parent / "images" / "r.png").unlink()
+    with pytest.raises(SceneError, match="no photo found for images/r.png"):
+        read_targets(load, path)
+
+
 def test_no_such_file(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
     with pytest.raises(SceneError, match="expected cameras of held-out views"):
