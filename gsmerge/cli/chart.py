@@ -16,7 +16,6 @@ import typer
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
 from gsmerge.cli.held_out import networks
-from gsmerge.cli.options import Lpips
 from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import BatchError, UsageError
 
@@ -110,7 +109,7 @@ def chart(
     typed: dict[str, Any] = {**lists, "fixed": fixed, "grid": grid, "targets": targets, "target_images": target_images}
     typed |= {"lpips": lpips and lpips.value, "lpips_views": lpips_views, "proxy_views": proxy_views}
     command = _command(given, out, {**typed, "seed": seed, "threads": threads})
-    nets, missing = _networks(lpips)
+    nets, missing = networks(lpips)
     with told_as_usage():
         told = RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun, command)
     plan, stored, notes = _planned(given, _grid(grid, lists, fixed), out, targets, target_images, told)
@@ -153,16 +152,6 @@ def _grid(file: Path | None, lists: dict[str, str | None], fixed: Sequence[str] 
 
     base = Grid() if file is None else read_grid(file)
     return parse_grid(lists, replace(base, fixed=tuple(fixed)) if fixed else base)
-
-
-def _networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
-    """The networks of LPIPS; those that were asked for must be there before the first run."""
-    from gsmerge.perceptual import INSTALL, lpips_available
-
-    nets, missing = networks(asked)
-    if not all(map(lpips_available, nets)):
-        raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
-    return nets, missing
 
 
 def _command(scenes: Sequence[Path], out: Path, told: dict[str, Any]) -> str:

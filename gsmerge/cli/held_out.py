@@ -19,11 +19,17 @@ _NETS = {Lpips.both: ("vgg", "alex"), Lpips.vgg: ("vgg",), Lpips.alex: ("alex",)
 
 
 def networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
-    """The networks to measure with, and a note where the weights are not installed and nobody asked for them."""
-    if asked is not None:
-        return _NETS[asked], []
+    """The networks to measure with, and a note where the weights are not installed and nobody asked for them.
+
+    Raises:
+        UsageError: If somebody did.
+    """
     from gsmerge.perceptual import INSTALL, lpips_available
 
+    if asked is not None:
+        if not all(map(lpips_available, _NETS[asked])):
+            raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
+        return _NETS[asked], []
     nets = tuple(net for net in _NETS[Lpips.both] if lpips_available(net))
     return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
 

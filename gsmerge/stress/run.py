@@ -126,7 +126,7 @@ def _judged(
         changed = given if case.change is None else case.change(given)
         settings = options if case.threads is None else replace(options, threads=case.threads)
         result = usual if case.name == "unchanged" else _run(changed, settings)
-    except GsmergeError as error:
+    except (GsmergeError, ValueError) as error:  # what one case does to a scene must not end the others
         return False, f"ended with: {error}"
     unsound = _unsound(result.gaussians, changed.scene)
     return (False, unsound) if unsound else _compared(case, usual, result, _slack(options))

@@ -85,6 +85,16 @@ def test_no_input_is_replaced(given: str, scene_copy: Path, run: Run) -> None:
     assert cameras.read_bytes() == before
 
 
+@pytest.mark.parametrize("command", ["evaluate", "report"])
+def test_networks_that_are_not_installed(
+    command: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.perceptual.lpips_available", lambda net: False)
+    outcome = run(command, scene_copy, scene_copy / "scene.ply", "--lpips", "vgg")
+    assert outcome.code == 2
+    assert "weights are not installed" in outcome.err
+
+
 def test_outputs_are_files_of_their_own(scene_copy: Path, run: Run) -> None:
     both = ("--csv", scene_copy / "a", "--report", scene_copy / "a")
     assert "got it twice" in run("evaluate", scene_copy, "--lpips", "none", *both).err

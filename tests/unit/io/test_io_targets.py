@@ -141,7 +141,7 @@ def test_the_photo_that_is_missing_is_named(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
     path = write_views(tmp_path / "held", {"q": between(tiny), "r": between(tiny)}, tiny)
     (path.parent / "images" / "r.png").unlink()
-    with pytest.raises(SceneError, match="no photo found for images/r.png"):
+    with pytest.raises(SceneError, match=r"no photo found for images/r\.png"):
         read_targets(load, path)
 
 
