@@ -179,7 +179,9 @@ def evaluate(
         near = near_plane(scene)
         points = context_points(scene, near)
         splits = _splits(scene, own, targets, options, near)
-        judged = [(name, views, visible_pixels(points, views.cameras, near)) for name, views in splits.items()]
+        judged = [
+            (name, views, visible_pixels(points, views.cameras, near, scene.cameras)) for name, views in splits.items()
+        ]
         out = []
         every = {INPUT: own, **results} if options.own else dict(results)
         _image(own[:1], scene.cameras, 0, near)  # loads the kernels, which is no one's time

@@ -13,7 +13,7 @@ from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
 _ROWS = 1 << 18  # points at a time: all of them, in every thread, would not fit
-_DILATION = 3  # pixels per side of the square that every sample marks
+_DILATION = 3  # pixels of the input views per side of the square that every sample marks
 
 
 def context_points(scene: PixelScene | LooseScene, near: float) -> Points:
@@ -41,13 +41,15 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
     return np.asarray((rays * depth.reshape(solid.shape[0], -1)[y, x, None]) @ pose[:3, :3].T + pose[:3, 3])
 
 
-def visible_pixels(points: Points, cameras: Cameras, near: float) -> NDArray[np.bool_]:
+def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
     """Pixels on which, or beside which, at least one of the points falls, whatever lies before it.
 
     Args:
         points: ``[n,3]`` depth samples of the input views, see :func:`context_points`.
         cameras: The views to be judged.
         near: Samples nearer than this do not count, world units.
+        sources: The input views: where those that are judged have pixels that are so much smaller, a sample marks so
+            many more, since samples would leave gaps otherwise; None: pixels of the same size.
 
     Returns:
         ``[c,h,w]`` bool.
@@ -64,6 +66,20 @@ def visible_pixels(points: Points, cameras: Cameras, near: float) -> NDArray[np.
             pixels = np.floor(image[:, :2] / image[:, 2:])
             pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
             hit[pixels[:, 1], pixels[:, 0]] = 1
-        return cv2.dilate(hit, np.ones((_DILATION, _DILATION), np.uint8)) > 0
+        side = _side(Ks[view], sources)
+        return cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
 
     return np.stack(parallel_map(one_view, range(len(cameras))))
+
+
+def _side(K: np.ndarray, sources: Cameras | None) -> int:
+    """Pixels per side, an odd number, of the square that a sample marks in a view with the intrinsics ``K [3,3]``."""
+    if sources is None:
+        return _DILATION
+    own = np.median(_focal(sources.Ks.double().numpy()))
+    return max(_DILATION, 2 * round((_DILATION * float(_focal(K) / own) - 1) / 2) + 1)
+
+
+def _focal(Ks: np.ndarray) -> np.ndarray:
+    """``[...]`` mean focal lengths of ``[...,3,3]`` intrinsics, pixels."""
+    return np.asarray(np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]))

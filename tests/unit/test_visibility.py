@@ -10,6 +10,7 @@ import scenes
 
 from gsmerge import visibility
 from gsmerge.sampling import subset
+from gsmerge.speed import resized
 from gsmerge.types import Cameras, LooseScene
 from gsmerge.visibility import context_points, visible_pixels
 
@@ -36,6 +37,17 @@ def test_mask_is_that_of_the_slow_loop(rows: int, monkeypatch: pytest.MonkeyPatc
     for view in range(3):
         assert np.array_equal(masks[view], slow_mask(points, held_out, view))
     assert 0.2 < masks[0].mean() < 0.9
+
+
+@pytest.mark.parametrize("factor", [2, 3, 5, 8])
+def test_larger_pictures_have_no_gaps_between_samples(factor: int) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
+    points, cameras = context_points(scene, 0.01), scene.cameras
+    large = resized(cameras, factor * 24)
+    assert visible_pixels(points, large, 0.01, cameras).all()
+    assert not visible_pixels(points, large, 0.01).all() or factor < 4
+    small = resized(cameras, 12)
+    assert np.array_equal(visible_pixels(points, small, 0.01, cameras), visible_pixels(points, small, 0.01))
 
 
 def test_input_views_see_themselves_whole() -> None:
