@@ -9,6 +9,8 @@ from pathlib import Path
 from gsmerge.charts.store import content_hash
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import CameraFile, SceneFiles, find_scene_files, read_cameras
+from gsmerge.io.cameras.colmap import is_colmap
+from gsmerge.io.cameras.read import find_cameras
 from gsmerge.io.scene_files import IMAGE_PLACES
 
 
@@ -90,13 +92,19 @@ def _place(scene: Path, name: str, targets: Path | None, target_images: Path | N
     files = find_scene_files(scene)
     if targets is not None and not targets.exists():
         raise SceneError(targets, f"expected cameras of held-out views of {scene}, found nothing")
-    read = [files.ply, files.cameras, files.images, targets, target_images]
+    read = [files.ply, files.cameras, files.images, targets and _cameras_inside(targets), target_images]
     for path in (files.cameras, targets):
         read += [] if path is None else _photos(path)
     cameras = None if files.cameras is None else _cameras(files.cameras, files.ply.stem)
     num_views = None if cameras is None else len(cameras)
     once = dict.fromkeys(path for path in read if path is not None)
     return Place(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
+
+
+def _cameras_inside(path: Path) -> Path:
+    """The cameras that are read from a folder: what else lies in it, such as results, does not count."""
+    found = find_cameras(path) if path.is_dir() and not is_colmap(path) else None
+    return path if found is None else found
 
 
 def _photos(cameras: Path) -> list[Path]:

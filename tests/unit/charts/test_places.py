@@ -67,6 +67,15 @@ def test_the_hash_knows_all_that_is_read(name: str, counts: bool, scene_copy: Pa
     assert (sha256() != before) is counts
 
 
+def test_results_beside_targets_do_not_count(scene_copy: Path) -> None:
+    before = find_places([scene_copy], "{scene}/targets")[0].sha256
+    (scene_copy / "targets" / "charts").mkdir()
+    (scene_copy / "targets" / "charts" / "runs.jsonl").write_text("{}")
+    assert find_places([scene_copy], "{scene}/targets")[0].sha256 == before
+    (scene_copy / "targets" / "transforms.json").write_text("{}")
+    assert find_places([scene_copy], "{scene}/targets")[0].sha256 != before
+
+
 def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
     assert find_places([scene_copy])[0].sha256 == find_places([made_scene])[0].sha256
 
