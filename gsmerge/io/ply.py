@@ -102,7 +102,8 @@ class PlyScene:
 
 def kept_comments(info: PlyInfo) -> tuple[str, ...]:
     """Comments of a file's header that say how its Gaussians are to be rendered, to be passed on."""
-    return tuple(comment for comment in info.comments if comment.startswith(RENDER_COMMENT) and comment.isascii())
+    lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
+    return tuple(comment for comment in lines if comment.startswith(RENDER_COMMENT))
 
 
 def ply_notes(info: PlyInfo) -> tuple[str, ...]:

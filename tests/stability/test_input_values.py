@@ -172,7 +172,10 @@ def test_the_way_to_render_is_passed_on(scene_copy: Path, tmp_path: Path) -> Non
     """Case 43: files whose Gaussians carry a filter of their own say so in the header."""
     ply = scene_copy / "scene.ply"
     head, rows = ply.read_bytes().split(b"end_header\n", 1)
-    head = head.replace(b"element vertex", b"comment SplatRenderMode: mip\ncomment of no use\nelement vertex")
+    head = head.replace(
+        b"element vertex",
+        b"comment SplatRenderMode: mip\ncomment SplatRenderMode:\tx\ncomment of no use\nelement vertex",
+    )
     ply.write_bytes(head + b"end_header\n" + rows)
     out = tmp_path / "small.ply"
     assert main(["compact", str(scene_copy), "-o", str(out), "--fit", "none", "--superpixels", "20", "-q"]) == 0
