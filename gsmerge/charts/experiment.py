@@ -17,6 +17,7 @@ OURS = "gsmerge"
 ALL = "all"  # word for all views
 SIZES = ("budget", "density")
 WHOLE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians, so have one size
+OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # would be overruled, or misnamed
 FITTED = ("unmerged-fit",)  # methods other than ours that effort changes
 
 
@@ -87,17 +88,22 @@ class Grid:
         """The fixed settings by name.
 
         Raises:
-            UsageError: If one is no "name=value".
+            UsageError: If one is no "name=value", or no setting that can be fixed.
         """
-        found = {}
+        found: dict[str, Any] = {}
         for text in self.fixed:
-            name, sign, value = text.partition("=")
+            name, sign, value = str(text).partition("=")
             if not (name and sign):
                 raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
+            if name in OWN_OPTIONS:
+                raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
             try:
                 found[name] = json.loads(value)
             except ValueError:
                 found[name] = value
+            plain = found[name] is None or isinstance(found[name], str | int | float)
+            if not plain or found[name] != found[name]:
+                raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")
         return found
 
 

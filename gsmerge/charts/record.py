@@ -16,7 +16,11 @@ HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "lpips_alex"
 
 
 _TEXTS = ("key", "scene", "scene_sha256", "method", "command")
-_TABLES = {"settings": (str, int, float, bool), "environment": (str,), "stages": (int, float)}  # and their values
+_TABLES = {
+    "settings": (str, int, float, bool, type(None)),
+    "environment": (str,),
+    "stages": (int, float),
+}  # and their values
 _LISTS = ("pictures", "notes")
 
 

@@ -122,10 +122,10 @@ def test_a_missing_file_is_told(tmp_path: Path) -> None:
 
 
 def test_fixed_settings_are_those_of_ours_alone() -> None:
-    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "seed=3"))
+    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "iterations=3"))
     combinations, _ = grid_settings(grid)
     assert combinations[1:] == [
-        ("gsmerge", {"budget": "1%", "robust": False, "match": "none", "seed": 3}),
+        ("gsmerge", {"budget": "1%", "robust": False, "match": "none", "iterations": 3}),
         ("random", {"budget": "1%"}),
     ]
 
@@ -133,4 +133,10 @@ def test_fixed_settings_are_those_of_ours_alone() -> None:
 @pytest.mark.parametrize("text", ["robust", "=1", ""])
 def test_fixed_settings_are_names_and_values(text: str) -> None:
     with pytest.raises(UsageError, match="NAME=VALUE"):
+        grid_settings(Grid(fixed=(text,)))
+
+
+@pytest.mark.parametrize("text", ["method=voxel", "seed=3", "threads=1", "prune=[1]", "prune={}", "prune=NaN"])
+def test_what_cannot_be_fixed(text: str) -> None:
+    with pytest.raises(UsageError, match="fixed: expected"):
         grid_settings(Grid(fixed=(text,)))
