@@ -239,6 +239,9 @@ def _check(method: str, settings: Mapping[str, Any]) -> None:
         CompactOptions().with_settings(run_settings(method, settings))
     except ValueError as error:
         raise UsageError(str(error)) from error
+    except TypeError as error:  # words in the place of numbers
+        told = ", ".join(f"{name}={value}" for name, value in settings.items())
+        raise UsageError(f"{method}: expected settings that compact takes, got {told}") from error
 
 
 def run_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,11 +16,11 @@ HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "lpips_alex"
 
 
 _TEXTS = ("key", "scene", "scene_sha256", "method", "command")
-_TABLES = {
+_TABLES = {  # and their values
     "settings": (str, int, float, bool, type(None)),
     "environment": (str,),
     "stages": (int, float),
-}  # and their values
+}
 _LISTS = ("pictures", "notes")
 
 
