@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from gsmerge.errors import UsageError
 from gsmerge.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate, near_plane
 from gsmerge.speed import Speed, measure_speeds, overdraw
 from gsmerge.types import Gaussians, LooseScene, PixelScene
@@ -102,12 +103,12 @@ def compare(
         merge_seconds: What making the results took, by name, where it is known.
 
     Raises:
-        ValueError: If a size is not positive, or as :func:`gsmerge.evaluate`.
+        UsageError: If a size is not positive, or as :func:`gsmerge.evaluate`.
     """
     own = max(scene.cameras.width, scene.cameras.height)
     sides = (own, 2 * own) if long_sides is None else long_sides
     if not sides or min(sides) < 1:
-        raise ValueError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
+        raise UsageError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
     quality = evaluate(scene, results, targets, options)
     near = near_plane(scene)
     every = {INPUT: scene.file_gaussians, **results}

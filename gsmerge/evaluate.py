@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsmerge.canonical import scene_frame
+from gsmerge.errors import UsageError
 from gsmerge.metrics import psnr, ssim
 from gsmerge.perceptual import lpips, min_size
 from gsmerge.render import render
@@ -166,14 +167,14 @@ def evaluate(
         progress: Called with ("evaluate", done, total) after each result.
 
     Raises:
-        ValueError: If the scene has no views, or a result is called "input".
+        UsageError: If the scene has no views, or a result is called "input".
         GsmergeError: If LPIPS is asked for and its weights are not installed.
     """
     options = options or EvaluateOptions()
     if INPUT in results:
-        raise ValueError(f"results: expected names other than {INPUT!r}")
+        raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
-        raise ValueError("expected a scene with views, got none")
+        raise UsageError("expected a scene with views, got none")
     own = scene.file_gaussians
     with use_threads(options.threads):
         near = near_plane(scene)

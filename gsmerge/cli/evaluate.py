@@ -85,9 +85,9 @@ def evaluate(
         options = EvaluateOptions(nets, lpips_views, context, threads=threads)
     load = load_files(files, opacity=opacity.value, reading=reading)
     require_views(load)
-    measured, held_out = held_out_views(load, targets, target_images, views)
+    measured, held_out, adapted = held_out_views(load, targets, target_images, views)
     plys = {name: read_ply(path) for name, path in zip(file_names(paths), paths, strict=True)}
-    notes = [*load.notes, *missing]
+    notes = [*load.notes, *adapted, *missing]
     say_notes(notes, quiet=quiet or json)
     gaussians = {name: ply.gaussians for name, ply in plys.items()}
     found = _measure(measured, held_out, gaussians, options, quiet=quiet or json)
@@ -109,7 +109,7 @@ def _measure(
 ) -> Evaluation:
     from gsmerge.evaluate import evaluate as evaluate_scene
 
-    with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, told_as_usage():
+    with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
         return evaluate_scene(scene, gaussians, held_out, options, progress=progress)
 
 

@@ -47,8 +47,8 @@ def require_views(load: SceneLoad) -> None:
 
 def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
-) -> tuple[PixelScene | LooseScene, Views | None]:
-    """The scene with the context views that were asked for, and the held-out ones."""
+) -> tuple[PixelScene | LooseScene, Views | None, tuple[str, ...]]:
+    """The scene with the context views that were asked for, the held-out ones, and notes about those."""
     from gsmerge.evaluate import Views
     from gsmerge.io import read_targets
     from gsmerge.sampling import even_views, midpoint_views, subset
@@ -57,8 +57,9 @@ def held_out_views(
         raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
     read = None if targets is None else read_targets(load, targets, target_images)
     found = None if read is None else Views(read.cameras, read.images, read.names)
+    notes = () if read is None else read.notes
     if views is None:
-        return load.scene, found
+        return load.scene, found, notes
     with told_as_usage():
         ids = even_views(len(load.scene), views)
     if read is not None and found is not None:
@@ -70,7 +71,7 @@ def held_out_views(
         if not chosen:
             raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
         found = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
-    return subset(load.scene, ids), found
+    return subset(load.scene, ids), found, notes
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:

@@ -13,7 +13,7 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
 from gsmerge.cli.held_out import file_names, held_out_views, networks
 from gsmerge.cli.paths import check_outputs, input_files
-from gsmerge.cli.settings import reading_of, told_as_usage
+from gsmerge.cli.settings import reading_of
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -94,14 +94,14 @@ def report(
     seconds = _merge_seconds(after, merge_seconds, compact_report)
     nets, missing = networks(lpips)
     load = load_files(files, opacity=opacity.value, reading=reading)
-    scene, held_out = held_out_views(load, targets, target_images, None)
+    scene, held_out, adapted = held_out_views(load, targets, target_images, None)
     scene, placed = with_views(scene)
     plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
-    notes = [*load.notes, *placed, *missing]
+    notes = [*load.notes, *adapted, *placed, *missing]
     say_notes(notes, quiet=quiet or json)
     storage = {INPUT: _storage(load.ply), **{name: _storage(ply.info) for name, ply in plys.items()}}
     gaussians = {name: ply.gaussians for name, ply in plys.items()}
-    with announce_compilation(quiet=quiet or json), told_as_usage():
+    with announce_compilation(quiet=quiet or json):
         found = compare(
             scene, gaussians, storage, held_out, EvaluateOptions(nets, threads=threads),
             long_sides=sizes, merge_seconds=dict(zip(plys, seconds, strict=False)),  # type: ignore[arg-type]

@@ -12,7 +12,8 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.held_out import held_out_views, require_views
 from gsmerge.cli.paths import check_outputs, input_files
-from gsmerge.cli.settings import reading_of, settings_of, told_as_usage
+from gsmerge.cli.settings import reading_of, settings_of
+from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
     from gsmerge.stress import StressOutcome
@@ -59,14 +60,11 @@ def stress(
     settings = settings_of({**chosen, "seed": seed, "threads": threads})
     load = load_files(files, opacity=opacity.value, reading=reading)
     require_views(load)
-    _, held_out = held_out_views(load, targets, target_images, None)
-    say_notes(load.notes, quiet=quiet or json)
+    _, held_out, adapted = held_out_views(load, targets, target_images, None)
+    notes = [*load.notes, *adapted]
+    say_notes(notes, quiet=quiet or json)
     names = None if cases is None else [name.strip() for name in cases.split(",")]
-    with (
-        announce_compilation(quiet=quiet or json),
-        stage_progress(quiet=quiet or json) as progress,
-        told_as_usage(),
-    ):
+    with announce_compilation(quiet=quiet or json), stage_progress(quiet=quiet or json) as progress:
         found = stress_scene(load, settings, targets=held_out, cases=names, reading=reading, progress=progress)
     document = {
         **document_head(),
@@ -75,7 +73,7 @@ def stress(
         "cases": [vars(outcome) for outcome in found],
         "held": sum(outcome.held is True for outcome in found),
         "failed": sum(outcome.held is False for outcome in found),
-        "notes": list(load.notes),
+        "notes": notes,
     }
     if report is not None:
         with atomic_output(report, overwrite=overwrite) as temporary:
@@ -84,6 +82,9 @@ def stress(
         sys.stdout.write(to_json(document))
     elif not quiet:
         print("\n".join(map(one_line, _lines(found))))
+    failed = [outcome.case for outcome in found if outcome.held is False]
+    if failed:
+        raise TargetError(f"{len(failed)} of {len(found)} cases failed: {', '.join(failed)}")
 
 
 def _lines(found: Sequence[StressOutcome]) -> list[str]:

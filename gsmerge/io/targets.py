@@ -15,16 +15,18 @@ from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.frame import SAME, Frame
 from gsmerge.io.grid import as_pinholes, photo_size
 from gsmerge.io.images import as_tensor, find_image
+from gsmerge.io.large import lighter_photos
 from gsmerge.io.poses import reread, with_poses
+from gsmerge.io.reading import AUTO
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.io.views import stored_photos
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, LooseScene, PixelScene
 
 _MAX_TURN = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
 _MAX_SHIFT = 0.005  # of the distance between the views
 _MIN_SHARED = 3  # views that tell how two worlds lie to one another
-_SAME_POSE = 1e-4  # of that distance, and in entries of the rotation: the very same view
+_SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotation: the very same view
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Targets:
         names: As their camera file has them.
         places: Of each along the trajectory: its index in the camera file.
         context_places: The same of the scene's views; None where they are not all in the file.
+        notes: What was adapted, one sentence each.
     """
 
     cameras: Cameras
@@ -44,6 +47,7 @@ class Targets:
     names: tuple[str, ...]
     places: tuple[int, ...]
     context_places: tuple[int, ...] | None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -73,7 +77,7 @@ def read_targets(
     tried = [(one, *_world(one, _shared_views(one, load.scene.names), load)) for one in _readings(read, load)]
     read, world, shared = next((found for found in tried if found[2]), tried[0])
     moved = world.move_cameras(read.viewmats.numpy())
-    shared |= _repeated(moved, load.scene.cameras)
+    shared |= _repeated(moved, load.scene)
     places = [i for i in range(len(read)) if i not in shared]
     if not places:
         raise SceneError(path, "expected views that the scene was not made of, found none")
@@ -82,6 +86,7 @@ def read_targets(
     if photos is None:
         raise SceneError(path, f"no photo found for {_missing(path, chosen)}", "name their folder with --target-images")
     straight, photos, _ = as_pinholes(chosen, photos)
+    photos, notes = lighter_photos(photos, 0, AUTO.max_side, loose=False)
     assert photos is not None
     at_size = to_cameras(straight, photo_size(photos))
     inverse = {view: place for place, view in shared.items()}
@@ -91,6 +96,7 @@ def read_targets(
         chosen.names,
         tuple(places),
         tuple(inverse[view] for view in range(len(load.scene))) if 0 < len(inverse) == len(load.scene) else None,
+        tuple(notes),
     )
 
 
@@ -183,12 +189,13 @@ def _spread(viewmats: np.ndarray) -> float:
     return float(np.linalg.norm(centres.max(0) - centres.min(0))) or 1.0
 
 
-def _repeated(moved: np.ndarray, cameras: Cameras) -> dict[int, int]:
+def _repeated(moved: np.ndarray, scene: PixelScene | LooseScene) -> dict[int, int]:
     """Views that stand where one of the scene's does and look the same way, and which one that is."""
-    if len(cameras) == 0:
+    if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
-    ours = cameras.viewmats.double().numpy()
-    limit = _SAME_POSE * _spread(ours)
+    ours, middle = scene.cameras.viewmats.double().numpy(), scene.gaussians.means.double().median(0).values.numpy()
+    # what is seen lies as far away as the views may be apart, or farther; one view has nothing else to measure by
+    limit = _SAME_POSE * float(np.linalg.norm(_centres(ours) - middle, axis=1).max())
     near = np.linalg.norm(_centres(moved)[:, None] - _centres(ours), axis=2) <= limit
     alike = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
     return {int(i): int(view) for i, view in zip(*np.nonzero(near & alike), strict=True)}

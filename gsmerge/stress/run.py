@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from gsmerge.errors import GsmergeError, SceneError
+from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.evaluate import EvaluateOptions, Views, evaluate
 from gsmerge.io import SceneLoad, align_scene, read_told
 from gsmerge.io.cameras.camera_file import from_viewmats, to_viewmats
@@ -86,14 +86,14 @@ def stress(
         progress: Called with (case, done, total).
 
     Raises:
-        ValueError: If a case is unknown, or the scene has no views.
+        UsageError: If a case is unknown, or the scene has no views.
     """
     names = list(CASES if cases is None else cases)
     unknown = next((name for name in names if name not in CASES), None)
     if unknown is not None:
-        raise ValueError(f"cases: expected some of {', '.join(CASES)}, got {unknown!r}")
+        raise UsageError(f"cases: expected some of {', '.join(CASES)}, got {unknown!r}")
     if len(load.scene) == 0:
-        raise ValueError("expected a scene with views, got none")
+        raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
     given = Judged(load.scene, targets)
     usual = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None

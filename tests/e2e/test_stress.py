@@ -32,3 +32,11 @@ def test_an_unknown_case(scene_copy: Path, run: Run) -> None:
     outcome = run("stress", scene_copy, "--cases", "hail")
     assert outcome.code == 2
     assert "expected some of unchanged" in outcome.err
+
+
+def test_a_case_that_fails_is_a_target_not_met(scene_copy: Path, run: Run) -> None:
+    outcome = run("stress", scene_copy, "--fit", "none", "--density", "0.01", "--cases", "order,views-1,unchanged")
+    failed = [line for line in outcome.out.splitlines() if line.startswith("FAILED")]
+    assert failed, "so few Gaussians without a fit must be worse than the input somewhere"
+    assert outcome.code == 4
+    assert f"{len(failed)} of 3 cases failed" in outcome.err

@@ -14,7 +14,7 @@ from tiny_scene import FLIP, Tiny, make_tiny, rotation
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io import load_scene, read_cameras, read_targets
+from gsmerge.io import large, load_scene, read_cameras, read_targets
 from gsmerge.io.targets import similarity
 from gsmerge.types import LooseScene
 
@@ -170,3 +170,28 @@ def test_similarity_of_one_place_keeps_the_scale(tiny: Tiny) -> None:
 def test_cameras_alone_are_read_as_before(tiny: Tiny, tmp_path: Path) -> None:
     path = write_views(tmp_path / "held", {"q": between(tiny)}, tiny)
     assert read_cameras(path).names == ("images/q.png",)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
+def test_views_beside_a_single_one_are_other_views_in_any_unit(factor: float, tiny: Tiny, tmp_path: Path) -> None:
+    c2w = tiny.c2w.copy()
+    c2w[:, :3, 3] *= factor
+    gaussians = replace(tiny.gaussians, means=tiny.gaussians.means * factor, scales=tiny.gaussians.scales * factor)
+    size = tiny.width * tiny.height
+    one = replace(tiny, c2w=c2w[:1], images=tiny.images[:1], gaussians=gaussians[:size], names=tiny.names[:1])
+    load = load_scene(one.save(tmp_path / "scene"))
+    beside = c2w[0].copy()
+    beside[0, 3] += 0.05 * factor
+    targets = read_targets(load, write_views(tmp_path / "held", {"p": c2w[0], "q": beside}, tiny))
+    assert targets.names == ("images/q.png",)
+
+
+def test_photos_beyond_all_memory_are_made_smaller(tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    load = load_scene(tiny.save(tmp_path / "scene"))
+    cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (1600, 1200))
+    assert read_targets(load, cameras).images.shape[2] == 1600
+    monkeypatch.setattr(large, "_MAX_BYTES", 1 << 20)
+    targets = read_targets(load, cameras)
+    assert targets.images.shape[2] == targets.cameras.width == 1200
+    assert np.allclose(targets.cameras.Ks[0].numpy()[:2], 1200 / tiny.width * tiny.K[:2])
+    assert "1600 x 1200" in targets.notes[0]
