@@ -22,7 +22,8 @@ from gsmerge.charts.record import INPUT, RunRecord
 from gsmerge.charts.store import append_run, experiment_key, read_runs
 from gsmerge.errors import GsmergeError
 from gsmerge.evaluate import EvaluateOptions, Views, near_plane
-from gsmerge.io import load_files
+from gsmerge.io import AUTO, Reading, load_files
+from gsmerge.io.ply import OpacityChoice
 from gsmerge.pipeline import compact
 from gsmerge.threads import available_threads, use_threads
 from gsmerge.types import LooseScene, PixelScene
@@ -44,6 +45,8 @@ class RunOptions:
         proxy_views: Photos of each scene whose superpixels alone are measured; 0: none.
         rerun: Do what is done already again.
         command: The command line, for the record.
+        reading: What is told of the scenes instead of found.
+        opacity: The same of their opacities.
     """
 
     lpips: tuple[str, ...] = ()
@@ -53,6 +56,8 @@ class RunOptions:
     proxy_views: int = 2
     rerun: bool = False
     command: str = ""
+    reading: Reading = AUTO
+    opacity: OpacityChoice = "auto"
 
     @property
     def evaluation(self) -> EvaluateOptions:
@@ -61,7 +66,9 @@ class RunOptions:
 
     def key_of(self, experiment: Experiment, place: Place) -> str:
         """Of a run with these options."""
-        measured = {"lpips": list(self.lpips), "lpips_views": self.lpips_views, "seed": self.seed}
+        measured: dict[str, Any] = {"lpips": list(self.lpips), "lpips_views": self.lpips_views, "seed": self.seed}
+        told = {name: value for name, value in vars(self.reading).items() if value != getattr(AUTO, name)}
+        measured |= told if self.opacity == "auto" else {**told, "opacity": self.opacity}
         settings = {**experiment.settings, "measured": measured}
         return experiment_key(place.sha256, experiment.method, settings, experiment.views)
 
@@ -155,7 +162,7 @@ def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) 
             if not runs and not proxies:
                 continue
             step(f"{place.name}: reading", 0)
-            ready = _read(place)
+            ready = _read(place, options)
             for key, experiment in runs:
                 step(f"{place.name}: {describe(experiment)}")
                 blank = _blank(key, experiment, place, options)
@@ -180,10 +187,10 @@ def describe(experiment: Experiment) -> str:
     return ", ".join([experiment.method, *told, *views])
 
 
-def _read(place: Place) -> _Ready | str:
+def _read(place: Place, options: RunOptions) -> _Ready | str:
     """The scene with its targets, or why it cannot be read."""
     try:
-        load = load_files(place.files)
+        load = load_files(place.files, opacity=options.opacity, reading=options.reading)
         targets, where = held_out(load, place.targets, place.target_images)
         return _Ready(load.scene, targets, where, tuple(load.notes))
     except Exception as error:

@@ -16,7 +16,7 @@ import typer
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
 from gsmerge.cli.held_out import networks
-from gsmerge.cli.settings import told_as_usage
+from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import BatchError, UsageError
 
 if TYPE_CHECKING:
@@ -81,6 +81,12 @@ def chart(
     views: NumViews = None,
     fixed: Fixed = None,
     grid: GridFile = None,
+    opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     targets: Targets = None,
     target_images: TargetImages = None,
     lpips: opt.LpipsOption = None,
@@ -107,11 +113,22 @@ def chart(
     lists = {"methods": methods, "k": k, "budgets": budgets, "densities": densities, "segmentations": segmentations}
     lists |= {"fit": fit, "efforts": efforts, "matches": matches, "views": views}
     typed: dict[str, Any] = {**lists, "fixed": fixed, "grid": grid, "targets": targets, "target_images": target_images}
-    typed |= {"lpips": lpips and lpips.value, "lpips_views": lpips_views, "proxy_views": proxy_views}
+    read = {"opacity": opacity.value, "dialect": dialect, "quats": quats.value, "order": order.value}
+    typed |= {name: value for name, value in read.items() if value != "auto"}
+    typed |= {
+        "scene_scale": scene_scale,
+        "max_side": max_side,
+        "lpips": lpips and lpips.value,
+        "lpips_views": lpips_views,
+    }
+    typed |= {"proxy_views": proxy_views}
     command = _command(given, out, {**typed, "seed": seed, "threads": threads})
     nets, missing = networks(lpips)
     with told_as_usage():
-        told = RunOptions(nets, lpips_views, seed or 0, threads, proxy_views, rerun, command)
+        reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+        told = RunOptions(
+            nets, lpips_views, seed or 0, threads, proxy_views, rerun, command, reading=reading, opacity=opacity.value
+        )
     plan, stored, notes = _planned(given, _grid(grid, lists, fixed), out, targets, target_images, told)
     notes = [*missing, *notes]
     if dry_run:

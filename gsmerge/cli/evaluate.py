@@ -34,6 +34,7 @@ def evaluate(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     targets: opt.TargetsOption = None,
     target_images: opt.TargetImagesOption = None,
     views: Annotated[
@@ -71,7 +72,7 @@ def evaluate(
     debug: opt.DebugOption = False,
 ) -> None:
     """Measure compact scenes against photos: PSNR, SSIM, LPIPS, counts, sizes, render time."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     if not context and targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
     from gsmerge.evaluate import EvaluateOptions

@@ -48,6 +48,7 @@ def report(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     targets: opt.TargetsOption = None,
     target_images: opt.TargetImagesOption = None,
     sizes: Annotated[
@@ -78,7 +79,7 @@ def report(
     debug: opt.DebugOption = False,
 ) -> None:
     """Compare a scene with its compact versions: bytes, render time, overdraw, quality, break-even frames."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.before_after import comparison_document
     from gsmerge.compare import compare
     from gsmerge.evaluate import INPUT, EvaluateOptions

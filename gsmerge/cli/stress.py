@@ -28,6 +28,7 @@ def stress(
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
     targets: opt.TargetsOption = None,
     target_images: opt.TargetImagesOption = None,
     cases: Annotated[
@@ -49,7 +50,7 @@ def stress(
     debug: opt.DebugOption = False,
 ) -> None:
     """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import atomic_output, find_scene_files, load_files
     from gsmerge.report import document_head, to_json
     from gsmerge.stress import stress as stress_scene
