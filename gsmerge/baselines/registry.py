@@ -51,6 +51,15 @@ def check_scene(baseline: Baseline, scene: PixelScene | LooseScene) -> None:
         raise UsageError(
             f"method {baseline.name}: expected one Gaussian per pixel, found them in no order; give another --method"
         )
+    check_program(baseline)
+
+
+def check_program(baseline: Baseline) -> None:
+    """Whether the program that a method runs is there, if it runs one.
+
+    Raises:
+        UsageError: If it is missing.
+    """
     if "node" in baseline.needs:
         find_program()
 

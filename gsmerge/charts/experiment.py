@@ -233,15 +233,19 @@ def make_experiments(scenes: Sequence[Path], grid: Grid) -> tuple[list[Experimen
 
 
 def _check(method: str, settings: Mapping[str, Any]) -> None:
+    from gsmerge.baselines.registry import check_program, find_baseline
     from gsmerge.options import CompactOptions
 
     try:
         CompactOptions().with_settings(run_settings(method, settings))
+        rival = None if method == INPUT else find_baseline(method)
     except ValueError as error:
         raise UsageError(str(error)) from error
     except TypeError as error:  # words in the place of numbers
         told = ", ".join(f"{name}={value}" for name, value in settings.items())
         raise UsageError(f"{method}: expected settings that compact takes, got {told}") from error
+    if rival is not None:
+        check_program(rival)
 
 
 def run_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:

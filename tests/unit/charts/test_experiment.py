@@ -140,3 +140,9 @@ def test_fixed_settings_are_names_and_values(text: str) -> None:
 def test_what_cannot_be_fixed(text: str) -> None:
     with pytest.raises(UsageError, match="fixed: expected"):
         grid_settings(Grid(fixed=(text,)))
+
+
+def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
+    with pytest.raises(UsageError, match="install it with"):
+        make_experiments([Path("scene")], Grid(methods=("gsmerge", "splat-transform"), budgets=("1%",)))
