@@ -309,36 +309,68 @@ def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
 
 
 def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
-    """When not to use it: where results lose against their input."""
-    lost = []
+    """When not to use it: where results lose against their input, or against fewer Gaussians."""
+    gains = sorted(_gains(parts), key=lambda row: float(row[-1]))
+    lost = [row for row in gains if float(row[-1]) < 0]
+    head = ("scene", "part", "views", "settings", "input (dB)", "ours")
+    shown = lost or gains[:5]
+    words = "are below their input" if lost else "gain least (none is below its input)"
+    text = f"## When not to use it\n\nRuns of ours that {words} on held-out views:\n\n{_table(head, shown)}"
+    return "\n\n".join(filter(None, [text, _too_many(parts.get("sizes", ())), _without(parts.get("ablation", ()))]))
+
+
+def _gains(parts: Mapping[str, Sequence[RunRecord]]) -> list[Row]:
+    """Every run of ours with the PSNR of its input, and how much it is above it."""
     inputs = {(name, r.scene, r.views_asked): r for name, some in parts.items() for r in some if r.method == INPUT}
+    rows = []
     for name, some in parts.items():
         for r in some:
             before = inputs.get((name, r.scene, r.views_asked))
-            if (
-                r.method != OURS
-                or before is None
-                or r.psnr_target_visible is None
-                or before.psnr_target_visible is None
-            ):
+            if r.method != OURS or before is None or None in (r.psnr_target_visible, before.psnr_target_visible):
                 continue
-            worse = r.psnr_target_visible - before.psnr_target_visible
-            if worse < 0:
-                views = "all" if r.views_asked is None else str(r.views_asked)
-                told = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
-                lost.append((r.scene, name, views, told, f"{before.psnr_target_visible:.2f}", f"{worse:+.2f}"))
-    text = """## When not to use it
+            assert r.psnr_target_visible is not None
+            assert before.psnr_target_visible is not None
+            views = "all" if r.views_asked is None else str(r.views_asked)
+            told = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
+            gain = r.psnr_target_visible - before.psnr_target_visible
+            rows.append((r.scene, name, views, told, f"{before.psnr_target_visible:.2f}", f"{gain:+.2f}"))
+    return rows
 
-- Where poses or depth are badly wrong, there is little to merge: on a roof terrace whose depth is mostly wrong the gain
-  is some tenths of a decibel, and a longer fit helps the input views alone.
-- Where nobody looks from elsewhere: from the input views themselves a scene that was fitted to nothing shows its photos
-  sharply, and a merged one is smoother (LPIPS of the input views above).
-- Without photos: the merge alone keeps less than the fit brings; expect the figures of `--fit none`.
-- Where fine texture counts and size does not: `--k 2` or `--budget 20%` cost size and bring LPIPS."""
-    if not lost:
-        return text + "\n\nOf all runs above none of ours is below its input on held-out views."
-    head = ("scene", "part", "views", "settings", "input (dB)", "ours")
-    return text + "\n\nRuns of ours that are below their input on held-out views:\n\n" + _table(head, sorted(lost))
+
+def _too_many(records: Sequence[RunRecord]) -> str:
+    """What a number of Gaussians brings, by scene: where depth or poses are poor, more of them fit what is wrong."""
+    runs = [
+        r for r in records if r.method == OURS and set(r.settings) == {"budget"} and r.psnr_target_visible is not None
+    ]
+    budgets = sorted({str(r.settings["budget"]) for r in runs}, key=lambda text: float(text.rstrip("%")))
+    if len(budgets) < 2:
+        return ""
+    found = {(r.scene, str(r.settings["budget"])): r for r in runs}
+    rows = []
+    for scene in sorted({r.scene for r in runs}):
+        values = [
+            (found[scene, b].psnr_target_visible, found[scene, b].psnr_context) for b in budgets if (scene, b) in found
+        ]
+        rows.append((scene, *(f"{target:.2f} / {context:.2f}" for target, context in values)))
+    words = (
+        "More Gaussians are not always better. Held-out and input views (dB) by budget: where the input views go on"
+        " rising and the held-out ones fall, the photos are learned by heart, because depth or poses do not fit them;"
+        " ask for fewer, or for `--k auto`."
+    )
+    return f"### More Gaussians than a scene bears\n\n{words}\n\n{_table(('scene', *budgets), rows)}"
+
+
+def _without(records: Sequence[RunRecord]) -> str:
+    """What is left without photos to fit to."""
+    plain = [r for r in records if r.method == OURS and not r.settings]
+    bare = [r for r in records if r.method == OURS and dict(r.settings) == {"fit": "none"}]
+    if not (plain and bare):
+        return ""
+    return (
+        "### Without photos\n\nWithout photos nothing can be fitted, and the merge alone has to do: at most"
+        f" {_mean(bare, 'psnr_target_visible')} dB in place of {_mean(plain, 'psnr_target_visible')} dB (the input:"
+        f" {_mean([r for r in records if r.method == INPUT], 'psnr_target_visible')} dB)."
+    )
 
 
 def _missing() -> str:
