@@ -71,7 +71,7 @@ PARTS = (
             ("--fit", "color,none", "--proxy-views", "0"),
             ("--densities", "0.02,0.087", "--proxy-views", "0"),
             ("--segmentations", "bass-st,slic", "--proxy-views", "0"),
-            ("--k", "auto", "--proxy-views", "0"),
+            ("--k", "2,4,auto", "--proxy-views", "0"),
         ),
     ),
     *(
