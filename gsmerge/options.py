@@ -40,6 +40,8 @@ class CompactOptions:
         target: What decides the number of Gaussians.
         method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
+        checkpoint: File of trained networks that correct what the analytic stages make; ``"none"``: those alone.
+        require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
@@ -58,6 +60,8 @@ class CompactOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     target: TargetOptions = field(default_factory=TargetOptions)
     method: str = "gsmerge"
+    checkpoint: str = "none"
+    require_checkpoint: bool = False
     seed: int = 0
     threads: int | None = None
 
