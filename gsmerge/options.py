@@ -46,7 +46,8 @@ class CompactOptions:
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:
-        ValueError: If the method is unknown, or another than ``"gsmerge"`` is asked to find the number of Gaussians.
+        ValueError: If the method is unknown, or another than ``"gsmerge"`` is asked to find the number of Gaussians;
+            if a checkpoint is required and none is named.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -68,6 +69,8 @@ class CompactOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.require_checkpoint and self.checkpoint == "none":
+            raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
             return
         asked = {"k auto": self.decode.k == "auto", "levels": self.target.levels > 1}

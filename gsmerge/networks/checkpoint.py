@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gsmerge import __version__
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import NetworkOptions
@@ -54,16 +54,10 @@ def save_checkpoint(path: str | PathLike[str], networks: Networks, training: Map
     Raises:
         SceneError: If the file cannot be written.
     """
-    header = {
-        "format": FORMAT,
-        "schema": str(SCHEMA),
-        "gsmerge": __version__,
-        "options": json.dumps(asdict(networks.options)),
-        "training": json.dumps(dict(training)),
-    }
+    header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
     with atomic_output(path, overwrite=True) as temporary:
-        save_file(tensors, temporary, header)
+        save_file(tensors, temporary, {FORMAT: json.dumps(header)})  # one entry: the order of several is not fixed
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
@@ -83,27 +77,29 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     except (SafetensorError, OSError, ValueError) as error:
         told = str(error).splitlines()[0]
         raise SceneError(path, f"expected a safetensors file, could not read it ({told})", REMEDY) from error
-    options, training = _header(path, header)
+    options, training, version = _header(path, header)
     networks = Networks(options)
     _check_tensors(path, tensors, networks.state_dict())
     networks.load_state_dict(tensors)
-    return Checkpoint(networks.eval().requires_grad_(False), path, str(header["gsmerge"]), training)
+    return Checkpoint(networks.eval().requires_grad_(False), path, version, training)
 
 
-def _header(path: Path, header: Mapping[str, str]) -> tuple[NetworkOptions, dict[str, Any]]:
-    """Sizes of the networks and figures of the training."""
-    if header.get("format") != FORMAT:
+def _header(path: Path, header: Mapping[str, str]) -> tuple[NetworkOptions, dict[str, Any], str]:
+    """Sizes of the networks, figures of the training, and the version that wrote them."""
+    if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
-    if header.get("schema") != str(SCHEMA):
-        raise SceneError(path, f"expected schema {SCHEMA}, found {header.get('schema')}", REMEDY)
     try:
-        options, training = (json.loads(header.get(name, "")) for name in ("options", "training"))
-        if not isinstance(options, dict) or not isinstance(training, dict) or "gsmerge" not in header:
-            raise ValueError("expected options, training and version")
-        return NetworkOptions.from_dict(options), training
+        told = json.loads(header[FORMAT])
+        if not isinstance(told, dict) or told.get("schema") != SCHEMA:
+            found = told.get("schema") if isinstance(told, dict) else "none"
+            raise SceneError(path, f"expected schema {SCHEMA}, found {found!r}", REMEDY)
+        for name, kind in (("options", dict), ("training", dict), ("gsmerge", str)):
+            if not isinstance(told.get(name), kind):
+                raise ValueError(f"no {name}")
+        return NetworkOptions.from_dict(told["options"]), told["training"], told["gsmerge"]
     except (ValueError, TypeError, RecursionError) as error:
-        told = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a header that describes the networks, found {told}", REMEDY) from error
+        words = str(error).splitlines()[0]
+        raise SceneError(path, f"expected a header that describes the networks ({words})", REMEDY) from error
 
 
 def _check_tensors(path: Path, tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
@@ -128,11 +124,8 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
 
     Raises:
         SceneError: If it is required and cannot be used.
-        UsageError: If it is required and none is asked for.
     """
     if name == "none":
-        if required:
-            raise UsageError("require checkpoint: expected a checkpoint, got none; give --checkpoint")
         return None, []
     try:
         return load_checkpoint(name), []

@@ -82,7 +82,7 @@ def move_gaussians(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> G
         means=g.means + rotated(frames, residuals[:, MEAN] * sizes_of(g.scales)[:, None]),
         quats=turn_quats(rotated(frames, residuals[:, TURN]), g.quats),
         scales=g.scales * torch.exp(residuals[:, SIZE]),
-        opacities=odds * factor / (1 + odds * (factor - 1)),  # the logit plus the correction
+        opacities=(odds * factor / (1 + odds * (factor - 1))).clamp(0, 1),  # the logit plus the correction
         sh0=g.sh0 + residuals[:, None, COLOR] / SH_C0,
     )
 

@@ -126,10 +126,12 @@ def part_tokens(parts: Gaussians, described: Described, owners: Tensor) -> Tenso
     frames, d = described.frames[owners].transpose(1, 2), described
     normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
     axes = frames @ torch.stack([parts.means - d.base.means[owners], normals], 2)
-    normals = axes[:, :, 1] * -torch.sign(axes[:, 2:, 1])  # towards the camera
+    scales = parts.scales.sort(1).values.clamp_min(TINY)
+    flat = 1 - scales[:, :1] / scales[:, 1:2]  # a round Gaussian has no normal, and rounding must not choose one
+    normals = -flat * axes[:, :, 1] * torch.sign(axes[:, 2:, 1])  # towards the camera
     columns = [
         torch.asinh(axes[:, :, 0] / d.sizes[owners, None]),
-        torch.log(parts.scales.sort(1).values.clamp_min(TINY) / d.footprints[owners, None]).clamp(-12, 12) / 4,
+        torch.log(scales / d.footprints[owners, None]).clamp(-12, 12) / 4,
         logits(parts.opacities)[:, None],
         SH_C0 * (parts.sh0[:, 0] - d.base.sh0[owners, 0]),
         normals,
