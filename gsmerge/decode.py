@@ -76,6 +76,16 @@ def decode(
         counts = np.full(len(features), options.count)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
+    gaussians, parents = divide(features, members, counts, rule)
+    if learned is not None:
+        gaussians = decode_gaussians(gaussians, parents, features, learned)
+    return gaussians[gaussians.opacities >= options.min_opacity]
+
+
+def divide(
+    features: FeatureGaussians, members: Members, counts: np.ndarray, rule: Rule = "depth"
+) -> tuple[Gaussians, np.ndarray]:
+    """The analytic children of :func:`decode`, however faint, and the Feature Gaussian ``[n]`` of each, rising."""
     divided = (counts > 1) & ~features.backing.numpy()
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
@@ -85,9 +95,7 @@ def decode(
         order = np.argsort(parents, kind="stable")
         parents = parents[order]
         gaussians = Gaussians.concat([gaussians[torch.from_numpy(whole)], children])[torch.from_numpy(order)]
-    if learned is not None:
-        gaussians = decode_gaussians(gaussians, parents, features, learned)
-    return gaussians[gaussians.opacities >= options.min_opacity]
+    return gaussians, parents
 
 
 def _children(
