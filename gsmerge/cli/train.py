@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, one_line, say, stage_progress
+from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.settings import told_as_usage
 
 if TYPE_CHECKING:
@@ -63,15 +63,15 @@ def train(
         folder = cache or out / "examples"
         examples = [_example(path, options, folder, progress) for path in data]
         held = [_example(path, options, folder, progress) for path in validation or []]
-        if not held:
-            say("note: without --validation, other crops of the same scenes choose the best checkpoint", quiet=quiet)
+        notes = [] if held else ["without --validation, other crops of the same scenes choose the best checkpoint"]
+        say_notes(notes, quiet=quiet)
 
         def told(step: int, steps: int, loss: float) -> None:
             if progress is not None:
                 progress(f"train: loss {loss:.4f}", step, steps)
 
         done = train_networks(examples, held, out, options, threads=threads, progress=told)
-    document: dict[str, Any] = {**document_head(), "options": options.to_dict()}
+    document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
     document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
     if json:
         sys.stdout.write(to_json(document))
