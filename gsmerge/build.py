@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -93,22 +94,23 @@ def _merged_features(
     with journal.stage("encode"):
         features = encode(scene, members, grouping.groups, options.encode, learned)
     if not grouping.robust:
-        return _matched(features, options, journal, learned)
+        return _matched(features, options, journal, learned, lambda merged: merged)
     with journal.stage("robust"):
-        coarse = grouping.coarse
         backing = None
-        if coarse is not None:
-            backing = encode_backing(scene, members, coarse, options.backing)
+        if grouping.coarse is not None:
+            backing = encode_backing(scene, members, grouping.coarse, options.backing)
             backing = replace(backing, latents=torch.zeros(len(backing), features.latents.shape[1]))
         photos = scene_photos(scene, 2)
         aligned = isinstance(scene, PixelScene)
         features, choice = choose_merge(features, backing, photos, options.robust, left_out=aligned)
         journal.choices["merge"], journal.choices["merge_scores"] = choice.name, choice.scores
-    features = _matched(features, options, journal, learned)
-    with journal.stage("match"):
-        features, choice = close_holes(features, backing, photos, options.robust)
+
+    def closed(merged: FeatureGaussians) -> FeatureGaussians:
+        merged, choice = close_holes(merged, backing, photos, options.robust)
         journal.choices["closed"] = choice.name
-        return features
+        return merged
+
+    return _matched(features, options, journal, learned, closed)
 
 
 def _filled(
@@ -123,17 +125,21 @@ def _filled(
 
 
 def _matched(
-    features: FeatureGaussians, options: CompactOptions, journal: Journal, learned: Learned | None
+    features: FeatureGaussians,
+    options: CompactOptions,
+    journal: Journal,
+    learned: Learned | None,
+    finish: Callable[[FeatureGaussians], FeatureGaussians],
 ) -> FeatureGaussians:
-    """Merged across views; where networks are loaded, in line with their neighbours."""
+    """Merged across views; where networks are loaded, in line with their neighbours; then what ``finish`` does."""
     with journal.stage("match"):
         matches = match(features, options.match, learned)
         journal.choices["groups"], journal.choices["clusters"] = len(features), matches.count
         features = merge(features, matches, learned)
-    if learned is None:
-        return features
+        if learned is None:
+            return finish(features)
     with journal.stage("refine"):
-        return refine(features, learned)
+        return finish(refine(features, learned))
 
 
 def _fitted(

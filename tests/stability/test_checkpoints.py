@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from learned import noisy, scaled, written
+from loose import shuffled
 from safetensors.torch import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
 
@@ -32,6 +33,32 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
     assert learned.report.choices["networks"]["checkpoint"] == str(path)
     assert "networks" not in plain.report.choices
     assert "refine" in learned.report.seconds
+
+
+def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
+    scene = make_scene(room(), arc(3))
+    chosen = {"fit": "none", "density": 0.1}
+    path = written(tmp_path / "a.safetensors", Networks())
+    loose = shuffled(scene)
+    plain = gsmerge.compact(loose, **chosen)
+    assert identical(plain.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path)).gaussians)
+    written(path, noisy())
+    one = gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=1)
+    assert_invariants(one.gaussians, scene)
+    assert not torch.equal(one.gaussians.means[:20], plain.gaussians.means[:20])
+    assert identical(one.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=3).gaussians)
+
+
+@pytest.mark.parametrize("settings", [{}, {"target_psnr": 15.0}, {"levels": 2}], ids=str)
+def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
+    scene = make_scene(room(), arc(2))
+    path = written(tmp_path / "a.safetensors", noisy())
+    found = gsmerge.compact(scene, fit="none", density=0.1, checkpoint=str(path), **settings)
+    for result in (found, *found.coarser):
+        assert result.report.choices["networks"]["checkpoint"] == str(path)
+    rival = gsmerge.compact(scene, method="random", checkpoint=str(path))
+    assert "networks" not in rival.report.choices
+    assert any("checkpoint" in note for note in rival.report.notes)
 
 
 def test_a_checkpoint_that_cannot_be_used_is_told(tmp_path: Path) -> None:
