@@ -15,12 +15,13 @@ from torch import Tensor
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.networks.evidence import EVIDENCE, evidence
 from gsmerge.networks.residuals import sizes_of
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
 
 PART = 13  # of a Gaussian beside another one: place, log scales, opacity, colour, normal
 MEMBER = PART + 6  # and place in footprints, colour itself
-GROUP = 19
+GROUP = 19 + EVIDENCE
 TINY = 1e-12
 
 
@@ -53,7 +54,8 @@ def describe(features: FeatureGaussians, members: Members, cameras: Cameras) -> 
     sizes, footprints = sizes_of(scales).clamp_min(TINY), features.footprints.clamp_min(TINY)
     group = _group_numbers(features, base, frames, sizes, footprints)
     places = image_places(features.means, views, cameras)
-    return Described(base, frames, sizes, footprints, views, torch.cat([group, places], 1).nan_to_num())
+    told = evidence(features.means, features.sh0, views, members, cameras)
+    return Described(base, frames, sizes, footprints, views, torch.cat([group, places, told], 1).nan_to_num())
 
 
 def _group_numbers(
