@@ -61,8 +61,8 @@ def train(
     quiet = quiet or json
     with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, use_threads(threads):
         folder = cache or out / "examples"
-        examples = [_example(path, options, folder, progress) for path in data]
-        held = [_example(path, options, folder, progress) for path in validation or []]
+        examples = [example for path in data for example in _examples(path, options, folder, progress)]
+        held = [example for path in validation or [] for example in _examples(path, options, folder, progress)]
         notes = [] if held else ["without --validation, other crops of the same scenes choose the best checkpoint"]
         say_notes(notes, quiet=quiet)
 
@@ -79,12 +79,12 @@ def train(
         print(one_line(f"{done.best}: {done.step} steps, validation loss {done.validation_loss:.4f}"))
 
 
-def _example(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> Example:
-    """One scene, fitted or from the cache."""
-    from gsmerge.training import read_example
+def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:
+    """One scene at all densities, fitted or from the cache."""
+    from gsmerge.training import read_examples
 
     def told(step: int, steps: int) -> None:
         if progress is not None:
             progress(f"fit {path.name}", step, steps)
 
-    return read_example(path, options, cache, told)
+    return read_examples(path, options, cache, told)

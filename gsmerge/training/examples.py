@@ -12,6 +12,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -87,8 +88,16 @@ class Example:
     levels: Mapping[int, Level]
 
 
-def read_example(path: Path, options: TrainOptions, cache: Path | None = None, progress: Told | None = None) -> Example:
-    """:func:`make_example` of a scene folder or ``.ply``; kept in the folder ``cache`` and taken from there.
+def read_examples(
+    path: Path, options: TrainOptions, cache: Path | None = None, progress: Told | None = None
+) -> list[Example]:
+    """A scene folder or ``.ply`` at every density, see :func:`make_example`.
+
+    Args:
+        path: The scene.
+        options: Densities, matching, steps of the fit, seed.
+        cache: Folder for what takes long; made if it is missing. None: nothing is kept.
+        progress: Called with (step, steps) of the fits.
 
     Raises:
         SceneError: If the scene cannot be read, is not one Gaussian per pixel, has no photos, or cannot be fitted.
@@ -99,17 +108,31 @@ def read_example(path: Path, options: TrainOptions, cache: Path | None = None, p
         raise SceneError(ply, "expected one Gaussian per pixel to learn from, found them in no order")
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them beside it in images/")
-    return make_example(scene, options, path.stem if path.suffix else path.name, cache, progress)
+    name, found = path.stem if path.suffix else path.name, list[Example]()
+    for number, density in enumerate(options.densities):
+
+        def told(step: int, steps: int, number: int = number) -> None:
+            if progress:
+                progress(number * steps + step, len(options.densities) * steps)
+
+        found.append(make_example(scene, options, density, name, cache, told))
+    return found
 
 
 def make_example(
-    scene: PixelScene, options: TrainOptions, name: str, cache: Path | None = None, progress: Told | None = None
+    scene: PixelScene,
+    options: TrainOptions,
+    density: float,
+    name: str,
+    cache: Path | None = None,
+    progress: Told | None = None,
 ) -> Example:
     """Segment, encode, match and merge a scene without networks, fit the result, and note what the fit changed.
 
     Args:
         scene: One Gaussian per pixel, with photos.
-        options: Density, matching, steps of the fit, seed.
+        options: Levels, matching, steps of the fit, seed.
+        density: Superpixels per pixel.
         name: For people and errors.
         cache: Folder for what takes long; made if it is missing. None: nothing is kept.
         progress: Called with (step, steps) of the fit.
@@ -117,17 +140,17 @@ def make_example(
     Raises:
         SceneError: If the fit does not make held-out parts of the photos better.
     """
-    sha256 = _content_hash(scene, options)
+    sha256 = _content_hash(scene, options, density)
     canonical, _ = canonicalise(scene)
     members = scene_members(canonical)
     kept = None if cache is None else cache / f"{sha256[:32]}.npz"
     columns = _read_columns(kept, options)
     if columns is None:
-        columns = _worked_out(canonical, members, options, name, progress)
+        columns = _worked_out(canonical, members, options, density, name, progress)
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             with atomic_output(kept, overwrite=True) as temporary:
-                np.savez(temporary, allow_pickle=False, **columns)
+                np.savez(temporary, **columns)
     tensors = {column: torch.from_numpy(values) for column, values in columns.items()}
     levels = {k: Level(Gaussians(*(tensors.pop(f"{n}{k}") for n in SHAPE)), *(tensors.pop(f"{n}{k}") for n in FITTED))
               for k in options.levels}  # fmt: skip
@@ -138,9 +161,9 @@ def make_example(
     )  # fmt: skip
 
 
-def _content_hash(scene: PixelScene, options: TrainOptions) -> str:
+def _content_hash(scene: PixelScene, options: TrainOptions, density: float) -> str:
     """Of all that the example hangs on."""
-    made_with = {"layout": LAYOUT, "gsmerge": __version__, "density": options.density, "match": options.match}
+    made_with = {"layout": LAYOUT, "gsmerge": __version__, "density": density, "match": options.match}
     made_with |= {"fit_steps": options.fit_steps, "seed": options.seed, "levels": options.levels}
     state = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode("ascii"))
     g, cameras = scene.gaussians, scene.cameras
@@ -152,7 +175,7 @@ def _content_hash(scene: PixelScene, options: TrainOptions) -> str:
     return state.hexdigest()
 
 
-def _read_columns(path: Path | None, options: TrainOptions) -> dict[str, np.ndarray] | None:
+def _read_columns(path: Path | None, options: TrainOptions) -> dict[str, Any] | None:
     """Arrays of an example that is kept; None where there is none that can be read."""
     if path is None or not path.is_file():
         return None
@@ -167,16 +190,16 @@ def _read_columns(path: Path | None, options: TrainOptions) -> dict[str, np.ndar
 
 
 def _worked_out(
-    scene: PixelScene, members: Members, options: TrainOptions, name: str, progress: Told | None
-) -> dict[str, np.ndarray]:
+    scene: PixelScene, members: Members, options: TrainOptions, density: float, name: str, progress: Told | None
+) -> dict[str, Any]:
     """Arrays of an example, from scratch."""
-    settings = {"density": options.density, "match": options.match, "fit": "none", "robust": False}
+    settings = {"density": density, "match": options.match, "fit": "none", "robust": False}
     chosen = CompactOptions().with_settings({**settings, "seed": options.seed})
     groups = group_scene(scene_canvas(scene, chosen), chosen).groups
     features = encode(scene, members, groups, chosen.encode)
     matches = match(features, chosen.match)
     merged = merge(features, matches)
-    columns = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
+    columns: dict[str, Any] = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
     columns |= {"clusters": matches.clusters.numpy(), "centres": merged.means.numpy()}
     described = describe(merged, members, scene.cameras)
     for number, k in enumerate(options.levels):

@@ -13,7 +13,7 @@ from .conftest import Run, listing
 
 FAST = ("--superpixels", 100, "--fit", "none", "--no-robust")
 CONFIG = {
-    "density": 0.02, "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
+    "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
     "network": {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}},
 }  # fmt: skip
 

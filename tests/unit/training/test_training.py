@@ -25,7 +25,7 @@ from gsmerge.types import PixelScene
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 OPTIONS = TrainOptions(
-    network=TINY, density=0.1, fit_steps=12, levels=(1, 2), steps=12, warmup=2, rate=3e-3, crop=60, save_every=4,
+    network=TINY, densities=(0.1,), fit_steps=12, levels=(1, 2), steps=12, warmup=2, rate=3e-3, crop=60, save_every=4,
     validation_crops=2,
 )  # fmt: skip
 
@@ -40,7 +40,7 @@ def scene(views: int = 3) -> PixelScene:
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    return make_example(scene(), OPTIONS, "room")
+    return make_example(scene(), OPTIONS, 0.1, "room")
 
 
 def files(out: Path) -> dict[str, bytes]:
@@ -184,9 +184,9 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
     def told(step: int, _: int) -> None:
         fits.append(step)
 
-    first = make_example(scene(), OPTIONS, "a", tmp_path, told)
+    first = make_example(scene(), OPTIONS, 0.1, "a", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
-    second = make_example(scene(), OPTIONS, "b", tmp_path, told)
+    second = make_example(scene(), OPTIONS, 0.1, "b", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
     assert first.sha256 == second.sha256
     for k in OPTIONS.levels:
@@ -195,15 +195,26 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
             assert a.means.equal(b.means) if f.name == "children" else a.equal(b)
     (kept,) = tmp_path.iterdir()
     kept.write_bytes(kept.read_bytes()[:1000])
-    assert make_example(scene(), OPTIONS, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
+    assert make_example(scene(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
     assert len(fits) == 4 * OPTIONS.fit_steps
-    other = make_example(make_scene(two_planes(), arc(3, 32, 24)), OPTIONS, "c", tmp_path)
+    other = make_example(make_scene(two_planes(), arc(3, 32, 24)), OPTIONS, 0.1, "c", tmp_path)
     assert other.sha256 != first.sha256
-    assert len(list(tmp_path.iterdir())) == 2
+    sparse = make_example(scene(), OPTIONS, 0.05, "a", tmp_path)
+    assert len(sparse.features) < len(first.features)
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_settings_are_checked(tmp_path: Path) -> None:
-    for wrong in ({"steps": 0}, {"rate": -1.0}, {"levels": (3,)}, {"levels": ()}, {"match": "all"}, {"seed": 1.5}):
+    for wrong in (
+        {"steps": 0},
+        {"rate": -1.0},
+        {"levels": (3,)},
+        {"levels": ()},
+        {"densities": ()},
+        {"densities": (2,)},
+        {"match": "all"},
+        {"seed": 1.5},
+    ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replace(OPTIONS, **wrong)  # type: ignore[arg-type]
     assert TrainOptions.from_dict(json.loads(json.dumps(OPTIONS.to_dict()))) == OPTIONS
