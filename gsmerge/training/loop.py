@@ -7,6 +7,7 @@ was interrupted ends with the same bytes as one that was not, on any number of t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from gsmerge.threads import parallel_map, use_threads
 from gsmerge.training.examples import Example
 from gsmerge.training.options import TrainOptions
 from gsmerge.training.predict import Crop, predicted, random_crop
-from gsmerge.training.record import REMEDY, Row, load_state, save_state, write_losses
+from gsmerge.training.record import REMEDY, Learner, Row, load_state, save_state, write_losses
 
 Told = Callable[[int, int, float], None]  # step, steps, loss
 PARTS = {"mean": MEAN, "size": SIZE, "turn": TURN, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
@@ -87,49 +88,48 @@ def train(
 def _run(
     examples: Sequence[Example], validation: Sequence[Example], out: Path, options: TrainOptions, progress: Told | None
 ) -> Trained:
-    networks = _fresh(options)
-    optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
+    learner = _fresh(options)
     scales, crops = target_scales(examples), _validation_crops(validation, options)
     hashes = {kind: [e.sha256 for e in part] for kind, part in (("data", examples), ("validation", validation))}
-    step, rows, best = _resumed(out, networks, optimizer, {"options": options.to_dict(), **hashes})
+    step, rows, best = _resumed(out, learner, {"options": options.to_dict(), **hashes})
     resumed, losses = step, list[Tensor]()
     while step < options.steps:
-        losses.append(_step(networks, optimizer, examples, scales, options, step))
+        losses.append(_step(learner, examples, scales, options, step))
         step += 1
         if progress:
             progress(step, options.steps, float(losses[-1]))
         if step % options.save_every == 0 or step == options.steps:
-            judged = _judged(networks, crops, scales, options)
+            judged = _judged(learner.smooth, crops, scales, options)
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **judged})
             losses = []
             told = {"step": step, "loss": mean, "validation": judged, "options": options.to_dict(), **hashes}
             if judged["validation_loss"] < best:
                 best = judged["validation_loss"]
-                save_checkpoint(out / "best.safetensors", networks, told)
-            save_checkpoint(out / "last.safetensors", networks, told)
+                save_checkpoint(out / "best.safetensors", learner.smooth, told)
+            save_checkpoint(out / "last.safetensors", learner.smooth, told)
             write_losses(out / "losses.csv", rows)
             state = {"step": step, "rows": rows, "best": best, "options": options.to_dict(), **hashes}
-            save_state(out / "state.safetensors", networks, optimizer, state)
+            save_state(out / "state.safetensors", learner, state)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     return Trained(*paths, step, rows[-1]["loss"], best, resumed)
 
 
-def _fresh(options: TrainOptions) -> Networks:
+def _fresh(options: TrainOptions) -> Learner:
     """New networks that hang on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        return Networks(options.network)
+        networks = Networks(options.network)
+    optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
+    return Learner(networks, deepcopy(networks).requires_grad_(False), optimizer)
 
 
-def _resumed(
-    out: Path, networks: Networks, optimizer: torch.optim.Optimizer, wanted: dict[str, Any]
-) -> tuple[int, list[Row], float]:
+def _resumed(out: Path, learner: Learner, wanted: dict[str, Any]) -> tuple[int, list[Row], float]:
     """Step, table and least validation loss of the run in the folder; those of a new one where there is none."""
     path = out / "state.safetensors"
     if not path.exists():
         return 0, [], float("inf")
-    told = load_state(path, networks, optimizer)
+    told = load_state(path, learner)
     for name, value in wanted.items():
         if told.get(name) != value:
             raise SceneError(path, f"expected a run with the same {name}, found another", REMEDY)
@@ -175,14 +175,14 @@ def correction_loss(found: Tensor, wanted: Tensor, options: TrainOptions) -> Ten
 
 
 def _step(
-    networks: Networks,
-    optimizer: torch.optim.Optimizer,
+    learner: Learner,
     examples: Sequence[Example],
     scales: Mapping[int, Tensor],
     options: TrainOptions,
     step: int,
 ) -> Tensor:
     """One step -> its loss."""
+    networks, optimizer = learner.networks, learner.optimizer
     parameters = list(networks.parameters())
 
     def work(index: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
@@ -201,6 +201,10 @@ def _step(
     for group in optimizer.param_groups:
         group["lr"] = options.rate_at(step)
     optimizer.step()
+    share = min(options.average, (1 + step) / (10 + step))
+    with torch.no_grad():
+        for _, parameter, mean in learner.pairs():
+            mean.lerp_(parameter, 1 - share)
     return torch.stack(losses).mean()
 
 

@@ -31,6 +31,8 @@ class TrainOptions:
         least_rate: Rate at the end of the cosine.
         decay: Weight decay (AdamW).
         clip: Largest norm of the gradient.
+        average: Weight of the old in the running mean of the weights, which is what is validated and kept; less in
+            the first steps.
         crops: Crops per step, worked on in parallel.
         crop: Merged Feature Gaussians of a crop: the nearest to one of them.
         inner: Share of a crop that is judged; the rest are neighbours.
@@ -54,6 +56,7 @@ class TrainOptions:
     least_rate: float = 1e-5
     decay: float = 1e-4
     clip: float = 1.0
+    average: float = 0.998
     crops: int = 2
     crop: int = 512
     inner: float = 0.6
@@ -68,6 +71,7 @@ class TrainOptions:
         for name in ("warmup", "seed"):
             self._expect(name, getattr(self, name), 0, 10**9, whole=True)
         self._expect("inner", self.inner, 1e-6, 1)
+        self._expect("average", self.average, 0, 1)
         for name in ("rate", "least_rate", "clip"):
             self._expect(name, getattr(self, name), 1e-12, 1e6)
         for name in ("decay", "turn_weight"):
