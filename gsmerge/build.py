@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+import torch
 
 from gsmerge.allocate import split_counts
 from gsmerge.backing import encode_backing
@@ -16,8 +18,10 @@ from gsmerge.journal import Journal
 from gsmerge.match import match
 from gsmerge.merge import merge
 from gsmerge.moments import Members
+from gsmerge.networks import Checkpoint, Learned
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_photos
+from gsmerge.refine import refine
 from gsmerge.robust import choose_merge, close_holes
 from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
 from gsmerge.unaligned import loose_count, members_of
@@ -30,10 +34,12 @@ class Source:
     Args:
         scene: The canonical scene.
         members: Its Gaussians as members of groups; None where the superpixels decide who belongs to them.
+        checkpoint: Networks that correct what the analytic stages make; None: those alone.
     """
 
     scene: PixelScene | LooseScene
     members: Members | None
+    checkpoint: Checkpoint | None = None
 
 
 def build(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Gaussians:
@@ -52,11 +58,15 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     if members is None:
         with journal.stage("members"):
             members = members_of(source.scene, grouping.groups, options)
-    features = _merged_features(source.scene, members, grouping, options, journal)
+    learned = None
+    if source.checkpoint is not None:
+        learned = Learned(source.checkpoint.networks, members, source.scene.cameras, options.seed)
+        journal.choices["networks"] = source.checkpoint.facts()
+    features = _merged_features(source.scene, members, grouping, options, journal, learned)
     with journal.stage("decode"):
         children = _filled(features, members, grouping, options)
-        gaussians = decode(features, members, options.decode, children, options.encode.rule)
-    del features, members
+        gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+    del features, members, learned
     if source.scene.images is None:
         return gaussians
     with journal.stage("fit"):
@@ -73,25 +83,34 @@ def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Ga
 
 
 def _merged_features(
-    scene: PixelScene | LooseScene, members: Members, grouping: Grouping, options: CompactOptions, journal: Journal
+    scene: PixelScene | LooseScene,
+    members: Members,
+    grouping: Grouping,
+    options: CompactOptions,
+    journal: Journal,
+    learned: Learned | None,
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
     with journal.stage("encode"):
-        features = encode(scene, members, grouping.groups, options.encode)
+        features = encode(scene, members, grouping.groups, options.encode, learned)
     if not grouping.robust:
-        with journal.stage("match"):
-            return _matched(features, options, journal)
+        return _matched(features, options, journal, learned, lambda merged: merged)
     with journal.stage("robust"):
-        coarse = grouping.coarse
-        backing = encode_backing(scene, members, coarse, options.backing) if coarse is not None else None
+        backing = None
+        if grouping.coarse is not None:
+            backing = encode_backing(scene, members, grouping.coarse, options.backing)
+            backing = replace(backing, latents=torch.zeros(len(backing), features.latents.shape[1]))
         photos = scene_photos(scene, 2)
         aligned = isinstance(scene, PixelScene)
         features, choice = choose_merge(features, backing, photos, options.robust, left_out=aligned)
         journal.choices["merge"], journal.choices["merge_scores"] = choice.name, choice.scores
-    with journal.stage("match"):
-        features, choice = close_holes(_matched(features, options, journal), backing, photos, options.robust)
+
+    def closed(merged: FeatureGaussians) -> FeatureGaussians:
+        merged, choice = close_holes(merged, backing, photos, options.robust)
         journal.choices["closed"] = choice.name
-        return features
+        return merged
+
+    return _matched(features, options, journal, learned, closed)
 
 
 def _filled(
@@ -105,11 +124,22 @@ def _filled(
     return None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
 
 
-def _matched(features: FeatureGaussians, options: CompactOptions, journal: Journal) -> FeatureGaussians:
-    """Merged across views."""
-    matches = match(features, options.match)
-    journal.choices["groups"], journal.choices["clusters"] = len(features), matches.count
-    return merge(features, matches)
+def _matched(
+    features: FeatureGaussians,
+    options: CompactOptions,
+    journal: Journal,
+    learned: Learned | None,
+    finish: Callable[[FeatureGaussians], FeatureGaussians],
+) -> FeatureGaussians:
+    """Merged across views; where networks are loaded, in line with their neighbours; then what ``finish`` does."""
+    with journal.stage("match"):
+        matches = match(features, options.match, learned)
+        journal.choices["groups"], journal.choices["clusters"] = len(features), matches.count
+        features = merge(features, matches, learned)
+        if learned is None:
+            return finish(features)
+    with journal.stage("refine"):
+        return finish(refine(features, learned))
 
 
 def _fitted(

@@ -1,4 +1,4 @@
-"""feature gaussians -> gaussians: K children of every group, without a network."""
+"""feature gaussians -> gaussians: K children of every group, analytic, with the networks' heads on top."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 
 from gsmerge.kernels.bisect import bisect, gather_groups
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
+from gsmerge.networks import Learned, decode_gaussians
 from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
 
@@ -50,6 +51,7 @@ def decode(
     options: DecodeOptions,
     counts: np.ndarray | None = None,
     rule: Rule = "depth",
+    learned: Learned | None = None,
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 
@@ -62,6 +64,7 @@ def decode(
         options: K and the least opacity.
         counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer are not looked at.
         rule: How children are pooled, the encoder's.
+        learned: Networks whose heads correct the children; None: none does.
 
     Returns:
         The Gaussians, those of one group next to each other.
@@ -73,14 +76,26 @@ def decode(
         counts = np.full(len(features), options.count)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    divided = (counts > 1) & ~features.backing.numpy()
-    gaussians = feature_to_gaussians(features)
-    if divided.any():
-        children, parents = _children(features, members, np.flatnonzero(divided), counts, rule)
-        whole = np.flatnonzero(~divided)
-        order = np.argsort(np.concatenate([whole, parents]), kind="stable")
-        gaussians = Gaussians.concat([gaussians[torch.from_numpy(whole)], children])[torch.from_numpy(order)]
+    gaussians, parents = divide(features, members, counts, rule)
+    if learned is not None:
+        gaussians = decode_gaussians(gaussians, parents, features, learned)
     return gaussians[gaussians.opacities >= options.min_opacity]
+
+
+def divide(
+    features: FeatureGaussians, members: Members, counts: np.ndarray, rule: Rule = "depth"
+) -> tuple[Gaussians, np.ndarray]:
+    """The analytic children of :func:`decode`, however faint, and the Feature Gaussian ``[n]`` of each, rising."""
+    divided = (counts > 1) & ~features.backing.numpy()
+    gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
+    if divided.any():
+        children, of_children = _children(features, members, np.flatnonzero(divided), counts, rule)
+        whole = np.flatnonzero(~divided)
+        parents = np.concatenate([whole, of_children])
+        order = np.argsort(parents, kind="stable")
+        parents = parents[order]
+        gaussians = Gaussians.concat([gaussians[torch.from_numpy(whole)], children])[torch.from_numpy(order)]
+    return gaussians, parents
 
 
 def _children(

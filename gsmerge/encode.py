@@ -1,4 +1,4 @@
-"""groups -> feature gaussians: the analytic encoder, one Feature Gaussian per superpixel."""
+"""groups -> feature gaussians: one Feature Gaussian per superpixel, analytic, with the networks' encoder on top."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 
 from gsmerge.kernels.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
+from gsmerge.networks import Learned, encode_features
 from gsmerge.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Groups, LooseScene, PixelScene
 
@@ -34,7 +35,11 @@ class EncodeOptions:
 
 
 def encode(
-    scene: PixelScene | LooseScene, members: Members, groups: Groups, options: EncodeOptions
+    scene: PixelScene | LooseScene,
+    members: Members,
+    groups: Groups,
+    options: EncodeOptions,
+    learned: Learned | None = None,
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, view by view.
 
@@ -43,12 +48,14 @@ def encode(
         members: Its Gaussians as arrays.
         groups: The superpixels of every view.
         options: The rule.
+        learned: Networks whose encoder looks at the members too; None: none does.
 
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
     """
     starts, ids, views = member_rows(scene, members, groups)
-    return from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
+    features = from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
+    return features if learned is None else encode_features(features, learned)
 
 
 def member_rows(
@@ -102,4 +109,5 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
         backing=torch.zeros(count, dtype=torch.bool),
         starts=tensor(starts),
         members=tensor(ids),
+        latents=torch.zeros(count, 0),
     )

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from gsmerge.kernels.cluster import connected_components, edge_scores, leader_clusters
+from gsmerge.networks import Learned, match_geometry
 from gsmerge.threads import use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
@@ -50,12 +51,15 @@ class MatchOptions:
             raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
 
 
-def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
+def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | None = None) -> Matches:
     """Clusters of Feature Gaussians of different views.
 
     The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
-    are taken by weight, ties by position. What is fully transparent is left alone.
+    are taken by weight, ties by position. What is fully transparent is left alone. Where networks are loaded, the
+    geometry compared is that of their K = 1 head.
     """
+    if learned is not None and options.match != "none":
+        features = match_geometry(features, learned)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_found = 0

@@ -6,10 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.networks import Learned, merge_features
 from gsmerge.types import FeatureGaussians, Matches
 
 
-def merge(features: FeatureGaussians, matches: Matches) -> FeatureGaussians:
+def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None = None) -> FeatureGaussians:
     """One Feature Gaussian per cluster; those that are alone pass unchanged.
 
     Members are weighted with their opacities times what the photos say of them (gains); masses and integrated
@@ -19,21 +20,29 @@ def merge(features: FeatureGaussians, matches: Matches) -> FeatureGaussians:
     Args:
         features: g Feature Gaussians.
         matches: A cluster for each.
+        learned: Networks whose merger corrects what is pooled; None: none does.
 
     Returns:
         ``matches.count`` Feature Gaussians: first those that are alone in their old order, then the merged ones.
     """
-    clusters = matches.clusters
-    sizes = torch.bincount(clusters, minlength=matches.count)
-    alone = sizes[clusters] == 1
-    if bool(alone.all()):
+    alone, order, cuts = cluster_runs(matches)
+    if len(order) == 0:
         return features
+    pooled = pool_runs(features, order, cuts)
+    if learned is not None:
+        pooled = merge_features(pooled, features, order.numpy(), cuts, learned)
+    return FeatureGaussians.concat([take(features, alone), pooled])
+
+
+def cluster_runs(matches: Matches) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Rows that are alone in their cluster; the others cluster by cluster; where each cluster begins among them."""
+    clusters = matches.clusters
+    alone = torch.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = torch.nonzero(~alone)[:, 0]
     order = order[torch.argsort(clusters[order], stable=True)]
     first = torch.ones(len(order), dtype=torch.bool)
     first[1:] = clusters[order][1:] != clusters[order][:-1]
-    cuts = torch.nonzero(first)[:, 0].numpy()
-    return FeatureGaussians.concat([take(features, torch.nonzero(alone)[:, 0]), _pool(features, order, cuts)])
+    return torch.nonzero(alone)[:, 0], order, torch.nonzero(first)[:, 0].numpy()
 
 
 def take(features: FeatureGaussians, index: Tensor) -> FeatureGaussians:
@@ -51,8 +60,8 @@ def _gather(features: FeatureGaussians, index: Tensor) -> tuple[Tensor, Tensor]:
     return starts, features.members[begin.repeat_interleave(sizes) + offsets]
 
 
-def _pool(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> FeatureGaussians:
-    """Pool runs of ``order`` that begin at ``cuts``."""
+def pool_runs(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> FeatureGaussians:
+    """One Feature Gaussian for each run of rows in ``order`` that begins at ``cuts``."""
 
     def rows(tensor: Tensor) -> np.ndarray:
         return tensor[order].double().numpy()
@@ -70,6 +79,8 @@ def _pool(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> Featur
     covars = total(share[:, None, None] * (rows(features.covars) + delta[:, :, None] * delta[:, None]))
     summed = total(extinctions)
     starts, members = _gather(features, order)
+
+    latents = features.latents[order] * torch.from_numpy(share).float()[:, None]  # in torch: gradients pass
 
     def single(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).float()
@@ -89,4 +100,5 @@ def _pool(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> Featur
         backing=features.backing[order][torch.from_numpy(cuts)],
         starts=torch.cat([starts[torch.from_numpy(cuts)], starts[-1:]]),
         members=members,
+        latents=torch.zeros(len(cuts), latents.shape[1]).index_add(0, torch.from_numpy(run), latents),
     )

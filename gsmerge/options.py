@@ -40,11 +40,14 @@ class CompactOptions:
         target: What decides the number of Gaussians.
         method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
+        checkpoint: File of trained networks that correct what the analytic stages make; ``"none"``: those alone.
+        require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:
-        ValueError: If the method is unknown, or another than ``"gsmerge"`` is asked to find the number of Gaussians.
+        ValueError: If the method is unknown, or another than ``"gsmerge"`` is asked to find the number of Gaussians;
+            if a checkpoint is required and none is named.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -58,12 +61,16 @@ class CompactOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     target: TargetOptions = field(default_factory=TargetOptions)
     method: str = "gsmerge"
+    checkpoint: str = "none"
+    require_checkpoint: bool = False
     seed: int = 0
     threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.require_checkpoint and self.checkpoint == "none":
+            raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
             return
         asked = {"k auto": self.decode.k == "auto", "levels": self.target.levels > 1}

@@ -23,6 +23,7 @@ from gsmerge.journal import STAGES, Journal, Progress
 from gsmerge.memory import peak_memory
 from gsmerge.metrics import psnr
 from gsmerge.moments import scene_members
+from gsmerge.networks import find_checkpoint
 from gsmerge.options import CompactOptions
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
@@ -162,8 +163,8 @@ def _settled(options: CompactOptions) -> CompactOptions:
 def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> _Work:
     """The scene in its own frame, and its superpixels if they are to be cut to a number."""
     target, baseline = settings.target, _rival(scene, settings, journal)
-    if baseline is not None:  # nothing is set aside
-        settings = replace(settings, contribution=ContributionOptions())
+    if baseline is not None:  # nothing is set aside, and nothing is learned
+        settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     with journal.stage("prepare"):
@@ -171,7 +172,10 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
         canonical, frame, options = ready.scene, ready.frame, ready.options
         journal.notes += ready.notes
         canvas = scene_canvas(canonical, options)
-    source = Source(canonical, scene_members(canonical) if isinstance(canonical, PixelScene) else None)
+    members = scene_members(canonical) if isinstance(canonical, PixelScene) else None
+    checkpoint, notes = find_checkpoint(settings.checkpoint, required=settings.require_checkpoint)
+    journal.notes += notes
+    source = Source(canonical, members, checkpoint)
     plain = not target.searches and options.decode.k != "auto" and canvas.limit is None
     tree = None
     if baseline is None and (not plain or target.levels > 1):

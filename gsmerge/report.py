@@ -20,6 +20,7 @@ COST_FIXED = 1.5  # imports
 COST_READ = 0.7
 COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5}
 COST_MERGE = 0.5
+COST_NETWORKS = 2.8  # at the usual density
 COST_SCORE = 1.3  # rendering the photos from input and output
 COST_ROBUST = 1.6
 COST_COLOR_FIT = 0.9
@@ -232,6 +233,7 @@ def plan_document(
     if method == "gsmerge":
         robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
         work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * robust
+        work += COST_NETWORKS * (options["checkpoint"] != "none")
     else:
         work = COST_RIVALS.get(method, COST_RIVAL)
         at_most = pixels if method.startswith("unmerged") else at_most

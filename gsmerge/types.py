@@ -290,6 +290,7 @@ class FeatureGaussians:
         backing: ``[g]`` bool: belongs to the coarse layer behind the surfaces.
         starts: ``[g+1]`` int64 into ``members``.
         members: ``[m]`` int64 rows of the scene's Gaussians, group by group.
+        latents: ``[g,d]`` what the networks remember of the group (paper section 4.2); d = 0 without networks.
     """
 
     means: Tensor
@@ -306,6 +307,7 @@ class FeatureGaussians:
     backing: Tensor
     starts: Tensor
     members: Tensor
+    latents: Tensor
 
     def __post_init__(self) -> None:
         g = self.means.shape[0]
@@ -313,6 +315,7 @@ class FeatureGaussians:
             _expect(name, getattr(self, name), (g,))
         _expect("covars", self.covars, (g, 3, 3))
         _expect("starts", self.starts, (g + 1,))
+        _expect("latents", self.latents, (g, "d"))
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -394,4 +394,5 @@ def make_features(
         backing=torch.zeros(g, dtype=torch.bool),
         starts=torch.arange(g + 1),
         members=torch.arange(g),
+        latents=torch.zeros(g, 0),
     )

@@ -21,6 +21,7 @@ from gsmerge.cli.render import render
 from gsmerge.cli.report import report
 from gsmerge.cli.segment import segment
 from gsmerge.cli.stress import stress
+from gsmerge.cli.train import train
 from gsmerge.errors import GsmergeError
 
 PROGRAM = "gsmerge"
@@ -29,7 +30,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart):
+for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart, train):
     app.command()(command)
 
 

@@ -49,6 +49,8 @@ def compact(
     time_budget: opt.TimeBudgetOption = None,
     unseen: opt.UnseenOption = None,
     method: opt.MethodOption = None,
+    checkpoint: opt.CheckpointOption = None,
+    require_checkpoint: opt.RequireCheckpointOption = False,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -67,6 +69,8 @@ def compact(
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
     inputs = input_files(files)
+    if checkpoint is not None and checkpoint != "none":
+        inputs = (*inputs, Path(checkpoint))
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:
         check_output(path, inputs, overwrite=overwrite)
@@ -80,6 +84,8 @@ def compact(
         "segmentation": segmentation,
         "effort": effort,
         "method": method,
+        "checkpoint": checkpoint,
+        "require_checkpoint": require_checkpoint or None,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}

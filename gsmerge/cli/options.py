@@ -332,6 +332,23 @@ MethodOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
+CheckpointOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|none",
+        help="Trained networks that correct what the analytic stages make; none: those alone.",
+        show_default="none",
+        rich_help_panel=MERGING,
+    ),
+]
+RequireCheckpointOption = Annotated[
+    bool,
+    typer.Option(
+        "--require-checkpoint",
+        help="A checkpoint that cannot be used is an error, instead of a note.",
+        rich_help_panel=MERGING,
+    ),
+]
 UnseenOption = Annotated[
     Unseen | None,
     typer.Option(

@@ -43,6 +43,7 @@ def test_commands_are_the_documented_ones() -> None:
         "report",
         "stress",
         "chart",
+        "train",
     }
 
 
@@ -95,7 +96,7 @@ def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device"}
+    known |= {"levels", "device", "checkpoint"}
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None

@@ -26,7 +26,7 @@ def loaded_after(code: str) -> set[str]:
         ["--help"],
         ["--version"],
         [],
-        *([name, "--help"] for name in ("compact", "inspect", "segment", "render", "preview", "chart")),
+        *([name, "--help"] for name in ("compact", "inspect", "segment", "render", "preview", "chart", "train")),
     ],
     ids=" ".join,
 )

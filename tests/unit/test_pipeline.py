@@ -9,7 +9,7 @@ import torch
 from gsmerge import CompactOptions, PixelScene, compact
 from gsmerge.journal import STAGES
 
-USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members")]
+USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine")]
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ def features(sizes: list[int]) -> FeatureGaussians:
         means=column[:, None].expand(g, 3), covars=column[:, None, None].expand(g, 3, 3), weights=column, masses=column,
         extinctions=column, gains=column, spreads=column, sh0=torch.zeros(g, 1, 3), shN=torch.zeros(g, 0, 3),
         footprints=column, views=column.long(), backing=torch.zeros(g, dtype=torch.bool), starts=starts,
-        members=torch.arange(int(starts[-1])),
+        members=torch.arange(int(starts[-1])), latents=torch.zeros(g, 0),
     )  # fmt: skip
 
 

@@ -1,0 +1,90 @@
+"""``gsmerge train``: networks from scenes."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gsmerge.cli import options as opt
+from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
+from gsmerge.cli.settings import told_as_usage
+
+if TYPE_CHECKING:
+    from gsmerge.journal import Progress
+    from gsmerge.training import Example, TrainOptions
+
+Config = Annotated[
+    Path | None,
+    typer.Option(help="TOML or JSON file with settings of the training; without it, the defaults."),
+]
+Data = Annotated[
+    list[Path], typer.Option(metavar="DIR", help="A scene to learn from: a folder or .ply; may be repeated.")
+]
+Validation = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="DIR", help="A scene that helps to choose the best checkpoint only; may be repeated."),
+]
+Out = Annotated[Path, typer.Option(help="Folder of the checkpoints. A run that it holds is gone on with.")]
+Cache = Annotated[Path | None, typer.Option(help="Folder for fitted scenes.", show_default="OUT/examples")]
+Steps = Annotated[
+    int | None, typer.Option(min=1, help="Steps of the training; wins over the file.", show_default="6000")
+]
+
+
+def train(
+    data: Data,
+    out: Out,
+    config: Config = None,
+    validation: Validation = None,
+    steps: Steps = None,
+    cache: Cache = None,
+    seed: opt.SeedOption = None,
+    threads: opt.ThreadsOption = None,
+    json: opt.JsonOption = False,
+    quiet: opt.QuietOption = False,
+    debug: opt.DebugOption = False,
+) -> None:
+    """Train networks on what the fit changes in scenes; interrupted, the same call goes on."""
+    from gsmerge.report import document_head, to_json
+    from gsmerge.threads import use_threads
+    from gsmerge.training import TrainOptions, read_config
+    from gsmerge.training import train as train_networks
+
+    options = TrainOptions() if config is None else read_config(config)
+    changes: dict[str, Any] = {name: value for name, value in (("steps", steps), ("seed", seed)) if value is not None}
+    with told_as_usage():
+        options = replace(options, **changes)
+    quiet = quiet or json
+    with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, use_threads(threads):
+        folder = cache or out / "examples"
+        examples = [example for path in data for example in _examples(path, options, folder, progress)]
+        held = [example for path in validation or [] for example in _examples(path, options, folder, progress)]
+        notes = [] if held else ["without --validation, other crops of the same scenes choose the best checkpoint"]
+        say_notes(notes, quiet=quiet)
+
+        def told(step: int, steps: int, loss: float) -> None:
+            if progress is not None:
+                progress(f"train: loss {loss:.4f}", step, steps)
+
+        done = train_networks(examples, held, out, options, threads=threads, progress=told)
+    document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
+    document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
+    if json:
+        sys.stdout.write(to_json(document))
+    elif not quiet:
+        print(one_line(f"{done.best}: {done.step} steps, validation loss {done.validation_loss:.4f}"))
+
+
+def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:
+    """One scene at all densities, fitted or from the cache."""
+    from gsmerge.training import read_examples
+
+    def told(step: int, steps: int) -> None:
+        if progress is not None:
+            progress(f"fit {path.name}", step, steps)
+
+    return read_examples(path, options, cache, told)

@@ -1,0 +1,29 @@
+"""The paper's networks as bounded corrections of the analytic stages, and the checkpoints that hold them."""
+
+from gsmerge.networks.apply import (
+    Learned,
+    decode_gaussians,
+    encode_features,
+    match_geometry,
+    merge_features,
+    refine_features,
+)
+from gsmerge.networks.checkpoint import Checkpoint, find_checkpoint, load_checkpoint, save_checkpoint
+from gsmerge.networks.modules import Networks
+from gsmerge.networks.options import Bounds, NetworkOptions
+
+__all__ = [
+    "Bounds",
+    "Checkpoint",
+    "Learned",
+    "NetworkOptions",
+    "Networks",
+    "decode_gaussians",
+    "encode_features",
+    "find_checkpoint",
+    "load_checkpoint",
+    "match_geometry",
+    "merge_features",
+    "refine_features",
+    "save_checkpoint",
+]

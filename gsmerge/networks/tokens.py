@@ -1,0 +1,157 @@
+"""What the networks read: numbers without a unit, in a frame of each group.
+
+The frame stands on the ray that the group was seen along, with the image's right and down of its own view. Lengths are
+in units of the Feature Gaussian's size or of one pixel's footprint there. So depth, focal length, resolution and the
+scale of the world drop out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.networks.evidence import EVIDENCE, evidence
+from gsmerge.networks.residuals import sizes_of
+from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
+
+PART = 13  # of a Gaussian beside another one: place, log scales, opacity, colour, normal
+MEMBER = PART + 6  # and place in footprints, colour itself
+GROUP = 19 + EVIDENCE
+TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """Feature Gaussians as the networks see them.
+
+    Args:
+        base: ``g`` Gaussians without corrections.
+        frames: ``[g,3,3]`` axes (right, down, away) as columns, world.
+        sizes: ``[g]`` geometric mean of the two largest scales, world units.
+        footprints: ``[g]`` size of one pixel, world units.
+        views: ``[g]`` int64 view that the frame belongs to.
+        group: ``[g,GROUP]`` numbers that describe the whole group.
+    """
+
+    base: Gaussians
+    frames: Tensor
+    sizes: Tensor
+    footprints: Tensor
+    views: Tensor
+    group: Tensor
+
+
+def describe(features: FeatureGaussians, members: Members, cameras: Cameras) -> Described:
+    """Feature Gaussians for the networks."""
+    base, views = feature_to_gaussians(features), own_views(features, members, cameras)
+    frames = ray_frames(features.means, views, cameras)
+    scales = base.scales / features.spreads[:, None]
+    sizes, footprints = sizes_of(scales).clamp_min(TINY), features.footprints.clamp_min(TINY)
+    group = _group_numbers(features, base, frames, sizes, footprints)
+    places = image_places(features.means, views, cameras)
+    told = evidence(features.means, features.sh0, views, members, cameras)
+    return Described(base, frames, sizes, footprints, views, torch.cat([group, places, told], 1).nan_to_num())
+
+
+def _group_numbers(
+    features: FeatureGaussians, base: Gaussians, frames: Tensor, sizes: Tensor, footprints: Tensor
+) -> Tensor:
+    """``[g,17]``: scales, opacity, mass, optical depth, members, colour, covariance."""
+    num_members = (features.starts[1:] - features.starts[:-1]).float()
+    local = frames.transpose(1, 2) @ (features.covars / sizes[:, None, None] ** 2) @ frames
+    columns = [
+        torch.log(base.scales.clamp_min(TINY) / footprints[:, None]).clamp(-12, 12) / 4,
+        logits(base.opacities)[:, None],
+        torch.log(features.masses.clamp_min(1e-30) / footprints**3)[:, None].clamp(-30, 30) / 10,
+        torch.log(features.extinctions.clamp_min(1e-30) / footprints**2)[:, None].clamp(-30, 30) / 10,
+        torch.log(num_members)[:, None] / 4,
+        (features.weights / num_members)[:, None],
+        SH_C0 * features.sh0[:, 0],
+        torch.asinh(local.flatten(1)[:, [0, 1, 2, 4, 5, 8]]),
+    ]
+    return torch.cat(columns, 1)
+
+
+def logits(opacities: Tensor) -> Tensor:
+    """Logits of opacities, held within finite bounds, divided by 3."""
+    return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
+
+
+def own_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> Tensor:
+    """``[g]`` int64 view of each Feature Gaussian: its own; of merged ones, the view that gave it most opacity."""
+    views = features.views.clone()
+    merged = torch.nonzero(views < 0)[:, 0].numpy()
+    if len(merged) == 0:
+        return views
+    starts, sizes = features.starts.numpy()[merged], np.diff(features.starts.numpy())[merged]
+    owners = np.repeat(np.arange(len(merged)), sizes)
+    offsets = np.arange(len(owners)) - (np.cumsum(sizes) - sizes)[owners]
+    ids = features.members.numpy()[starts[owners] + offsets]
+    pixels = ids if members.pixels is None else members.pixels[ids]
+    seen = pixels // (cameras.width * cameras.height)
+    sums = np.bincount(owners * len(cameras) + seen, members.opacities[ids], len(merged) * len(cameras))
+    views[torch.from_numpy(merged)] = torch.from_numpy(sums.reshape(len(merged), -1).argmax(1))
+    return views
+
+
+def ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
+    """``[n,3,3]`` frames of points ``[n,3]`` seen in ``views [n]``: image right, image down and the ray as columns."""
+    rotations, centres = cameras.viewmats[:, :3, :3].float()[views], cameras.centres.float()[views]
+    normalize = torch.nn.functional.normalize
+    away = means - centres
+    away = normalize(torch.where(away.norm(dim=1, keepdim=True) > TINY, away, rotations[:, 2]), dim=1)
+    right, ahead = (axis - (axis * away).sum(1, keepdim=True) * away for axis in (rotations[:, 0], rotations[:, 2]))
+    right = normalize(torch.where(right.norm(dim=1, keepdim=True) > 1e-3, right, ahead), dim=1)
+    return torch.stack([right, torch.linalg.cross(away, right), away], 2)
+
+
+def image_places(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
+    """``[n,2]`` tangents of the angles to the axis of each point's view, held within 3."""
+    viewmats = cameras.viewmats.float()[views]
+    camera = (viewmats[:, :3, :3] @ means[:, :, None])[:, :, 0] + viewmats[:, :3, 3]
+    return (camera[:, :2] / camera[:, 2:].clamp_min(1e-6)).clamp(-3, 3)
+
+
+def part_tokens(parts: Gaussians, described: Described, owners: Tensor) -> Tensor:
+    """``[n,PART]``: Gaussians beside the Feature Gaussians that they belong to.
+
+    Args:
+        parts: n Gaussians.
+        described: The Feature Gaussians.
+        owners: ``[n]`` the Feature Gaussian of each.
+    """
+    frames, d = described.frames[owners].transpose(1, 2), described
+    normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
+    axes = frames @ torch.stack([parts.means - d.base.means[owners], normals], 2)
+    scales = parts.scales.sort(1).values.clamp_min(TINY)
+    flat = 1 - scales[:, :1] / scales[:, 1:2]  # a round Gaussian has no normal, and rounding must not choose one
+    normals = -flat * axes[:, :, 1] * torch.sign(axes[:, 2:, 1])  # towards the camera
+    columns = [
+        torch.asinh(axes[:, :, 0] / d.sizes[owners, None]),
+        torch.log(scales / d.footprints[owners, None]).clamp(-12, 12) / 4,
+        logits(parts.opacities)[:, None],
+        SH_C0 * (parts.sh0[:, 0] - d.base.sh0[owners, 0]),
+        normals,
+    ]
+    return torch.cat(columns, 1).nan_to_num()
+
+
+def member_tokens(members: Members, ids: np.ndarray, described: Described, owners: Tensor) -> Tensor:
+    """``[n,MEMBER]``: members of groups, relative to their Feature Gaussians.
+
+    Args:
+        members: The scene's Gaussians.
+        ids: ``[n]`` rows of them.
+        described: The Feature Gaussians.
+        owners: ``[n]`` the group of each.
+    """
+    columns = (members.means, members.quats, members.scales, members.opacities, members.sh[:, :1], members.sh[:, :0])
+    picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
+    tokens = part_tokens(picked, described, owners)
+    places = described.sizes[owners, None] / described.footprints[owners, None] * torch.sinh(tokens[:, :3])
+    return torch.cat([tokens, torch.asinh(places), SH_C0 * picked.sh0[:, 0]], 1)

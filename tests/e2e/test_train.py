@@ -1,0 +1,72 @@
+"""``gsmerge train`` and ``--checkpoint`` as users call them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from learned import SMALL, noisy, written
+
+from gsmerge.networks import load_checkpoint
+
+from .conftest import Run, listing
+
+FAST = ("--superpixels", 100, "--fit", "none", "--no-robust")
+CONFIG = {
+    "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
+    "network": {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}},
+}  # fmt: skip
+
+
+def test_train_then_compact(scene_copy: Path, run: Run) -> None:
+    config, out = scene_copy / "train.json", scene_copy / "run"
+    config.write_text(json.dumps(CONFIG))
+    call = ("train", "--data", scene_copy, "--out", out, "--config", config)
+    outcome = run(*call)
+    assert outcome.code == 0, outcome.err
+    assert "best.safetensors: 4 steps" in outcome.out
+    assert "--validation" in outcome.err
+    kept = {"best.safetensors", "last.safetensors", "losses.csv", "state.safetensors"}
+    assert kept < set(listing(out))
+    assert load_checkpoint(out / "best.safetensors").networks.options.bounds.mean == 0.5
+    document = json.loads(run(*call, "--validation", scene_copy, "--json").out)
+    assert (document["step"], document["resumed"], document["notes"]) == (4, 4, [])
+    small = scene_copy / "small.ply"
+    learned = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json")
+    assert learned.code == 0, learned.err
+    report = json.loads(learned.out)
+    assert report["choices"]["networks"]["training"]["step"] in (2, 4)
+    assert report["options"]["checkpoint"] == str(out / "best.safetensors")
+    assert "refine" in report["seconds"]
+
+
+def test_settings_and_scenes_are_told_in_one_line(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+    config, out = tmp_path / "train.toml", tmp_path / "run"
+    for text, told in (("steps = 0\n", "steps"), ("stride = 3\n", "stride"), ("steps = = 3", "TOML")):
+        config.write_text(text)
+        outcome = run("train", "--data", scene_copy, "--out", out, "--config", config)
+        assert outcome.code == 3
+        assert told in outcome.err
+        assert outcome.err.count("\n") == 1
+    assert run("train", "--data", tmp_path / "nowhere", "--out", out).code == 3
+    assert run("train", "--out", out).code == 2
+
+
+def test_a_checkpoint_that_cannot_be_used(scene_copy: Path, run: Run) -> None:
+    missing, small = scene_copy / "missing.safetensors", scene_copy / "small.ply"
+    outcome = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", missing)
+    assert outcome.code == 0
+    notes = [line for line in outcome.err.splitlines() if line.startswith("note")]
+    assert len(notes) == 1
+    assert str(missing) in notes[0]
+    outcome = run("compact", scene_copy, *FAST, "--checkpoint", missing, "--require-checkpoint")
+    assert outcome.code == 3
+    assert outcome.err.count("\n") == 1
+    assert run("compact", scene_copy, *FAST, "--require-checkpoint").code == 2
+
+
+def test_a_checkpoint_is_not_replaced(scene_copy: Path, run: Run) -> None:
+    path = written(scene_copy / "a.safetensors", noisy(SMALL))
+    before = path.read_bytes()
+    assert run("compact", scene_copy, *FAST, "--checkpoint", path, "-o", path, "--overwrite").code == 2
+    assert path.read_bytes() == before

@@ -1,0 +1,67 @@
+"""Networks with weights that do something, and Feature Gaussians of a made scene for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scenes import arc, make_scene, room
+
+from gsmerge.encode import EncodeOptions, encode
+from gsmerge.moments import Members, scene_members
+from gsmerge.networks import Learned, NetworkOptions, Networks, save_checkpoint
+from gsmerge.types import FeatureGaussians, Groups, PixelScene
+
+SMALL = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
+
+
+def noisy(options: NetworkOptions = SMALL, scale: float = 0.3, seed: int = 0) -> Networks:
+    """Networks with random last layers too."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        networks = Networks(options)
+        for name, parameter in networks.named_parameters():
+            if name.split(".")[-2] in ("out", "shift") and not bool(parameter.any()):
+                torch.nn.init.normal_(parameter, std=scale)
+    return networks.eval().requires_grad_(False)
+
+
+def scaled(networks: Networks, factor: float) -> Networks:
+    """The networks with every weight times a factor, in place."""
+    for parameter in networks.parameters():
+        parameter.data.mul_(factor)
+    return networks
+
+
+def written(path: Path, networks: Networks) -> Path:
+    """A checkpoint of the networks."""
+    save_checkpoint(path, networks, {"steps": 0})
+    return path
+
+
+@dataclass(frozen=True)
+class Made:
+    """A made scene, its members and analytic Feature Gaussians of groups of many sizes."""
+
+    scene: PixelScene
+    members: Members
+    features: FeatureGaussians
+
+    def learned(self, networks: Networks, seed: int = 0) -> Learned:
+        """The networks for this scene."""
+        return Learned(networks, self.members, self.scene.cameras, seed)
+
+
+def made(num_views: int = 2) -> Made:
+    """Groups of 1 to 40 members."""
+    scene = make_scene(room(), arc(num_views, 24, 18))
+    members = scene_members(scene)
+    sizes = [1, 2, 3, 5, 8, 9, 13, 17, 30, 40]
+    edges = np.cumsum(np.tile(sizes, 4))
+    edges = edges[edges < 24 * 18]
+    labels = np.searchsorted(edges, np.arange(24 * 18), side="right").reshape(18, 24).astype(np.int32)
+    count = len(edges) + 1
+    groups = Groups(torch.from_numpy(labels).expand(num_views, -1, -1).contiguous(), (count,) * num_views)
+    return Made(scene, members, encode(scene, members, groups, EncodeOptions()))

@@ -1,0 +1,105 @@
+"""Networks that are missing, damaged or badly wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from learned import noisy, scaled, written
+from loose import shuffled
+from safetensors.torch import load_file, save_file
+from scenes import arc, assert_invariants, identical, make_scene, room
+
+import gsmerge
+from gsmerge.networks import Networks
+from gsmerge.networks.options import Bounds
+from gsmerge.types import SH_C0
+
+PLAIN = {"fit": "none", "match": "none", "robust": False, "superpixels": 100}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"k": 2}, {"k": 4, "robust": True}, {"match": "aabb"}, {"fit": "full", "fit_steps": 4}, {"budget": 150}],
+    ids=str,
+)
+def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
+    scene = make_scene(room(), arc(3))
+    path = written(tmp_path / "a.safetensors", Networks())
+    chosen = {"superpixels": 80, "fit": "color", **settings}
+    plain, learned = gsmerge.compact(scene, **chosen), gsmerge.compact(scene, **chosen, checkpoint=str(path))
+    assert identical(plain.gaussians, learned.gaussians)
+    assert learned.report.choices["networks"]["checkpoint"] == str(path)
+    assert "networks" not in plain.report.choices
+    assert "refine" in learned.report.seconds
+
+
+def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
+    scene = make_scene(room(), arc(3))
+    chosen = {"fit": "none", "density": 0.1}
+    path = written(tmp_path / "a.safetensors", Networks())
+    loose = shuffled(scene)
+    plain = gsmerge.compact(loose, **chosen)
+    assert identical(plain.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path)).gaussians)
+    written(path, noisy())
+    one = gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=1)
+    assert_invariants(one.gaussians, scene)
+    assert not torch.equal(one.gaussians.means[:20], plain.gaussians.means[:20])
+    assert identical(one.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=3).gaussians)
+
+
+@pytest.mark.parametrize("settings", [{}, {"target_psnr": 15.0}, {"levels": 2}], ids=str)
+def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
+    scene = make_scene(room(), arc(2))
+    path = written(tmp_path / "a.safetensors", noisy())
+    found = gsmerge.compact(scene, fit="none", density=0.1, checkpoint=str(path), **settings)
+    for result in (found, *found.coarser):
+        assert result.report.choices["networks"]["checkpoint"] == str(path)
+    rival = gsmerge.compact(scene, method="random", checkpoint=str(path))
+    assert "networks" not in rival.report.choices
+    assert any("checkpoint" in note for note in rival.report.notes)
+
+
+def test_a_checkpoint_that_cannot_be_used_is_told(tmp_path: Path) -> None:
+    scene = make_scene(room(), arc(2))
+    path = tmp_path / "a.safetensors"
+    plain = gsmerge.compact(scene, **PLAIN)
+    for damage in ("missing", "truncated"):
+        if damage == "truncated":
+            path.write_bytes(written(path, noisy()).read_bytes()[:-100])
+        fallen = gsmerge.compact(scene, **PLAIN, checkpoint=str(path))
+        assert identical(plain.gaussians, fallen.gaussians)
+        assert [note for note in fallen.report.notes if str(path) in note]
+        assert "networks" not in fallen.report.choices
+
+
+def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:
+    scene, path = make_scene(room(), arc(2)), tmp_path / "a.safetensors"
+    with pytest.raises(gsmerge.SceneError, match=r"a\.safetensors"):
+        gsmerge.compact(scene, **PLAIN, checkpoint=str(path), require_checkpoint=True)
+    with pytest.raises(ValueError, match="require_checkpoint"):
+        gsmerge.compact(scene, **PLAIN, require_checkpoint=True)
+    written(path, noisy())
+    tensors = load_file(path)
+    tensors["encoder.latent.bias"][0] = float("nan")
+    save_file(tensors, path)
+    with pytest.raises(gsmerge.SceneError):
+        gsmerge.compact(scene, **PLAIN, checkpoint=str(path), require_checkpoint=True)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_weights_a_hundred_times_as_large_stay_within_the_bounds(tmp_path: Path, k: int) -> None:
+    scene = make_scene(room(), arc(2))
+    path = written(tmp_path / "a.safetensors", scaled(noisy(), 100))
+    before = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0)
+    after = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0, checkpoint=str(path))
+    assert_invariants(after.gaussians, scene)
+    a, b, bounds = before.gaussians, after.gaussians, Bounds()
+    assert len(a) == len(b)
+    stages = 1.5 if k == 1 else 1.0  # refiner and head; children are pooled anew, so the refiner does not reach them
+    assert float((b.scales.log() - a.scales.log()).abs().max()) <= stages * bounds.size * 1.001
+    assert float((SH_C0 * (b.sh0 - a.sh0)).abs().max()) <= stages * bounds.color * 1.001
+    largest = a.scales.max(1).values * (2 + stages * torch.tensor(bounds.size).exp())  # encoder, refiner, head
+    assert bool(((b.means - a.means).norm(dim=1) <= 3**0.5 * 2 * largest).all())
+    assert float((b.means - a.means).abs().max()) > 0

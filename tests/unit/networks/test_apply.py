@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from learned import SMALL, Made, made, noisy
+
+from gsmerge.decode import DecodeOptions, decode
+from gsmerge.match import MatchOptions, match
+from gsmerge.merge import merge, take
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.networks import (
+    Learned,
+    NetworkOptions,
+    Networks,
+    decode_gaussians,
+    encode_features,
+    match_geometry,
+    refine_features,
+)
+from gsmerge.networks.apply import encoder_outputs, head_residuals, nearest
+from gsmerge.refine import refine
+from gsmerge.threads import use_threads
+from gsmerge.types import FeatureGaussians, Gaussians, Matches
+
+
+@pytest.fixture(scope="module")
+def scene() -> Made:
+    return made()
+
+
+def assert_close(a: FeatureGaussians | Gaussians, b: FeatureGaussians | Gaussians, atol: float = 0.0) -> None:
+    assert type(a) is type(b)
+    for f in fields(a):
+        if atol and getattr(a, f.name).is_floating_point():
+            torch.testing.assert_close(getattr(a, f.name), getattr(b, f.name), atol=atol, rtol=atol, msg=f.name)
+        else:
+            assert torch.equal(getattr(a, f.name), getattr(b, f.name)), f.name
+
+
+def pairs(features: FeatureGaussians) -> Matches:
+    """Every Feature Gaussian of the first view with the same one of the second, but for the first."""
+    half = len(features) // 2
+    clusters = torch.arange(half).repeat(2)
+    clusters[half] = half
+    return Matches(clusters, half + 1)
+
+
+def test_untrained_networks_change_no_bit(scene: Made) -> None:
+    learned = scene.learned(Networks(SMALL))
+    encoded = encode_features(scene.features, learned)
+    assert encoded.latents.shape == (len(scene.features), SMALL.latent)
+    bare = replace(encoded, latents=torch.zeros(len(encoded), 0))
+    assert_close(bare, scene.features)
+    assert_close(match_geometry(encoded, learned), encoded)
+    merged = merge(encoded, pairs(encoded), learned)
+    assert_close(merged, merge(encoded, pairs(encoded)))
+    assert_close(refine(merged, learned), merged)
+    for k in (1, 2, 3, 4, 6):
+        options = DecodeOptions(k=k)
+        assert_close(decode(merged, scene.members, options, learned=learned), decode(merged, scene.members, options))
+
+
+def test_trained_networks_change_every_stage(scene: Made) -> None:
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    assert not torch.equal(encoded.means, scene.features.means)
+    assert torch.equal(encoded.covars, scene.features.covars)  # paper: the encoder leaves the geometry to the head
+    geometry = match_geometry(encoded, learned)
+    merged, plain = merge(encoded, pairs(encoded), learned), merge(encoded, pairs(encoded))
+    assert torch.equal(merged.means[:2], plain.means[:2])  # alone
+    refined, children = refine(merged, learned), decode(merged, scene.members, DecodeOptions(k=2))
+    decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), learned=learned)
+    for after, before in ((geometry, encoded), (merged, plain), (refined, merged)):
+        for name in ("means", "covars", "extinctions", "sh0"):
+            assert not torch.equal(getattr(after, name), getattr(before, name)), name
+    assert len(decoded) >= len(children)
+    assert not torch.equal(refined.latents, merged.latents)
+
+
+def test_no_networks_and_nothing_to_do(scene: Made) -> None:
+    assert refine(scene.features, None) is scene.features
+    learned = scene.learned(noisy())
+    none = take(encode_features(scene.features, learned), torch.zeros(0, dtype=torch.int64))
+    assert len(refine(none, learned)) == 0
+    assert len(encode_features(none, learned)) == 0
+    assert len(decode(none, scene.members, DecodeOptions(), learned=learned)) == 0
+
+
+def test_order_of_the_members_does_not_matter(scene: Made) -> None:
+    starts, members = scene.features.starts.numpy(), scene.features.members.numpy().copy()
+    rng = np.random.default_rng(0)
+    for first, last in pairwise(starts):
+        members[first:last] = rng.permutation(members[first:last])
+    shuffled = replace(scene.features, members=torch.from_numpy(members))
+    learned = scene.learned(noisy())
+    a, b = encode_features(scene.features, learned), encode_features(shuffled, learned)
+    assert torch.equal(a.latents, b.latents)
+    assert torch.equal(a.means, b.means)
+
+
+def test_order_of_the_groups_and_the_table_they_share_do_not_matter(scene: Made) -> None:
+    """Padding and bins: every group alone gives what all together give."""
+    learned = scene.learned(noisy())
+    together = encode_features(scene.features, learned)
+    for row in range(0, len(scene.features), 3):
+        alone = encode_features(take(scene.features, torch.tensor([row])), learned)
+        assert_close(alone, take(together, torch.tensor([row])), 2e-6)
+
+
+def test_order_within_a_cluster_does_not_matter(scene: Made) -> None:
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    matches = pairs(encoded)
+    back = torch.arange(len(encoded)).flip(0)
+    a = merge(encoded, matches, learned)
+    b = merge(take(encoded, back), Matches(matches.clusters[back], matches.count), learned)
+    torch.testing.assert_close(a.means.sort(0).values, b.means.sort(0).values, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(a.latents.sort(0).values, b.latents.sort(0).values, atol=1e-5, rtol=1e-5)
+
+
+def test_clusters_alone_and_together(scene: Made) -> None:
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    half, matches = len(encoded) // 2, pairs(encoded)
+    together = merge(encoded, matches, learned)
+    two = torch.tensor([5, half + 5])
+    alone = merge(take(encoded, two), Matches(torch.zeros(2, dtype=torch.int64), 1), learned)
+    assert_close(alone, take(together, torch.tensor([2 + 5 - 1])), 2e-6)
+
+
+def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
+    """Slots that are empty do not count, whoever shares the table."""
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    counts = np.where(np.arange(len(encoded)) % 2 == 0, 3, 4)
+    options = DecodeOptions(min_opacity=0)
+    mixed = decode(encoded, scene.members, options, counts, learned=learned)
+    plain = decode(encoded, scene.members, options, counts)
+    assert len(mixed) == len(plain)
+    row = next(i for i in range(0, len(encoded), 2) if encoded.starts[i + 1] - encoded.starts[i] >= 13)
+    one = take(encoded, torch.tensor([row]))
+    alone = decode(one, scene.members, options, np.array([3]), learned=learned)
+    before = len(decode(take(encoded, torch.arange(row)), scene.members, options, counts[:row]))
+    assert_close(alone, mixed[before : before + 3], 2e-6)
+
+
+def test_many_children_and_the_backing_layer_stay_as_they_are(scene: Made) -> None:
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    large = torch.nonzero(encoded.starts.diff() >= 30)[:, 0]
+    few, options = take(encoded, large), DecodeOptions(k=6, min_opacity=0)
+    children = decode(few, scene.members, options)
+    sizes = torch.bincount(torch.cdist(children.means, few.means).argmin(1))
+    assert int(sizes.max()) >= 5
+    many = np.full(len(few), 6)
+    parents = np.repeat(np.arange(len(few)), 6)
+    if len(children) == len(parents):
+        assert_close(decode(few, scene.members, options, many, learned=learned), children)
+    behind = replace(scene.features, backing=torch.ones(len(encoded), dtype=torch.bool))
+    encoded = encode_features(behind, learned)
+    assert torch.equal(encoded.means, behind.means)
+    refined = refine(encoded, learned)
+    assert_close(refined, encoded)
+    assert_close(decode(refined, scene.members, options, learned=learned), feature_to_gaussians(refined))
+
+
+def test_refiner_reads_the_neighbours(scene: Made) -> None:
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    near = nearest(encoded, 4)
+    far = int(np.setdiff1d(np.arange(len(encoded)), np.append(near[0], 0))[-1])
+    for row, same in ((int(near[0, 0]), False), (far, True)):
+        latents = encoded.latents.clone()
+        latents[row] += 1
+        refined = refine_features(replace(encoded, latents=latents), learned)
+        assert torch.equal(refined.means[0], refine_features(encoded, learned).means[0]) is same
+
+
+def test_nearest_by_hand(scene: Made) -> None:
+    features = take(scene.features, torch.arange(6))
+    line = torch.tensor([0.0, 1, 3, 7, 7.5, 9])
+    features = replace(features, means=torch.stack([line, line * 0, line * 0], 1))
+    assert nearest(features, 2).tolist() == [[1, 2], [0, 2], [1, 0], [4, 5], [3, 5], [4, 3]]
+    behind = torch.tensor([False, False, True, True, False, False])
+    found = nearest(replace(features, backing=behind), 2)
+    assert found[2].tolist() == [3, -1]
+    assert found[0].tolist() == [1, 4]
+    piled = nearest(replace(features, means=torch.zeros(6, 3)), 3)
+    assert (piled != np.arange(6)[:, None]).all()
+    assert nearest(take(features, torch.tensor([0])), 2).tolist() == [[-1, -1]]
+
+
+def test_one_thread_and_many_give_the_same_bits(scene: Made) -> None:
+    learned = scene.learned(noisy(replace(SMALL, width=32)))
+
+    def run() -> FeatureGaussians:
+        encoded = encode_features(scene.features, learned)
+        return refine(merge(encoded, match(encoded, MatchOptions(overlap=0.3), learned), learned), learned)
+
+    with use_threads(1), torch.no_grad():
+        one = run()
+    with use_threads(4), torch.no_grad():
+        assert_close(run(), one)
+
+
+def test_the_seed_chooses_the_sample_of_large_groups(scene: Made) -> None:
+    networks = noisy()
+    a, b = (encode_features(scene.features, scene.learned(networks, seed)).latents for seed in (0, 1))
+    assert torch.equal(a, encode_features(scene.features, scene.learned(networks, 0)).latents)
+    large = scene.features.starts.diff() > SMALL.members
+    twice = scene.features.starts.diff() > 2 * SMALL.members  # a group of nine has but one place with a choice
+    assert bool((a[twice] != b[twice]).any(1).all())
+    assert torch.equal(a[~large], b[~large])
+
+
+def test_every_member_counts_in_the_mass_even_when_sampled(scene: Made) -> None:
+    """Group mass is that of all members (paper supplement), so it does not change with the limit."""
+    few, many = scene.learned(noisy()), scene.learned(noisy(replace(SMALL, members=64)))
+    assert torch.equal(few.describe(scene.features).group, many.describe(scene.features).group)
+
+
+@pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
+def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
+    learned, f = scene.learned(noisy(replace(SMALL, members=64))), scene.features  # a sample hangs on the bits of means
+    cameras = scene.scene.cameras
+    viewmats = cameras.viewmats.clone()
+    viewmats[:, :3, 3] *= factor
+    m = scene.members
+    members = replace(m, means=m.means * factor, scales=m.scales * factor, footprints=m.footprints * factor)
+    members = replace(members, **{n: getattr(members, n).astype(np.float32) for n in ("means", "scales", "footprints")})
+    larger = replace(
+        f, means=f.means * factor, covars=f.covars * factor**2, masses=f.masses * factor**3,
+        extinctions=f.extinctions * factor**2, footprints=f.footprints * factor,
+    )  # fmt: skip
+    other = Learned(learned.networks, members, replace(cameras, viewmats=viewmats))
+    a, b = encode_features(f, learned), encode_features(larger, other)
+    torch.testing.assert_close(a.means * factor, b.means, rtol=1e-5, atol=1e-5 * factor)
+
+
+def test_gradients_reach_every_parameter(scene: Made) -> None:
+    networks = noisy().requires_grad_(True)
+    learned = scene.learned(networks)
+    described = learned.describe(scene.features)
+    encoded = encoder_outputs(scene.features, described, learned)
+    features = replace(scene.features, latents=torch.tanh(encoded[:, :-3]))
+    total = encoded.square().sum()
+    for k in (1, 2, 4):
+        sizes = np.full(len(features), k)
+        parents = np.repeat(np.arange(len(features)), sizes)
+        base = feature_to_gaussians(scene.features)[torch.from_numpy(parents)]
+        total = total + head_residuals(base, parents, features, described, learned).square().sum()
+    merged = merge(features, pairs(features), learned)
+    total = total + refine_features(merged, learned).latents.square().sum()
+    total.backward()
+    for name, parameter in networks.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool(torch.isfinite(parameter.grad).all()), name
+        silent = name.startswith("heads.1.block.attention.query")  # one slot attends to itself, whatever it asks
+        assert silent or bool(parameter.grad.any()), name
+
+
+def test_decode_gaussians_takes_the_frame_of_the_parent(scene: Made) -> None:
+    learned = scene.learned(noisy())
+    encoded = encode_features(scene.features, learned)
+    base = feature_to_gaussians(encoded)
+    moved = decode_gaussians(base, np.arange(len(base)), encoded, learned)
+    assert not torch.equal(moved.means, base.means)
+    torch.testing.assert_close(moved.quats.norm(dim=1), torch.ones(len(base)), atol=1e-5, rtol=0)
+
+
+def test_sizes_are_checked() -> None:
+    for wrong in ({"width": 50}, {"heads": 0}, {"members": 10**9}, {"latent": 1.5}, {"blocks": True}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            NetworkOptions(**wrong)  # type: ignore[arg-type]
+    assert 150_000 <= Networks().num_parameters <= 300_000

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import make_features
+
+from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.networks.options import Bounds
+from gsmerge.networks.residuals import (
+    COLOR,
+    LOGIT,
+    MEAN,
+    RESIDUAL,
+    SIZE,
+    TURN,
+    bounded,
+    limits,
+    move_features,
+    move_gaussians,
+    sizes_of,
+    turn_matrices,
+    turn_quats,
+)
+from gsmerge.types import SH_C0, FeatureGaussians
+
+
+def some(count: int = 20) -> FeatureGaussians:
+    rng = np.random.default_rng(0)
+    features = make_features(rng.normal(size=(count, 3)), opacities=0.6)
+    half = torch.from_numpy(rng.normal(size=(count, 3, 3)).astype(np.float32))
+    covars = half @ half.transpose(1, 2)
+    scales = torch.linalg.eigvalsh(covars).clamp_min(1e-6).sqrt()
+    return replace(features, covars=covars, extinctions=-np.log(0.4) * scales[:, 1] * scales[:, 2])
+
+
+def frames(count: int = 20, seed: int = 1) -> torch.Tensor:
+    return quat_to_rotmat(torch.randn(count, 4, generator=torch.Generator().manual_seed(seed)))
+
+
+def test_zero_changes_no_bit() -> None:
+    features = some()
+    base, zero = feature_to_gaussians(features), torch.zeros(20, RESIDUAL)
+    for before, after in (
+        (base, move_gaussians(base, zero, frames())),
+        (features, move_features(features, base, zero, frames())),
+    ):
+        for f in fields(before):
+            assert torch.equal(getattr(before, f.name), getattr(after, f.name)), f.name
+
+
+def test_gaussians_move_as_told() -> None:
+    base = feature_to_gaussians(some())
+    residuals = torch.zeros(20, RESIDUAL)
+    residuals[:, MEAN], residuals[:, SIZE] = torch.tensor([1.0, 0, 0]), torch.tensor([0.1, 0.2, -0.3])
+    residuals[:, LOGIT], residuals[:, COLOR] = 0.7, torch.tensor([0.1, -0.1, 0.2])
+    moved = move_gaussians(base, residuals, frames())
+    torch.testing.assert_close(moved.means, base.means + frames()[:, :, 0] * sizes_of(base.scales)[:, None])
+    torch.testing.assert_close(moved.scales.log() - base.scales.log(), residuals[:, SIZE], atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.logit(moved.opacities) - torch.logit(base.opacities), residuals[:, LOGIT])
+    torch.testing.assert_close(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-6, 1.0])
+def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
+    base = replace(feature_to_gaussians(some()), opacities=torch.full((20,), opacity))
+    for logit in (-3.0, 3.0):
+        residuals = torch.zeros(20, RESIDUAL)
+        residuals[:, LOGIT] = logit
+        moved = move_gaussians(base, residuals, frames()).opacities
+        assert bool(((moved >= 0) & (moved <= 1)).all())
+
+
+def test_rotations_agree_with_each_other() -> None:
+    vectors = torch.randn(20, 3, generator=torch.Generator().manual_seed(3))
+    quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=torch.Generator().manual_seed(4)), dim=1)
+    turned = quat_to_rotmat(turn_quats(vectors, quats))
+    torch.testing.assert_close(turned, turn_matrices(vectors) @ quat_to_rotmat(quats), atol=1e-5, rtol=0)
+    quarter = turn_matrices(torch.tensor([[0, 0, torch.pi / 2]]))[0]
+    torch.testing.assert_close(quarter @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
+
+
+def test_feature_gaussians_move_like_gaussians() -> None:
+    """Means, covariances and colours alike; opacity stays with scales and follows its own column."""
+    features = some()
+    base = feature_to_gaussians(features)
+    residuals = 0.3 * torch.randn(20, RESIDUAL, generator=torch.Generator().manual_seed(5))
+    residuals[:, LOGIT] = 0
+    residuals[:, SIZE] = residuals[:, SIZE].sort(1).values * 0.1  # scales still rise
+    moved, one = move_features(features, base, residuals, frames()), move_gaussians(base, residuals, frames())
+    torch.testing.assert_close(moved.means, one.means, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(moved.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
+    decoded = feature_to_gaussians(moved)
+    torch.testing.assert_close(decoded.opacities, base.opacities, atol=1e-4, rtol=0)
+    residuals = torch.zeros(20, RESIDUAL)
+    residuals[:, LOGIT] = np.log(2)
+    doubled = feature_to_gaussians(move_features(features, base, residuals, frames()))
+    torch.testing.assert_close(doubled.opacities, 1 - (1 - base.opacities) ** 2, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("raw", [1e30, -1e30, float("inf"), float("-inf"), float("nan")])
+def test_whatever_comes_out_is_bounded(raw: float) -> None:
+    found = bounded(torch.full((2, RESIDUAL), raw), Bounds(mean=0.5), 0.5)
+    assert bool((found.abs() <= 0.5 * limits(Bounds(mean=0.5))).all())
+    assert bool(torch.isfinite(found).all())
+    assert float(limits(Bounds(turn=0.2))[TURN].max()) == pytest.approx(0.2)
+
+
+def test_bounds_are_checked() -> None:
+    for wrong in (0.0, -1.0, 100.0, float("nan"), "1"):
+        with pytest.raises(ValueError, match="size"):
+            Bounds(size=wrong)  # type: ignore[arg-type]
