@@ -26,6 +26,7 @@ from gsmerge.cli import main as gsmerge
 
 ROOT = Path(__file__).parents[1]
 FAST_RIVALS = "random,opacity,contribution,blocks,voxel,paper"
+NO_PROXIES = ("--proxy-views", "0")
 LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
 
 
@@ -47,18 +48,19 @@ class Part:
 
 
 SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
-VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", "--proxy-views", "0")
+VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", *NO_PROXIES)
 PARTS = (
     Part(
         "sizes",
         "plain",
         (
             ("--methods", f"gsmerge,{FAST_RIVALS}", *SIZES),
-            ("--budgets", "4.4%", "--efforts", "fast,best", "--proxy-views", "0"),
-            ("--budgets", "4.4%", "--fit", "color,none", "--proxy-views", "0"),
-            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "robust=false", "--proxy-views", "0"),
-            ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", "--proxy-views", "0"),
-            ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", "--proxy-views", "0"),
+            ("--budgets", "4.4%", "--efforts", "fast,best", *NO_PROXIES),
+            ("--budgets", "4.4%", "--fit", "color,none", *NO_PROXIES),
+            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "robust=false", *NO_PROXIES),
+            ("--densities", "0.044,0.15", "--fit", "none", "--efforts", "fast", "--fixed", "robust=false", *NO_PROXIES),
+            ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", *NO_PROXIES),
+            ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", *NO_PROXIES),
         ),
         ("quality-seconds", "quality-ratio", "stages", "proxy", "break-even"),
     ),
@@ -67,15 +69,15 @@ PARTS = (
         "ablation",
         "plain",
         (
-            ("--matches", "overlap,none", "--proxy-views", "0"),
-            ("--fit", "color,none", "--proxy-views", "0"),
-            ("--densities", "0.02,0.087", "--proxy-views", "0"),
-            ("--segmentations", "bass-st,slic", "--proxy-views", "0"),
-            ("--k", "2,4,auto", "--proxy-views", "0"),
+            ("--matches", "overlap,none", *NO_PROXIES),
+            ("--fit", "color,none", *NO_PROXIES),
+            ("--densities", "0.02,0.087", *NO_PROXIES),
+            ("--segmentations", "bass-st,slic", *NO_PROXIES),
+            ("--k", "2,4,auto", *NO_PROXIES),
         ),
     ),
     *(
-        Part(style, style, (("--methods", "gsmerge,paper", "--k", "1,2,4", "--proxy-views", "0"),))
+        Part(style, style, (("--methods", "gsmerge,paper", "--k", "1,2,4", *NO_PROXIES),))
         for style in ("da3", "depthsplat", "anysplat")
     ),
 )

@@ -13,6 +13,7 @@ from gsmerge.charts.experiment import OURS, SIZES, WHOLE
 from gsmerge.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord
 from gsmerge.charts.statistics import Interval, paired_intervals
 
+FEW_SCENES = 0.4  # share of the scenes that a number of views must have to be shown: not all scenes have as many views
 USUAL_RATIO = 0.044  # of the usual result: where one size stands for all
 PARTS = ("target_visible", "target", "context_visible", "context")  # what scores are taken over, the best first
 PART_WORDS = {
@@ -172,7 +173,7 @@ def by_views(records: Sequence[RunRecord], y: Value, *, with_input: bool = False
     """Lines from number of views to number of views, at the usual size; empty where there is one number alone."""
     size = usual_size(records)
     chosen = [r for r in records if (r.method == INPUT and with_input) or stands_for_all(r, size)]
-    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, least=1.0)
+    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, least=FEW_SCENES)
     return [line for line in lines if len(line.points) > 1]
 
 

@@ -98,6 +98,14 @@ def test_views_make_lines_where_there_are_several() -> None:
     assert by_views(make_grid(views=(None,)), PSNR) == []
 
 
+def test_scenes_with_fewer_views_do_not_end_the_line() -> None:
+    records = [r for r in make_grid(views=(3, 6)) if r.views_asked == 3 or r.scene != "a"]
+    scenes = {r.scene for r in records}
+    lines = by_views(records, PSNR)
+    assert [[point.label for point in line.points] for line in lines] == [["3", "6"]] * len(lines) != []
+    assert all(set(point.by_scene) == scenes - {"a"} for line in lines for point in line.points)
+
+
 def test_parts_and_metrics() -> None:
     records = make_grid()
     assert best_part(records) == "target_visible"
