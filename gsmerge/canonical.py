@@ -19,6 +19,7 @@ from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 Scene = TypeVar("Scene", PixelScene, LooseScene)
 SAMPLES = 65536  # Gaussians that are looked at
+NEAR = 0.01  # near plane of every render that is scored, in canonical units
 MAX_VIEWS = 32  # of a scene in no order
 
 

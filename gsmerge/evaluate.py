@@ -11,16 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsmerge.canonical import scene_frame
+from gsmerge.canonical import NEAR, scene_frame
 from gsmerge.errors import UsageError
 from gsmerge.metrics import psnr, ssim
 from gsmerge.perceptual import lpips, min_size
 from gsmerge.render import render
+from gsmerge.sampling import pick_views
 from gsmerge.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 from gsmerge.visibility import context_points, visible_pixels
 
-NEAR = 0.01  # near plane, in canonical units: as everywhere
 NETS = ("vgg", "alex")
 LITTLE = 0.1  # share of the held-out pixels that input views have seen; less is odd
 INPUT = "input"  # what the scene itself is called among the results
@@ -246,7 +246,7 @@ def _evaluated(
     scores: list[ViewScore] = []
     seconds, count = 0.0, 0
     for split, views, visible in judged:
-        perceptual = _spread(len(views.names), options.lpips_views)
+        perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
         for i, view in enumerate(views.names):
             start = time.perf_counter()
             image = _image(gaussians, views.cameras, i, near)
@@ -282,13 +282,6 @@ def _ssim(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None) 
         return ssim(image, photo, mask)
     except ValueError:
         return None
-
-
-def _spread(count: int, most: int | None) -> set[int]:
-    """Indices of at most so many of ``count`` views, evenly spread."""
-    if most is None or most >= count:
-        return set(range(count))
-    return {int((i + 0.5) * count / most) for i in range(most)}
 
 
 def _mean(found: Sequence[Quality]) -> Quality:

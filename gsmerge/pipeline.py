@@ -14,7 +14,7 @@ import torch
 from gsmerge.allocate import RegionTree
 from gsmerge.baselines import Baseline, check_scene, find_baseline, unused_notes
 from gsmerge.build import Source, build, keep_all
-from gsmerge.canonical import Frame
+from gsmerge.canonical import NEAR, Frame
 from gsmerge.contribution import ContributionOptions
 from gsmerge.curve import LONG, SHORT, measure_curve
 from gsmerge.errors import UsageError
@@ -34,7 +34,6 @@ from gsmerge.unaligned import make_ready
 
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 AUTO_STEPS = 2  # times the usual ones
-NEAR = 0.01  # near plane, in canonical units
 
 
 @dataclass(frozen=True)

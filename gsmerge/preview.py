@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsmerge.metrics import psnr
 from gsmerge.render import render
+from gsmerge.sampling import pick_views
 from gsmerge.types import Cameras, Gaussians
 
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
@@ -22,12 +23,6 @@ GAP = 4
 def to_picture(image: Tensor) -> Picture:
     """``[h,w,3]`` float in [0, 1] -> 8 bit, RGB."""
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-
-
-def pick_views(num_views: int, most: int) -> list[int]:
-    """At most ``most`` view ids, evenly spread and without the first and last where there are enough."""
-    count = min(num_views, most)
-    return [int((i + 0.5) * num_views / count) for i in range(count)]
 
 
 def label(picture: Picture, text: str) -> Picture:

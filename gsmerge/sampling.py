@@ -1,4 +1,4 @@
-"""Which views go in and which are held out: the paper's rule (supplement A, "View sampling")."""
+"""Which views go in, which are held out (the paper's rule, supplement A, "View sampling"), and which are looked at."""
 
 from __future__ import annotations
 
@@ -23,6 +23,12 @@ def even_views(num_views: int, count: int) -> list[int]:
     if count == 1:
         return [(num_views - 1) // 2]
     return [round(i * (num_views - 1) / (count - 1)) for i in range(count)]
+
+
+def pick_views(num_views: int, most: int) -> list[int]:
+    """At most ``most`` view ids, evenly spread and without the first and last where there are enough."""
+    count = min(num_views, most)
+    return [int((i + 0.5) * num_views / count) for i in range(count)]
 
 
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:

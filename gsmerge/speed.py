@@ -11,6 +11,7 @@ import torch
 
 from gsmerge.render import plan_view, prepare, render
 from gsmerge.render.cuda import cuda_problem
+from gsmerge.sampling import pick_views
 from gsmerge.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
 from gsmerge.weights import view_weights
@@ -66,7 +67,7 @@ def measure_speeds(
         near: Nearest depth that is drawn, world units.
         threads: To draw with on the processor; None: all.
     """
-    few = cameras[_some(len(cameras))]
+    few = cameras[pick_views(len(cameras), VIEWS)]
     found: dict[str, list[Speed]] = {name: [] for name in scenes}
     with use_threads(threads) as used:
         for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
@@ -77,11 +78,6 @@ def measure_speeds(
                     count = used if device == "cpu" else 0
                     found[name].append(Speed(device, views.width, views.height, count, seconds))
     return {name: tuple(speeds) for name, speeds in found.items()}
-
-
-def _some(num_views: int) -> list[int]:
-    """The views that are drawn, evenly spread."""
-    return sorted({int((i + 0.5) * num_views / VIEWS) for i in range(VIEWS)})
 
 
 def _turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
@@ -110,7 +106,7 @@ def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
     """Gaussians that are blended into a pixel, on average over some of the views: what drawing is made of."""
     splats, entries, pixels = prepare(gaussians), 0, 0
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
-    for view in _some(len(cameras)):
+    for view in pick_views(len(cameras), VIEWS):
         plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
         entries += len(view_weights(plan).lanes)
         pixels += cameras.width * cameras.height

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
@@ -12,6 +11,7 @@ from typing import Any
 
 from gsmerge.charts.record import INPUT
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.io.tables import read_table
 
 OURS = "gsmerge"
 ALL = "all"  # word for all views
@@ -142,30 +142,14 @@ def read_grid(path: Path) -> Grid:
     Raises:
         SceneError: If the file cannot be read, or holds anything else.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneError(path, "expected a TOML or JSON file of lists, found none that can be read") from error
-    try:
-        values = json.loads(text) if path.suffix.lower() == ".json" else _toml(path, text)
-    except ValueError as error:
-        raise SceneError(path, f"expected TOML or JSON, found a mistake ({str(error).splitlines()[0]})") from error
-    known = {f.name for f in fields(Grid)}
-    if not isinstance(values, dict) or values.keys() - known:
-        odd = ", ".join(sorted(values.keys() - known)) if isinstance(values, dict) else "no table"
+    values, known = read_table(path), {f.name for f in fields(Grid)}
+    if values.keys() - known:
+        odd = ", ".join(sorted(values.keys() - known))
         raise SceneError(path, f"expected lists named {', '.join(sorted(known))}, found {odd}")
     try:
         return Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
     except (TypeError, ValueError) as error:
         raise SceneError(path, str(error)) from error
-
-
-def _toml(path: Path, text: str) -> Any:
-    if sys.version_info >= (3, 11):
-        import tomllib
-
-        return tomllib.loads(text)
-    raise SceneError(path, "TOML needs Python 3.11", "write the grid as JSON")
 
 
 def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:

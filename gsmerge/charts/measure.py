@@ -15,9 +15,9 @@ from torch import Tensor
 from gsmerge.charts.store import picture_path
 from gsmerge.evaluate import EvaluateOptions, Views, evaluate, near_plane
 from gsmerge.io import SceneLoad, atomic_output, read_targets
-from gsmerge.preview import Picture, pick_views, to_picture
+from gsmerge.preview import Picture, to_picture
 from gsmerge.render import render
-from gsmerge.sampling import even_views, midpoint_views, subset
+from gsmerge.sampling import even_views, midpoint_views, pick_views, subset
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 Scene = PixelScene | LooseScene

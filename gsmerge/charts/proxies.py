@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gsmerge.charts.store import PROXIES, append_line, digest, read_lines
 from gsmerge.metrics import psnr
-from gsmerge.preview import draw_means, pick_views
+from gsmerge.preview import draw_means
+from gsmerge.sampling import pick_views
 from gsmerge.segment import superpixels
 from gsmerge.threads import parallel_map
 

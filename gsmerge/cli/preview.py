@@ -36,7 +36,8 @@ def preview(
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
     reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files, place_views, ply_notes, read_ply, read_told
-    from gsmerge.preview import contact_sheet, pick_views
+    from gsmerge.preview import contact_sheet
+    from gsmerge.sampling import pick_views
     from gsmerge.threads import use_threads
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)

@@ -25,7 +25,7 @@ def read_table(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise SceneError(path, f"expected TOML or JSON, found a mistake ({str(error).splitlines()[0]})") from error
     if not isinstance(table, dict):
-        raise SceneError(path, "expected a table of settings, found something else")
+        raise SceneError(path, "expected a table of settings, found no table")
     return table
 
 
