@@ -15,11 +15,13 @@ import torch
 from torch import Tensor
 
 from gsmerge.geometry import project
+from gsmerge.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 Scene = TypeVar("Scene", PixelScene, LooseScene)
 SAMPLES = 65536  # Gaussians that are looked at
 NEAR = 0.01  # near plane of every render that is scored, in canonical units
+ROWS = 65536  # Gaussians per task
 MAX_VIEWS = 32  # of a scene in no order
 
 
@@ -37,8 +39,15 @@ class Frame:
 
     def enter(self, gaussians: Gaussians) -> Gaussians:
         """World to canonical; means in float32."""
-        means = ((gaussians.means.double() - self.origin) / self.unit).float()
-        return replace(gaussians, means=means, scales=gaussians.scales / self.unit)
+        means, scales = torch.empty(gaussians.means.shape), torch.empty_like(gaussians.scales)
+
+        def fill(first: int) -> None:
+            rows = slice(first, first + ROWS)
+            means[rows] = (gaussians.means[rows].double() - self.origin) / self.unit
+            torch.div(gaussians.scales[rows], self.unit, out=scales[rows])
+
+        parallel_map(fill, range(0, len(gaussians), ROWS))
+        return replace(gaussians, means=means, scales=scales)
 
     def leave(self, gaussians: Gaussians) -> Gaussians:
         """Canonical to world; means in float64."""

@@ -23,7 +23,8 @@ class MatchOptions:
     Args:
         match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes) and star clusters
             that cannot chain. ``"aabb"``: the paper's box IoU and connected components. ``"none"``: no merging
-            across views.
+            across views. None: ``"overlap"``, but ``"none"`` for a draft.
+        effort: Of the whole run; ``"draft"`` matters here.
         overlap: Least overlap, 0 to 1.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
         neighbors: Nearest neighbours in 3D that are looked at, the own view's included.
@@ -34,14 +35,15 @@ class MatchOptions:
         ValueError: If a setting is unknown or out of range.
     """
 
-    match: Method = "overlap"
+    match: Method | None = None
+    effort: str = "default"
     overlap: float = 0.7
     max_color: float = 0.12
     neighbors: int = 16
     cluster_size: int | None = None
 
     def __post_init__(self) -> None:
-        if self.match not in ("overlap", "aabb", "none"):
+        if self.match not in (None, "overlap", "aabb", "none"):
             raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
         if not 0 <= self.overlap <= 1:
             raise ValueError(f"overlap: expected 0 to 1, got {self.overlap}")
@@ -49,6 +51,11 @@ class MatchOptions:
             raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
         if self.cluster_size is not None and self.cluster_size < 1:
             raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
+
+    @property
+    def method(self) -> Method:
+        """How views are merged: as asked, otherwise by effort."""
+        return self.match or ("none" if self.effort == "draft" else "overlap")
 
 
 def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | None = None) -> Matches:
@@ -58,12 +65,12 @@ def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | 
     are taken by weight, ties by position. What is fully transparent is left alone. Where networks are loaded, the
     geometry compared is that of their K = 1 head.
     """
-    if learned is not None and options.match != "none":
+    if learned is not None and options.method != "none":
         features = match_geometry(features, learned)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_found = 0
-    if options.match != "none" and len(torch.unique(features.views)) > 1:
+    if options.method != "none" and len(torch.unique(features.views)) > 1:
         solid = features.extinctions > 0
         for layer in (solid & ~features.backing, solid & features.backing):
             rows = torch.nonzero(layer)[:, 0].numpy()
@@ -81,7 +88,7 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     means, views = features.means.double().numpy()[rows], features.views.numpy()[rows]
     covars = features.covars.double().numpy()[rows].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[:, 0].double().numpy()[rows]
-    neighbors, boxes = _nearest(means, options.neighbors), options.match == "aabb"
+    neighbors, boxes = _nearest(means, options.neighbors), options.method == "aabb"
     scores = np.empty(neighbors.shape)
     edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, views, options.max_color, boxes, scores)
     if boxes:

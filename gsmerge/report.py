@@ -18,7 +18,7 @@ SCHEMA_VERSION = 1
 # Measured on twelve views of 256 x 480; they only have to be right within a factor of two.
 COST_FIXED = 1.5  # imports
 COST_READ = 0.7
-COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5}
+COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
 COST_MERGE = 0.5
 COST_NETWORKS = 2.8  # at the usual density
 COST_SCORE = 1.3  # rendering the photos from input and output

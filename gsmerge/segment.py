@@ -3,8 +3,9 @@
 The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
 first (more than wanted), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
 is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
-Shi-Tomasi response, as in the paper, and ``slic`` the common baseline. Whichever it is, there are exactly as
-many superpixels as asked for, none is empty, each is 4-connected, and a run repeats bit for bit.
+Shi-Tomasi response, as in the paper, ``slic`` the common baseline, and ``grid`` rectangles that no colour has a say
+in: where they are a few pixels large and no fit follows, they are as good and cost nothing. Whichever it is, there are
+exactly as many superpixels as asked for, none is empty, each is 4-connected, and a run repeats bit for bit.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from gsmerge.kernels.ward import merge_regions
 from gsmerge.threads import parallel_map
 from gsmerge.types import Groups
 
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic")
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic", "grid")
 # Effort -> (rectangles per superpixel, sweeps before merging).
-EFFORTS = {"fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
+EFFORTS = {"draft": (1.0, 0), "fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
 NUM_SWEEPS = 2
 BLOCK = 32  # side of the squares that the cutting starts from, pixels
 PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
@@ -39,8 +40,8 @@ class SegmentOptions:
     Args:
         superpixels: Superpixels of each view; None to take ``density`` of its pixels.
         density: Superpixels per pixel, in (0, 1].
-        segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
-        effort: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
+        effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
             [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
 
@@ -115,8 +116,8 @@ def superpixels(
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
         count: Superpixels wanted, 1 to h·w.
-        segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
-        effort: Of ``rdseg`` only: ``fast``, ``default`` or ``best``.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
+        effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the two BASS methods).
 
     Returns:
@@ -140,11 +141,29 @@ def superpixels(
         )
     if segmentation == "rdseg":
         labels = _rdseg(pixels, count, effort, compactness)
+    elif segmentation == "grid":
+        return torch.from_numpy(grid_labels(height, width, count))
     elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
         labels = _bass(pixels, count, salient=segmentation == "bass-st")
     return torch.from_numpy(np.ascontiguousarray(labels[1:-1, 1:-1]))
+
+
+def grid_labels(height: int, width: int, count: int) -> np.ndarray:
+    """``[h,w]`` int32: exactly ``count`` rectangles about as high as wide, in rows that differ by at most one.
+
+    Args:
+        height: Rows of pixels.
+        width: Columns of pixels.
+        count: Rectangles, 1 to height x width.
+    """
+    least = -(-count // width)  # rows of blocks that can hold them all
+    lines = min(height, count, max(least, round((count * height / width) ** 0.5)))
+    first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
+    line = np.arange(height) * lines // height
+    blocks = np.diff(first)[line]
+    return (first[line][:, None] + np.arange(width) * blocks[:, None] // width).astype(np.int32)
 
 
 def saliency(image: Tensor | np.ndarray) -> Tensor:

@@ -73,10 +73,3 @@ def apply_transposed(view: ViewWeights, image: Array) -> Array:
     sums = np.zeros((len(view.ids), kernels.LANES))
     kernels.collect(view.starts, view.lanes, view.weights, view.members, view.offsets, view.columns, padded, sums)
     return sums[:, :channels]
-
-
-def peak_weights(view: ViewWeights) -> Array:
-    """``[m]`` float32, the largest weight of each of ``view.ids`` at any pixel."""
-    peaks = np.zeros(len(view.ids), np.float32)
-    kernels.peaks(view.starts, view.weights, view.members, peaks)
-    return peaks

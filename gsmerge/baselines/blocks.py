@@ -12,24 +12,9 @@ from gsmerge.encode import EncodeOptions, encode
 from gsmerge.grouping import Canvas
 from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
+from gsmerge.segment import grid_labels
 from gsmerge.types import Gaussians, Groups
 from gsmerge.unaligned import members_of
-
-
-def block_labels(height: int, width: int, count: int) -> np.ndarray:
-    """``[h,w]`` int32: exactly ``count`` rectangles about as high as wide, in rows that differ by at most one.
-
-    Args:
-        height: Rows of pixels.
-        width: Columns of pixels.
-        count: Rectangles, 1 to height x width.
-    """
-    least = -(-count // width)  # rows of blocks that can hold them all
-    lines = min(height, count, max(least, round((count * height / width) ** 0.5)))
-    first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
-    line = np.arange(height) * lines // height
-    blocks = np.diff(first)[line]
-    return (first[line][:, None] + np.arange(width) * blocks[:, None] // width).astype(np.int32)
 
 
 def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
@@ -38,7 +23,7 @@ def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, jou
     height, width = scene.cameras.height, scene.cameras.width
     with journal.stage("segment"):
         counts = view_shares(count, len(scene), height * width)
-        labels = np.stack([block_labels(height, width, own) for own in counts])
+        labels = np.stack([grid_labels(height, width, own) for own in counts])
         groups = Groups(torch.from_numpy(labels), tuple(counts))
     with journal.stage("encode"):
         members = members_of(scene, groups, options) if source.members is None else source.members

@@ -29,6 +29,7 @@ class Segmentation(str, Enum):
     bass = "bass"
     bass_st = "bass-st"
     slic = "slic"
+    grid = "grid"
 
 
 class Method(str, Enum):
@@ -51,6 +52,7 @@ class Method(str, Enum):
 class Effort(str, Enum):
     """How much work to put in."""
 
+    draft = "draft"
     fast = "fast"
     default = "default"
     best = "best"
@@ -319,7 +321,8 @@ RobustOption = Annotated[
     ),
 ]
 MatchOption = Annotated[
-    Match | None, typer.Option(help="Merging across views.", show_default="overlap", rich_help_panel=MERGING)
+    Match | None,
+    typer.Option(help="Merging across views.", show_default="overlap, none for a draft", rich_help_panel=MERGING),
 ]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)

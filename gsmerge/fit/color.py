@@ -19,7 +19,7 @@ from gsmerge.photos import Photos
 from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import SH_C0, Gaussians
-from gsmerge.weights import ViewWeights, apply, apply_transposed, peak_weights, view_weights
+from gsmerge.weights import ViewWeights, apply, apply_transposed, view_weights
 
 MAX_RETRIES = 2
 HOLDOUT = 4  # times the share: the last steps see everything, and a small sample misjudges a scene of few views
@@ -60,15 +60,6 @@ def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
 
     views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
     return Drawn(len(gaussians), list(views), list(images))
-
-
-def seen(drawn: Drawn, least: float) -> torch.Tensor:
-    """Mask of the Gaussians worth keeping: those that show somewhere, or lie in no photo's frustum at all."""
-    peak, inside = np.zeros(drawn.count, np.float32), np.zeros(drawn.count, bool)
-    for view, peaks in zip(drawn.views, parallel_map(peak_weights, drawn.views), strict=True):
-        peak[view.ids] = np.maximum(peak[view.ids], peaks)
-        inside[view.ids] = True
-    return torch.from_numpy(~inside | (peak >= least))
 
 
 def fit_colors(

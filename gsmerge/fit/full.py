@@ -112,20 +112,24 @@ def step_sizes(rates: Rates, progress: float, steps: int) -> np.ndarray:
     return (np.array(columns) * decay**progress).astype(np.float32)
 
 
-def box_shares(state: State, photos: Photos, alone: float) -> np.ndarray:
-    """``[n]`` float32 share of the box that each Gaussian may use: ``alone`` to 1, by how many photos show it.
+def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
+    """PSNR (dB) of the half-size held-out blocks, and ``[n]`` float32 the share of its box that each Gaussian may use.
 
-    The number of photos is the effective one, (sum w)^2 / sum w^2 of its blending weights w in them.
+    The share is ``reach_alone`` to 1, by how many photos show a Gaussian: the effective number of them,
+    (sum w)^2 / sum w^2 of its blending weights w in them.
     """
-
+    photos, colors = plan.photos[1], state.view_colors()
     everywhere = np.ones((photos.height, photos.width, 1), np.float32)
 
-    def one_view(view: int) -> np.ndarray:
-        return splat_adjoint(plan_view(state.splats, **photos.camera(view)), everywhere)[:, 0]
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        drawn = plan_view(state.splats, **photos.camera(view))
+        return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0]
 
-    weights = np.stack(parallel_map(one_view, range(len(photos)))).astype(np.float64)
+    images, each = zip(*parallel_map(one_view, range(len(photos))), strict=True)
+    weights = np.stack(each).astype(np.float64)
     photos_each = weights.sum(0) ** 2 / np.maximum((weights**2).sum(0), 1e-12)
-    return np.clip(photos_each - 1, alone, 1).astype(np.float32)
+    shares = np.clip(photos_each - 1, plan.options.rates.reach_alone, 1).astype(np.float32)
+    return holdout_psnr(list(images), photos, plan.weights[1], plan.options.min_gain), shares
 
 
 def holdout_score(state: State, plan: Plan) -> float:
@@ -164,8 +168,8 @@ def fit_full(
         engine: What it steps with.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
-    state.shares[:] = box_shares(state, photos[1], options.rates.reach_alone)
-    before = after = holdout_score(state, plan)
+    before, state.shares[:] = first_look(state, plan)
+    after = before
     queue: list[int] = []
     grows = options.grows
     step, steps, started, error, judged = 0, options.steps, time.perf_counter(), 0.0, False

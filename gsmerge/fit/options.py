@@ -7,8 +7,9 @@ from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
-STEPS = {"fast": 30, "default": 280, "best": 1000}  # of the full fit, by effort
+STEPS = {"draft": 12, "fast": 30, "default": 280, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
+HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -52,13 +53,13 @@ class FitOptions:
 
     Args:
         fit: ``"full"``: all parameters; ``"color"``: the base colours; ``"none"``: nothing.
-        effort: ``"fast"``, ``"default"`` or ``"best"``: what ``fit_steps`` are unless given.
+        effort: ``"draft"``, ``"fast"``, ``"default"`` or ``"best"``: what ``fit_steps`` are unless given.
         fit_steps: Steps of the full fit, one view each; None: by effort.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the photos alone would be learnt by heart, otherwise 0.05 from 600 steps on and 0 below.
-        coarse: Share of the steps that look at half-size photos; None: 0.7, from 600 steps on 0.5.
+        coarse: Share of the steps that look at half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all.
         dssim: Share of structural similarity in the loss, the rest is L1.
         opacity_pull: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
             the photos do not need fades, instead of standing in front of other views.
@@ -107,7 +108,9 @@ class FitOptions:
     @property
     def coarse_share(self) -> float:
         """Share of the steps that look at half-size photos."""
-        return self.coarse if self.coarse is not None else 0.5 if self.steps >= LONG_STEPS else 0.7
+        if self.coarse is not None:
+            return self.coarse
+        return 1.0 if self.steps < HASTY_STEPS else 0.5 if self.steps >= LONG_STEPS else 0.7
 
     @property
     def grows(self) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
-from gsmerge.fit.color import draw, fit_colors, seen
+from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.device import engine_for
 from gsmerge.fit.full import Progress, fit_full
 from gsmerge.fit.grow import grow_to
@@ -14,7 +15,7 @@ from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
 from gsmerge.fit.state import gaussians_of, start_state
 from gsmerge.photos import Photos
-from gsmerge.render import composite, plan_view, prepare
+from gsmerge.render import composite, contributions, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
@@ -30,7 +31,7 @@ def fit(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Gaussians, FitReport | None]:
-    """Leave out what no photo shows, and fit the rest to the photos.
+    """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
     Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
 
@@ -45,8 +46,9 @@ def fit(
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    drawn = draw(gaussians, photos[1])
-    keep = seen(drawn, options.prune)
+    if options.fit == "none" and (options.prune == 0 or options.effort == "draft"):
+        return gaussians, None  # looking costs as much as all that was done before
+    keep = shown(gaussians, photos[1], options.prune)
     if options.fit == "none":
         return gaussians[keep], None
     if options.fit == "full":
@@ -60,8 +62,29 @@ def fit(
             grown = gaussians_of(state.x, state.splats.shN)
             fitted, report = fit_colors(grown, draw(grown, photos[1]), photos[1], options, seed)
             return _better_of(kept, fitted, report, photos[0]) if report.accepted else (kept, report)
-    fitted, report = fit_colors(gaussians, drawn, photos[1], options, seed)
+    fitted, report = fit_colors(gaussians, draw(gaussians, photos[1]), photos[1], options, seed)
     return _better_of(gaussians[keep], fitted[keep], report, photos[0])
+
+
+def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
+    """``[n]`` mask of the Gaussians worth keeping.
+
+    Args:
+        gaussians: n Gaussians.
+        photos: The views that they may show in.
+        least: Largest blending weight at a pixel that is too little. What lies in no photo's frustum stays.
+    """
+    splats = prepare(gaussians)
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        plan = plan_view(splats, **photos.camera(view))
+        return plan.ids, contributions(plan)[1]
+
+    peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
+    for ids, peaks in parallel_map(one_view, range(len(photos))):
+        inside[ids] = True
+        np.maximum(peak, peaks, out=peak)
+    return torch.from_numpy(~inside | (peak >= least))
 
 
 def _better_of(before: Gaussians, after: Gaussians, report: FitReport, photos: Photos) -> tuple[Gaussians, FitReport]:

@@ -121,13 +121,3 @@ def collect(starts, lanes, weights, members, offsets, columns, image, sums):
             sums[k, 1] += b
             sums[k, 2] += c
             sums[k, 3] += d
-
-
-@kernel
-def peaks(starts, weights, members, out):
-    """Raise ``out [m]`` to the largest weight of every Gaussian."""
-    for i in range(members.shape[0]):
-        most = f4(0.0)
-        for e in range(starts[i], starts[i + 1]):
-            most = max(most, weights[e])
-        out[members[i]] = max(out[members[i]], most)

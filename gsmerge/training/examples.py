@@ -23,9 +23,9 @@ from gsmerge.canonical import canonicalise
 from gsmerge.decode import divide
 from gsmerge.encode import encode
 from gsmerge.errors import SceneError
-from gsmerge.fit.color import draw, seen
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.options import FitOptions
+from gsmerge.fit.stage import shown
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.grouping import group_scene, scene_canvas
 from gsmerge.io import find_scene_files, read_scene
@@ -229,7 +229,7 @@ def _fitted(
     """Gaussians after a full fit without growth, and which of those given they are ``[n]``: what is not seen is not."""
     fit, photos = FitOptions(fit_steps=options.fit_steps), (scene_photos(scene), scene_photos(scene, 2))
     mask = start.opacities >= least
-    mask[mask.clone()] = seen(draw(start[mask], photos[1]), fit.prune)
+    mask[mask.clone()] = shown(start[mask], photos[1], fit.prune)
     fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress)
     if not report.accepted:
         raise SceneError(name, f"expected a scene that the fit makes better ({report.stopped})", "leave it out")

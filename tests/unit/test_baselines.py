@@ -13,12 +13,12 @@ import torch
 
 from gsmerge import CompactOptions, Gaussians, PixelScene, compact
 from gsmerge.baselines import BASELINES
-from gsmerge.baselines.blocks import block_labels
 from gsmerge.baselines.contribution import summed_weights
 from gsmerge.cli.options import Method
 from gsmerge.errors import UsageError
 from gsmerge.options import METHODS
 from gsmerge.pipeline import CompactResult
+from gsmerge.segment import grid_labels
 
 COUNT = 200
 KEEPERS = ("unmerged", "unmerged-color", "unmerged-fit")
@@ -212,7 +212,7 @@ def test_the_seed_chooses(scene: PixelScene) -> None:
     [(24, 32, 66), (24, 32, 1), (24, 32, 768), (24, 32, 767), (1, 40, 7), (40, 1, 7), (5, 7, 11)],
 )
 def test_blocks_are_as_many_as_asked_for(height: int, width: int, count: int) -> None:
-    labels = block_labels(height, width, count)
+    labels = grid_labels(height, width, count)
     assert np.array_equal(np.unique(labels), np.arange(count))
     for label in range(count):
         ys, xs = np.nonzero(labels == label)
@@ -220,7 +220,7 @@ def test_blocks_are_as_many_as_asked_for(height: int, width: int, count: int) ->
 
 
 def test_blocks_are_about_equal() -> None:
-    sizes = np.bincount(block_labels(240, 320, 300).reshape(-1))
+    sizes = np.bincount(grid_labels(240, 320, 300).reshape(-1))
     assert sizes.max() < 1.5 * sizes.min()
 
 

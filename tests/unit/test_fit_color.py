@@ -9,7 +9,7 @@ import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.fit import FitOptions, FitReport
-from gsmerge.fit.color import draw, fit_colors, seen
+from gsmerge.fit.color import draw, fit_colors
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.types import SH_C0
 
@@ -138,19 +138,5 @@ def test_small_photos_still_have_a_held_out_part(size: tuple[int, int]) -> None:
 def test_nothing_to_fit(photos: Photos, gaussians: Gaussians) -> None:
     none = gaussians[:0]
     drawn = draw(none, photos)
-    assert seen(drawn, 1 / 255).shape == (0,)
     result, _ = fit_colors(none, drawn, photos, FEW)
     assert len(result) == 0
-
-
-def test_seen(photos: Photos) -> None:
-    """In sight, hidden behind an opaque sheet, and outside all photos."""
-    sheet = [[x, y, 2.0] for x in np.linspace(-2, 2, 41) for y in np.linspace(-2, 2, 41)]
-    means = torch.tensor([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]])
-    n = len(means)
-    made = Gaussians(
-        means, torch.tensor([1.0, 0, 0, 0]).expand(n, 4), torch.full((n, 3), 0.1), torch.full((n,), 0.99),
-        torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
-    )  # fmt: skip
-    made.scales[-3:] = 0.02
-    assert seen(draw(made, photos), 1 / 255)[-3:].tolist() == [False, True, True]

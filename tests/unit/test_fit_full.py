@@ -14,7 +14,7 @@ import torch
 from gsmerge import Gaussians, PixelScene
 from gsmerge.fit import FitOptions, Rates, start_share
 from gsmerge.fit import full as full_module
-from gsmerge.fit.full import affordable_steps, box_shares, fit_full, holdout_score, plan_run, step_sizes
+from gsmerge.fit.full import affordable_steps, first_look, fit_full, holdout_score, plan_run, step_sizes
 from gsmerge.fit.state import start_state
 from gsmerge.photos import Photos
 from gsmerge.render import plan_view, splat_adjoint
@@ -102,16 +102,25 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
-    state = start_state(truth)
-    shares = box_shares(state, photos[1], 0.3)
+    state, least = start_state(truth), QUICK.rates.reach_alone
+
+    def shares_of(some: Pair) -> np.ndarray:
+        plan = plan_run(some, QUICK, 0)
+        psnr, found = first_look(state, plan)
+        assert psnr == holdout_score(state, plan)
+        return found
+
+    def with_views(views: list[int]) -> Pair:
+        return tuple(Photos(p.images[views], p.viewmats[views], p.Ks[views], p.eps2d) for p in photos)  # type: ignore[return-value]
+
+    shares, alone = shares_of(photos), with_views([0])
     assert shares.dtype == np.float32
-    assert shares.min() >= np.float32(0.3)
+    assert shares.min() >= np.float32(least)
     assert shares.max() == 1
-    alone = Photos(*(getattr(photos[1], name)[:1] for name in ("images", "viewmats", "Ks")), eps2d=photos[1].eps2d)
-    np.testing.assert_array_equal(box_shares(state, alone, 0.3), np.full(len(truth), 0.3, np.float32))
-    twice = Photos(*(np.repeat(a, 2, 0) for a in (alone.images, alone.viewmats, alone.Ks)), eps2d=alone.eps2d)
-    shown = splat_adjoint(plan_view(state.splats, **alone.camera(0)), np.ones((alone.height, alone.width, 1)))[:, 0]
-    np.testing.assert_allclose(box_shares(state, twice, 0.3), np.where(shown > 0, 1, 0.3), atol=1e-6)
+    np.testing.assert_array_equal(shares_of(alone), np.full(len(truth), least, np.float32))
+    whole = np.ones((alone[1].height, alone[1].width, 1))
+    shown = splat_adjoint(plan_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
+    np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
 
 
 def test_single_photo_moves_less(truth: Gaussians) -> None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.fit import FitOptions, FitReport, fit
-from gsmerge.fit.color import draw, seen
 from gsmerge.fit.full import fit_full
+from gsmerge.fit.stage import shown
 from gsmerge.photos import Photos
 from gsmerge.types import SH_C0
 
@@ -80,11 +81,12 @@ def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None
     start = Gaussians.concat([opaque, hidden, behind])
     result, report = fit(start, photos, replace(QUICK, fit="none"))
     assert report is None
-    keep = seen(draw(start, photos[1]), QUICK.prune)
+    keep = shown(start, photos[1], QUICK.prune)
     assert scenes.identical(result, start[keep])
     assert not keep[-6:-3].any()
     assert keep[-3:].all()
-    assert scenes.identical(fit(start, photos, replace(QUICK, fit="none", prune=0.0))[0], start)
+    for hasty in ({"prune": 0.0}, {"effort": "draft"}):
+        assert scenes.identical(fit(start, photos, replace(QUICK, fit="none", **hasty))[0], start)
 
 
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
@@ -115,3 +117,16 @@ def test_settings_out_of_range_are_refused(setting: dict[str, Any]) -> None:
     (name,) = setting
     with pytest.raises(ValueError, match=name):
         FitOptions(**setting)
+
+
+def test_shown(photos: Pair) -> None:
+    """In sight, hidden behind an opaque sheet, and outside all photos."""
+    sheet = [[x, y, 2.0] for x in np.linspace(-2, 2, 41) for y in np.linspace(-2, 2, 41)]
+    means = torch.tensor([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]])
+    n = len(means)
+    made = Gaussians(
+        means, torch.tensor([1.0, 0, 0, 0]).expand(n, 4), torch.full((n, 3), 0.1), torch.full((n,), 0.99),
+        torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
+    )  # fmt: skip
+    made.scales[-3:] = 0.02
+    assert shown(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]

@@ -25,6 +25,14 @@ def test_a_shared_name_reaches_every_stage_that_has_it() -> None:
     assert options.with_settings({"fit_steps": 77}).fit.steps == 77
 
 
+def test_a_draft_merges_no_views_and_takes_few_steps_on_small_photos() -> None:
+    draft = CompactOptions().with_settings({"effort": "draft"})
+    assert draft.match.method == "none"
+    assert (draft.fit.steps, draft.fit.coarse_share, draft.fit.grows) == (12, 1.0, False)
+    assert CompactOptions().match.method == "overlap"
+    assert draft.with_settings({"match": "aabb"}).match.method == "aabb"
+
+
 def test_settings_reach_their_stage() -> None:
     options = CompactOptions().with_settings(
         {"k": 2, "density": 0.01, "match": "aabb", "robust": False, "fit": "none", "backing": 0.01, "seed": 3}

@@ -8,6 +8,7 @@ import torch
 
 from gsmerge import CompactOptions, PixelScene, compact
 from gsmerge.journal import STAGES
+from gsmerge.segment import SEGMENTATIONS
 
 USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine")]
 
@@ -117,7 +118,7 @@ def test_tiny_images(size: tuple[int, int], views: int) -> None:
     scenes.compacted(scenes.make_scene(scenes.wall(), scenes.arc(views, *size)))
 
 
-@pytest.mark.parametrize("segmentation", ["rdseg", "bass", "bass-st", "slic"])
+@pytest.mark.parametrize("segmentation", SEGMENTATIONS)
 def test_every_segmentation(scene: PixelScene, segmentation: str) -> None:
     assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40).gaussians) <= 120
 

@@ -74,8 +74,11 @@ def test_image_is_checked(image: np.ndarray, message: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"segmentation": "watershed"}, "segmentation: expected one of rdseg, bass, bass-st, slic, got 'watershed'"),
-        ({"effort": "slow"}, "effort: expected one of fast, default, best, got 'slow'"),
+        (
+            {"segmentation": "watershed"},
+            "segmentation: expected one of rdseg, bass, bass-st, slic, grid, got 'watershed'",
+        ),
+        ({"effort": "slow"}, "effort: expected one of draft, fast, default, best, got 'slow'"),
         ({"compactness": -1.0}, r"compactness: expected a number in \[0, 1\], got -1.0"),
         ({"compactness": float("nan")}, "compactness: expected a number"),
     ],
