@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,17 +33,27 @@ PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 
+Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a run goes: photos at full and half size with their training weights, steps, and what a step does."""
+    """How a run goes: photos at full and half size with their training weights, steps, and what a step does.
+
+    ``masks``, where there are any, say which pixels of each size count at all.
+    """
 
     photos: tuple[Photos, Photos]
     weights: tuple[list[np.ndarray], list[np.ndarray]]
     options: FitOptions
     dropout: float
+    masks: Masks | None = None
+
+    def weight(self, level: int, view: int) -> np.ndarray:
+        """``[h,w]`` float32 weights of the pixels of a photo for a step: full size looks at held-out blocks, too."""
+        weight = self.weights[level][view] if level == 1 else np.ones_like(self.weights[level][view])
+        return weight if self.masks is None else weight * self.masks[level][view]
 
 
 def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int) -> Plan:
@@ -59,7 +69,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     """One Adam step on one view -> mean squared error of its training pixels."""
     level = 1 if progress < plan.options.coarse_share else 0
     photos = plan.photos[level]
-    weight = plan.weights[level][view] if level == 1 else np.ones_like(plan.weights[level][view])
+    weight = plan.weight(level, view)
     background, opacities = rng.random(3, dtype=np.float32), None
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
@@ -148,6 +158,7 @@ def fit_full(
     seed: int = 0,
     progress: Progress | None = None,
     engine: Engine = KERNELS,
+    masks: Masks | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
@@ -162,8 +173,10 @@ def fit_full(
         seed: Order of the views, backgrounds, dropout, held-out blocks.
         progress: Told after every step.
         engine: What it steps with.
+        masks: Pixels that the steps look at; None: all. Where no Gaussian is, none should be drawn to.
     """
-    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
+    rng, state = np.random.default_rng(seed), start_state(gaussians)
+    plan = replace(plan_run(photos, options, seed), masks=masks)
     state.shares[:] = box_shares(state, photos[1], options.rates.reach_alone)
     before = after = holdout_score(state, plan)
     queue: list[int] = []

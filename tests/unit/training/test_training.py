@@ -21,6 +21,7 @@ from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussian
 from gsmerge.training import Example, TrainOptions, make_example, train
 from gsmerge.training.examples import differences
 from gsmerge.training.predict import Crop, owners, predicted, random_crop
+from gsmerge.training.subjects import Subject, make_subject
 from gsmerge.types import PixelScene
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
@@ -38,9 +39,13 @@ def scene(views: int = 3) -> PixelScene:
     return make_scene(room(), arc(views, 32, 24))
 
 
+def subject() -> Subject:
+    return make_subject(scene(), range(3))
+
+
 @pytest.fixture(scope="module")
 def example() -> Example:
-    return make_example(scene(), OPTIONS, 0.1, "room")
+    return make_example(subject(), OPTIONS, 0.1, "room")
 
 
 def files(out: Path) -> dict[str, bytes]:
@@ -184,9 +189,9 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
     def told(step: int, _: int) -> None:
         fits.append(step)
 
-    first = make_example(scene(), OPTIONS, 0.1, "a", tmp_path, told)
+    first = make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
-    second = make_example(scene(), OPTIONS, 0.1, "b", tmp_path, told)
+    second = make_example(subject(), OPTIONS, 0.1, "b", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
     assert first.sha256 == second.sha256
     for k in OPTIONS.levels:
@@ -195,11 +200,11 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
             assert a.means.equal(b.means) if f.name == "children" else a.equal(b)
     (kept,) = tmp_path.iterdir()
     kept.write_bytes(kept.read_bytes()[:1000])
-    assert make_example(scene(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
+    assert make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
     assert len(fits) == 4 * OPTIONS.fit_steps
-    other = make_example(make_scene(two_planes(), arc(3, 32, 24)), OPTIONS, 0.1, "c", tmp_path)
+    other = make_example(make_subject(make_scene(two_planes(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "c", tmp_path)
     assert other.sha256 != first.sha256
-    sparse = make_example(scene(), OPTIONS, 0.05, "a", tmp_path)
+    sparse = make_example(subject(), OPTIONS, 0.05, "a", tmp_path)
     assert len(sparse.features) < len(first.features)
     assert len(list(tmp_path.iterdir())) == 3
 
