@@ -34,7 +34,7 @@ from gsmerge.io import SceneLoad, load_scene, read_targets
 from gsmerge.io.atomic import atomic_output
 from gsmerge.match import match
 from gsmerge.merge import merge
-from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.moments import Members
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, sizes_of
 from gsmerge.networks.tokens import describe
 from gsmerge.options import CompactOptions
@@ -231,7 +231,7 @@ def _worked_out(
     columns: dict[str, Any] = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
     columns |= {"clusters": matches.clusters.numpy(), "centres": merged.means.numpy()}
     frames = describe(merged, members, scene.cameras).frames
-    masks = covered(subject, feature_to_gaussians(merged))
+    masks = covered(subject)
     columns["masks"] = reduced_masks(masks, subject.photos(options.photo_scale))
     teacher = _teacher(subject, masks, name)
     for number, k in enumerate(options.levels):

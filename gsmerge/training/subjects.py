@@ -16,7 +16,7 @@ from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
 from gsmerge.sampling import even_views, subset
 from gsmerge.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
+from gsmerge.types import Cameras, LooseScene, PixelScene
 from gsmerge.visibility import context_points, visible_pixels
 
 OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
@@ -87,18 +87,13 @@ def _at_size(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
 
 
-def covered(subject: Subject, gaussians: Gaussians) -> np.ndarray:
-    """``[p,h,w]`` bool: pixels that show what the given views have seen, and that the Gaussians cover.
-
-    Args:
-        subject: Scene and cameras.
-        gaussians: Of the scene, canonical.
-    """
+def covered(subject: Subject) -> np.ndarray:
+    """``[p,h,w]`` bool: pixels that show what the given views have seen, and that their Gaussians cover."""
     own, cameras = len(subject.scene), subject.cameras
-    splats, photos = prepare(gaussians), subject.photos()
+    splats, photos = prepare(subject.scene.gaussians, np.zeros(3)), subject.photos()
 
     def opaque(view: int) -> np.ndarray:
-        return 1 - composite(plan_view(splats, **photos.camera(view)))[1] >= OPAQUE
+        return 1 - composite(plan_view(splats, **photos.camera(view), near=NEAR))[1] >= OPAQUE
 
     masks = np.stack(parallel_map(opaque, range(len(cameras))))
     if len(cameras) > own:

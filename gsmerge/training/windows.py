@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,12 +11,13 @@ from torch import Tensor
 
 from gsmerge.canonical import NEAR
 from gsmerge.metrics import WINDOW as LEAST
+from gsmerge.photos import Photos
+from gsmerge.render import plan_view, prepare
 from gsmerge.training.examples import Example
 from gsmerge.training.predict import Crop
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras
 
-SIGMAS = 3.0  # how far a footprint reaches, standard deviations
-SPARE = 2.0  # pixels more, as corrections move Gaussians
+SPARE = 4  # pixels about a window in which Gaussians may lie that corrections move into it
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,9 @@ class Window:
     @property
     def camera(self) -> Cameras:
         """One camera that sees the box alone."""
-        photos = self.crop.example.photos
-        K = torch.from_numpy(photos.Ks[self.photo].copy())
-        K[:2, 2] -= torch.tensor([self.box.left, self.box.top], dtype=K.dtype)
-        viewmat = torch.from_numpy(photos.viewmats[self.photo])
-        return Cameras(viewmat[None], K[None], self.box.width, self.box.height)
+        c = box_camera(self.crop.example.photos, self.photo, self.box)
+        viewmat, K = torch.from_numpy(c["viewmat"]), torch.from_numpy(c["K"])
+        return Cameras(viewmat[None], K[None], c["width"], c["height"])
 
     def part(self, images: np.ndarray) -> Tensor:
         """The box of one of ``images [p,h,w,...]``."""
@@ -102,19 +102,16 @@ def _about(x: int, y: int, side: int, width: int, height: int) -> Box:
 
 
 def _rows(example: Example, k: int, photo: int, box: Box) -> Tensor:
-    """Rising rows of the merged Feature Gaussians of which a child reaches into the window."""
-    level, photos = example.levels[k], example.photos
-    reached = footprints_touch(level.children, photos.viewmats[photo], photos.Ks[photo], photos.eps2d, box)
+    """Rising rows of the merged Feature Gaussians of which a child reaches into the window, or nearly does."""
+    level = example.levels[k]
+    wide = Box(box.left - SPARE, box.top - SPARE, box.width + 2 * SPARE, box.height + 2 * SPARE)
+    plan = plan_view(prepare(level.children, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
+    reached = torch.from_numpy(plan.ids[np.unique(plan.members)].astype(np.int64))
     return torch.unique(level.parents[reached])
 
 
-def footprints_touch(gaussians: Gaussians, viewmat: np.ndarray, K: np.ndarray, eps2d: float, box: Box) -> Tensor:
-    """``[n]`` bool: Gaussians whose circle of three standard deviations reaches into a window."""
-    pose, focal = torch.from_numpy(viewmat).float(), float(max(K[0, 0], K[1, 1]))
-    camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
-    depths = camera[:, 2].clamp_min(NEAR)
-    places = camera[:, :2] / depths[:, None] * torch.tensor([K[0, 0], K[1, 1]]).float()
-    places = places + torch.tensor([K[0, 2] - box.left, K[1, 2] - box.top]).float()
-    radii = SIGMAS * ((gaussians.scales.amax(1) * focal / depths).square() + eps2d).sqrt() + SPARE
-    far = torch.maximum(-places, places - torch.tensor([box.width, box.height]).float()).amax(1)
-    return (camera[:, 2] > NEAR) & (far < radii)
+def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:
+    """The camera that sees a part of a photo alone, as :func:`gsmerge.render.plan_view` takes it."""
+    K = photos.Ks[photo].copy()
+    K[:2, 2] -= box.left, box.top
+    return {**photos.camera(photo), "K": K, "width": box.width, "height": box.height}
