@@ -48,7 +48,7 @@ def train(
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
-    """Train networks on what the fit changes in scenes; interrupted, the same call goes on."""
+    """Train networks on what the fit changes in scenes and on photos; interrupted, the same call goes on."""
     from gsmerge.report import document_head, to_json
     from gsmerge.threads import use_threads
     from gsmerge.training import TrainOptions, read_config
@@ -76,7 +76,7 @@ def train(
     if json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        print(one_line(f"{done.best}: {done.step} steps, validation loss {done.validation_loss:.4f}"))
+        print(one_line(f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"))
 
 
 def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:
