@@ -76,7 +76,11 @@ def train(
     if json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        print(one_line(f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"))
+        print(
+            one_line(
+                f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"
+            )
+        )
 
 
 def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:

@@ -22,6 +22,7 @@ from torch import Tensor
 from gsmerge.errors import SceneError
 from gsmerge.networks import Networks, save_checkpoint
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, limits
+from gsmerge.perceptual import require_lpips
 from gsmerge.threads import parallel_map, use_threads
 from gsmerge.training.examples import Example
 from gsmerge.training.options import TrainOptions
@@ -84,11 +85,14 @@ def train(
 
     Raises:
         ValueError: If there are no examples.
+        GsmergeError: If LPIPS has a weight, and its own are not installed.
         SceneError: If the folder holds another run, or cannot be written.
     """
     options = options or TrainOptions()
     if not examples:
         raise ValueError("examples: expected at least one, got none")
+    if options.lpips_weight:
+        require_lpips("vgg")
     out.mkdir(parents=True, exist_ok=True)
     with use_threads(threads):
         return _run(examples, validation or examples, out, options, progress)

@@ -48,6 +48,7 @@ class TrainOptions:
         photo_loss: Difference of colours: ``"l1"`` or ``"mse"`` (the paper's).
         photo_weight: Weight of the difference of colours.
         ssim_weight: Weight of 1 - SSIM.
+        lpips_weight: Weight of LPIPS (VGG), whose weights are then needed; a step takes twice as long with it.
         regression_weight: Weight of the regression where renders are compared, falling to 0 at the end of the run.
         save_every: Steps between checkpoints, validation and lines of the table.
         validation_crops: Crops of each scene that validation looks at, always the same.
@@ -83,6 +84,7 @@ class TrainOptions:
     photo_loss: str = "l1"
     photo_weight: float = 0.8
     ssim_weight: float = 0.2
+    lpips_weight: float = 0.0
     regression_weight: float = 0.1
     save_every: int = 200
     validation_crops: int = 8
@@ -101,7 +103,7 @@ class TrainOptions:
             self._expect(name, getattr(self, name), 0, 1)
         for name in ("rate", "least_rate", "clip"):
             self._expect(name, getattr(self, name), 1e-12, 1e6)
-        for name in ("decay", "turn_weight", "photo_weight", "ssim_weight", "regression_weight"):
+        for name in ("decay", "turn_weight", "photo_weight", "ssim_weight", "lpips_weight", "regression_weight"):
             self._expect(name, getattr(self, name), 0, 1e6)
         for name in ("levels", "densities", "views"):  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))

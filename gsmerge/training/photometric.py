@@ -15,6 +15,7 @@ from gsmerge.canonical import NEAR
 from gsmerge.metrics import C1, C2
 from gsmerge.metrics import WINDOW as SIDE
 from gsmerge.networks import Networks
+from gsmerge.perceptual import lpips_loss
 from gsmerge.render.autograd import render_differentiable
 from gsmerge.training.options import TrainOptions
 from gsmerge.training.predict import foreseen
@@ -54,12 +55,13 @@ def structural_similarity(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
 
 
 def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Tensor:
-    """Weighted sum of the difference of colours and 1 - SSIM."""
+    """Weighted sum of the difference of colours, 1 - SSIM and, if it has a weight, LPIPS (VGG)."""
     example = window.crop.example
     photo, mask = window.part(example.photos.images), window.part(example.masks)
     color = color_difference(image, photo, mask, options.photo_loss)
     similar = structural_similarity(image, photo, mask) if options.ssim_weight else torch.ones(())
-    return options.photo_weight * color + options.ssim_weight * (1 - similar)
+    loss = options.photo_weight * color + options.ssim_weight * (1 - similar)
+    return loss + options.lpips_weight * lpips_loss(image, photo, mask) if options.lpips_weight else loss
 
 
 def window_psnr(window: Window, networks: Networks | None) -> float:

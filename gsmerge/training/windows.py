@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from gsmerge.canonical import NEAR
-from gsmerge.metrics import WINDOW as LEAST
 from gsmerge.photos import Photos
 from gsmerge.render import plan_view, prepare
 from gsmerge.training.examples import Example
 from gsmerge.training.predict import Crop
 from gsmerge.types import Cameras
 
+LEAST = 16  # pixels per side below which windows are not halved
 SPARE = 4  # pixels about a window in which Gaussians may lie that corrections move into it
 
 
@@ -30,7 +30,7 @@ class Box:
     height: int
 
     def halved(self) -> Box:
-        """The middle half of the longer side; sides do not become shorter than the windows of SSIM."""
+        """The middle half of the longer side; sides do not become too short to see anything."""
         if self.width >= self.height:
             width = max(min(LEAST, self.width), self.width // 2)
             return Box(self.left + (self.width - width) // 2, self.top, width, self.height)
