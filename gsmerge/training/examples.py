@@ -123,7 +123,7 @@ def read_examples(
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them beside it in images/")
     held_out = _held_out(load)
-    name, found = path.stem if path.suffix else path.name, list[Example]()
+    name, found = scene_name(path), list[Example]()
     subsets = view_subsets(len(scene), options.views)
     total = len(subsets) * len(options.densities)
     for ids in subsets:
@@ -134,8 +134,14 @@ def read_examples(
                 if progress:
                     progress(number * steps + step, total * steps)
 
-            found.append(make_example(subject, options, density, f"{name}, {len(ids)} views", cache, told))
+            found.append(make_example(subject, options, density, name, cache, told))
     return found
+
+
+def scene_name(path: Path) -> str:
+    """The folder's name, and the file's where one is told."""
+    path = path.absolute()
+    return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
 
 
 def _held_out(load: SceneLoad) -> Views | None:

@@ -21,20 +21,17 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.networks import Networks, save_checkpoint
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, limits
 from gsmerge.perceptual import require_lpips
 from gsmerge.threads import parallel_map, use_threads
 from gsmerge.training.examples import Example
+from gsmerge.training.objective import compared, correction_loss, target_scales, window_loss
 from gsmerge.training.options import TrainOptions
-from gsmerge.training.photometric import draw_window, photometric_loss, window_psnr
-from gsmerge.training.predict import Crop, foreseen, predicted, random_crop
+from gsmerge.training.predict import random_crop
 from gsmerge.training.record import REMEDY, Learner, Row, load_state, save_state, write_losses
-from gsmerge.training.windows import Window, random_window
+from gsmerge.training.validation import judged_by, make_judge, write_pictures
+from gsmerge.training.windows import random_window
 
 Told = Callable[[int, int, float], None]  # step, steps, loss
-PARTS = {"mean": MEAN, "size": SIZE, "turn": TURN, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
-VALIDATION = 2**32  # instead of the step, in what validation's random numbers hang on
-MANY = 4.0  # targets are held within so many standard deviations
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,8 @@ def train(
     Args:
         examples: Scenes to learn from, at least one.
         validation: Scenes that choose the best checkpoint; empty: other crops of the first ones.
-        out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv`` and ``state.safetensors``.
+        out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv``, ``state.safetensors`` and a picture
+            of each validation scene.
         options: Settings.
         threads: Threads to use; None: all processors. The result does not depend on it.
         progress: Called after every step.
@@ -102,7 +100,7 @@ def _run(
     examples: Sequence[Example], validation: Sequence[Example], out: Path, options: TrainOptions, progress: Told | None
 ) -> Trained:
     learner = _fresh(options)
-    scales, judge = target_scales(examples), _judge(validation, options)
+    scales, judge = target_scales(examples), make_judge(validation, options)
     hashes = {kind: [e.sha256 for e in part] for kind, part in (("data", examples), ("validation", validation))}
     step, rows = _resumed(out, learner, {"options": options.to_dict(), **hashes})
     resumed, losses = step, list[Tensor]()
@@ -112,7 +110,7 @@ def _run(
         if progress:
             progress(step, options.steps, float(losses[-1]))
         if step % options.save_every == 0 or step == options.steps:
-            judged = _judged(learner.smooth, judge, scales, options)
+            judged = judged_by(learner.smooth, judge, scales, options)
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **judged})
             losses = []
@@ -121,6 +119,7 @@ def _run(
                 save_checkpoint(out / "best.safetensors", learner.smooth, told)
             save_checkpoint(out / "last.safetensors", learner.smooth, told)
             write_losses(out / "losses.csv", rows)
+            write_pictures(out, learner.smooth, judge)
             state = {"step": step, "rows": rows, "options": options.to_dict(), **hashes}
             save_state(out / "state.safetensors", learner, state)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
@@ -158,64 +157,6 @@ def _resumed(out: Path, learner: Learner, wanted: dict[str, Any]) -> tuple[int, 
     return int(told["step"]), list(told["rows"])
 
 
-def target_scales(examples: Sequence[Example]) -> dict[int, Tensor]:
-    """``[13]`` standard deviation of every column of the targets of each K, at least a thousandth."""
-    found = {}
-    for k in examples[0].levels:
-        levels = [example.levels[k] for example in examples]
-        targets = torch.cat([level.targets[level.mask] for level in levels])
-        found[k] = targets.std(0, correction=0).clamp_min(1e-3)
-    return found
-
-
-@dataclass(frozen=True)
-class Judge:
-    """What validation looks at every time: crops, and windows with the PSNR (dB) that they have without networks."""
-
-    crops: list[Crop]
-    windows: list[Window]
-    analytic: float
-
-
-def _judge(validation: Sequence[Example], options: TrainOptions) -> Judge:
-    """Crops and, where there are novel views, windows of those."""
-    rng = np.random.default_rng([options.seed, VALIDATION])
-    every = [example for example in validation for _ in range(options.validation_crops)]
-    crops = [random_crop(example, options.crop, options.inner, rng) for example in every]
-    every = [example for example in validation for _ in range(options.validation_windows)]
-    windows = [random_window(example, options.window, options.most, 1, rng) for example in every]
-    scores = parallel_map(lambda window: window_psnr(window, None), windows)
-    return Judge(crops, windows, float(np.mean(scores)))
-
-
-def compared(
-    crop: Crop, networks: Networks, scales: Mapping[int, Tensor], options: TrainOptions, seed: int
-) -> tuple[Tensor, Tensor]:
-    """``[j,13]`` corrections and targets of the judged children, in standard deviations of the targets.
-
-    Targets are held within what the networks can say, and within a few standard deviations.
-    """
-    return _scaled(crop, predicted(crop, networks, seed), scales, options)
-
-
-def _scaled(
-    crop: Crop, corrections: Tensor, scales: Mapping[int, Tensor], options: TrainOptions
-) -> tuple[Tensor, Tensor]:
-    """:func:`compared` of corrections ``[n,13]`` that are known."""
-    targets = crop.example.levels[crop.k].targets[crop.children[crop.judged]]
-    most = 2 * limits(options.network.bounds)  # of all stages together
-    found = corrections[crop.judged]
-    return found / scales[crop.k], (targets.clamp(-most, most) / scales[crop.k]).clamp(-MANY, MANY)
-
-
-def correction_loss(found: Tensor, wanted: Tensor, options: TrainOptions) -> Tensor:
-    """Mean smooth L1 of corrections ``[j,13]``; 0 of none."""
-    weights = torch.ones(RESIDUAL)
-    weights[TURN] = options.turn_weight
-    losses = torch.nn.functional.smooth_l1_loss(found, wanted, reduction="none") * weights
-    return losses.sum() / (weights.sum() * max(1, len(wanted)))
-
-
 def _step(
     learner: Learner,
     examples: Sequence[Example],
@@ -235,7 +176,8 @@ def _step(
                 crop = random_crop(example, options.crop, options.inner, rng)
                 loss = correction_loss(*compared(crop, networks, scales, options, step), options)
             else:
-                loss = _photo_loss(networks, example, scales, options, step, rng)
+                window = random_window(example, options.window, options.most, options.novel, rng)
+                loss = window_loss(networks, window, scales, options, step, rng)
             return loss.detach(), torch.autograd.grad(loss, parameters, allow_unused=True)
 
     losses, gradients = zip(*parallel_map(work, range(options.crops)), strict=True)
@@ -251,42 +193,3 @@ def _step(
         for _, parameter, mean in learner.pairs():
             mean.lerp_(parameter, 1 - share)
     return torch.stack(losses).mean()
-
-
-def _photo_loss(
-    networks: Networks,
-    example: Example,
-    scales: Mapping[int, Tensor],
-    options: TrainOptions,
-    step: int,
-    rng: np.random.Generator,
-) -> Tensor:
-    """Loss of a random window of a photo: its render on a random background, and the regression of what is in it."""
-    window = random_window(example, options.window, options.most, options.novel, rng)
-    found = foreseen(window.crop, networks, step)
-    image = draw_window(found.gaussians, window, rng.random(3, dtype=np.float32))
-    regression = correction_loss(*_scaled(window.crop, found.corrections, scales, options), options)
-    return photometric_loss(image, window, options) + options.regression_at(step) * regression
-
-
-def _judged(networks: Networks, judge: Judge, scales: Mapping[int, Tensor], options: TrainOptions) -> Row:
-    """Validation loss, PSNR of renders, and the explained share of the targets' squares for each kind of correction."""
-
-    def work(crop: Crop) -> tuple[float, Tensor, Tensor]:
-        with torch.no_grad():
-            found, wanted = compared(crop, networks, scales, options, 0)
-            return (
-                float(correction_loss(found, wanted, options)),
-                (found - wanted).square().sum(0),
-                wanted.square().sum(0),
-            )
-
-    losses, left, whole = zip(*parallel_map(work, judge.crops), strict=True)
-    missed, squares = torch.stack(left).sum(0), torch.stack(whole).sum(0)
-    shares = {
-        f"explained_{name}": float(1 - missed[columns].sum() / squares[columns].sum().clamp_min(1e-12))
-        for name, columns in PARTS.items()
-    }
-    learned = float(np.mean(parallel_map(lambda window: window_psnr(window, networks), judge.windows)))
-    scores = {"psnr_analytic": judge.analytic, "psnr_learned": learned}
-    return {"validation_loss": float(np.mean(losses)), **scores, **shares}

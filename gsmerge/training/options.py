@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,10 @@ class TrainOptions:
         ssim_weight: Weight of 1 - SSIM.
         lpips_weight: Weight of LPIPS (VGG), whose weights are then needed; a step takes twice as long with it.
         regression_weight: Weight of the regression where renders are compared, falling to 0 at the end of the run.
+        teacher_weight: Weight of the distance from the analytic Gaussians.
+        teacher_steps: Steps that compare renders over which it falls to 0.
+        diversity_weight: Weight of the diversification of several children.
+        diversity_steps: Steps that compare renders over which it falls to 0.
         save_every: Steps between checkpoints, validation and lines of the table.
         validation_crops: Crops of each scene that validation looks at, always the same.
         validation_windows: Windows of each scene that validation renders, always the same.
@@ -86,6 +90,10 @@ class TrainOptions:
     ssim_weight: float = 0.2
     lpips_weight: float = 0.0
     regression_weight: float = 0.1
+    teacher_weight: float = 0.0
+    teacher_steps: int = 2000
+    diversity_weight: float = 0.0
+    diversity_steps: int = 50_000
     save_every: int = 200
     validation_crops: int = 8
     validation_windows: int = 4
@@ -93,7 +101,7 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         for name in ("fit_steps", "steps", "crops", "crop", "save_every", "validation_crops", "photo_scale", "most",
-                     "validation_windows"):  # fmt: skip
+                     "validation_windows", "teacher_steps", "diversity_steps"):  # fmt: skip
             self._expect(name, getattr(self, name), 1, 10**9, whole=True)
         for name in ("warmup", "seed"):
             self._expect(name, getattr(self, name), 0, 10**9, whole=True)
@@ -103,7 +111,8 @@ class TrainOptions:
             self._expect(name, getattr(self, name), 0, 1)
         for name in ("rate", "least_rate", "clip"):
             self._expect(name, getattr(self, name), 1e-12, 1e6)
-        for name in ("decay", "turn_weight", "photo_weight", "ssim_weight", "lpips_weight", "regression_weight"):
+        weights = [f.name for f in fields(self) if f.name.endswith("_weight")]
+        for name in ("decay", *weights):
             self._expect(name, getattr(self, name), 0, 1e6)
         for name in ("levels", "densities", "views"):  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
@@ -135,9 +144,18 @@ class TrainOptions:
         """The first step, counted from 0, that compares renders with photos."""
         return math.ceil(self.photo_start * self.steps)
 
-    def regression_at(self, step: int) -> float:
-        """Weight of the regression in a step that compares renders."""
-        return self.regression_weight * (1 - (step - self.photo_step) / max(1, self.steps - self.photo_step))
+    def held_by(self, step: int) -> tuple[float, float, float]:
+        """Weights of regression, teacher and diversification in a step that compares renders."""
+        done = step - self.photo_step
+
+        def left(steps: int) -> float:
+            return max(0.0, 1 - done / max(1, steps))
+
+        return (
+            self.regression_weight * left(self.steps - self.photo_step),
+            self.teacher_weight * left(self.teacher_steps),
+            self.diversity_weight * left(self.diversity_steps),
+        )
 
     def rate_at(self, step: int) -> float:
         """Learning rate of a step, counted from 0: a linear rise, then half a cosine."""
@@ -156,7 +174,15 @@ class TrainOptions:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> TrainOptions:
-        """The options with some settings changed; ``network`` is a table in the table.
+        """The defaults with some settings changed; ``network`` is a table in the table.
+
+        Raises:
+            ValueError: If a name is unknown or a value out of range.
+        """
+        return TrainOptions().with_settings(values)
+
+    def with_settings(self, values: Mapping[str, Any]) -> TrainOptions:
+        """Some settings changed, as in :meth:`from_dict`; a ``network`` is changed from the default one.
 
         Raises:
             ValueError: If a name is unknown or a value out of range.
@@ -164,20 +190,24 @@ class TrainOptions:
         unknown = sorted(values.keys() - {f.name for f in fields(TrainOptions)})
         if unknown:
             raise ValueError(f"unknown setting {unknown[0]!r}")
-        network = values.get("network", {})
+        network = values.get("network", asdict(self.network))
         if not isinstance(network, Mapping):
             raise ValueError(f"network: expected a table, got {network!r}")
-        return TrainOptions(**{**values, "network": NetworkOptions.from_dict(network)})
+        return replace(self, **{**values, "network": NetworkOptions.from_dict(network)})
 
 
-def read_config(path: Path) -> TrainOptions:
+def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
     """Training settings from a TOML or JSON file whose keys are the fields of :class:`TrainOptions`.
+
+    Args:
+        path: The file.
+        start: Settings that it does not name; None: the defaults.
 
     Raises:
         SceneError: If the file cannot be read or a setting is unknown or out of range.
     """
     table = read_table(path)
     try:
-        return TrainOptions.from_dict(table)
+        return (start or TrainOptions()).with_settings(table)
     except (TypeError, ValueError) as error:
         raise SceneError(path, str(error).splitlines()[0]) from error

@@ -64,15 +64,20 @@ def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Te
     return loss + options.lpips_weight * lpips_loss(image, photo, mask) if options.lpips_weight else loss
 
 
-def window_psnr(window: Window, networks: Networks | None) -> float:
-    """PSNR (dB) of a window on black, as the networks make it; None: as the analytic stages alone do."""
+def plain_render(window: Window, networks: Networks | None) -> Tensor:
+    """``[h,w,3]`` render of a window on black within [0, 1]; None: of what the analytic stages alone make."""
     crop = window.crop
     with torch.no_grad():
         if networks is None:
             gaussians = crop.example.levels[crop.k].children[crop.children]
         else:
             gaussians = foreseen(crop, networks, 0).gaussians
-        image = draw_window(gaussians, window, np.zeros(3, np.float32)).clamp(0, 1)
-    photo, mask = window.part(crop.example.photos.images), window.part(crop.example.masks)
-    error = float(color_difference(image, photo, mask, "mse"))
+        return draw_window(gaussians, window, np.zeros(3, np.float32)).clamp(0, 1)
+
+
+def window_psnr(window: Window, networks: Networks | None) -> float:
+    """PSNR (dB) of :func:`plain_render` where the mask is."""
+    example = window.crop.example
+    photo, mask = window.part(example.photos.images), window.part(example.masks)
+    error = float(color_difference(plain_render(window, networks), photo, mask, "mse"))
     return min(BEST, -10 * float(np.log10(max(error, 1e-12))))

@@ -89,6 +89,18 @@ def random_window(example: Example, side: int, most: int, novel: float, rng: np.
     while len(rows) > most and box.halved() != box:
         box = box.halved()
         rows = _rows(example, k, photo, box)
+    return _window(example, k, photo, box, rows)
+
+
+def whole_photo(example: Example, photo: int) -> Window:
+    """A whole photo, at the smallest K."""
+    k, (height, width) = min(example.levels), example.masks.shape[1:]
+    box = Box(0, 0, width, height)
+    return _window(example, k, photo, box, _rows(example, k, photo, box))
+
+
+def _window(example: Example, k: int, photo: int, box: Box, rows: Tensor) -> Window:
+    """With all children of the Feature Gaussians ``rows``."""
     level, inside = example.levels[k], torch.zeros(len(example.centres), dtype=torch.bool)
     inside[rows] = True
     children = torch.nonzero(inside[level.parents])[:, 0]
