@@ -115,7 +115,7 @@ def _run(
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **judged})
             losses = []
             told = {"step": step, "loss": mean, "validation": judged, "options": options.to_dict(), **hashes}
-            if _is_best(rows, options):
+            if is_best(rows, options):
                 save_checkpoint(out / "best.safetensors", learner.smooth, told)
             save_checkpoint(out / "last.safetensors", learner.smooth, told)
             write_losses(out / "losses.csv", rows)
@@ -127,7 +127,7 @@ def _run(
     return Trained(*paths, step, rows[-1]["loss"], least, rows[-1]["psnr_analytic"], most, resumed)
 
 
-def _is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
+def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
     """Whether the last row is better than all before it: those that compared renders, as soon as one did."""
     *before, last = rows
     if last["step"] > options.photo_step:
