@@ -100,6 +100,15 @@ class Example:
         return [photo for photo in span if self.masks[photo].any()]
 
 
+@dataclass(frozen=True, eq=False)
+class Teacher:
+    """What is fitted to: all photos at full and half size, and which of their pixels count."""
+
+    name: str
+    photos: tuple[Photos, Photos]
+    masks: Masks
+
+
 def read_examples(
     path: Path, options: TrainOptions, cache: Path | None = None, progress: Told | None = None
 ) -> list[Example]:
@@ -253,15 +262,6 @@ def _worked_out(
         columns |= {f"{f.name}_{k}": getattr(children, f.name).numpy() for f in fields(children)}
         columns |= {f"parents_{k}": parents, f"targets_{k}": targets.numpy(), f"mask_{k}": mask.numpy()}
     return columns
-
-
-@dataclass(frozen=True, eq=False)
-class Teacher:
-    """What is fitted to: all photos at full and half size, and which of their pixels count."""
-
-    name: str
-    photos: tuple[Photos, Photos]
-    masks: Masks
 
 
 def _teacher(subject: Subject, masks: np.ndarray, name: str) -> Teacher:
