@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
@@ -120,6 +120,15 @@ def lpips_available(net: str = "vgg") -> bool:
     return _find_weights(net) is not None
 
 
+def require_lpips(net: str) -> None:
+    """Refuse to go on without the weights of ``net``.
+
+    Raises:
+        GsmergeError: If they are not installed.
+    """
+    _weights_file(net)
+
+
 def min_size(net: str) -> int:
     """Pixels per side of the smallest image that ``net`` can look at.
 
@@ -151,25 +160,59 @@ def _mask(mask: Array | Tensor, image: Array) -> Array:
     return chosen
 
 
+def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
+    """:func:`lpips`, differentiable in ``image``.
+
+    Args:
+        image: ``[h,w,3]`` float32 on the CPU, sRGB in [0, 1].
+        reference: ``[h,w,3]``, without gradient.
+        mask: ``[h,w]`` pixels that count.
+        net: As there.
+
+    Returns:
+        The distance; 0 where the images are too small for the network or no pixel counts.
+
+    Raises:
+        GsmergeError: If the package with the weights is not installed.
+    """
+    if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
+        return image.new_zeros(())
+    layers = _load(_weights_file(net), net)
+    with torch.no_grad():
+        wanted = list(_unit_features(reference, layers))
+    return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), wanted, layers)
+
+
 def _distance(image: Array, reference: Array, layers: tuple[_Layer, ...]) -> float:
-    """Equation 1 of Zhang et al.: squared differences of unit features, weighted, averaged over pixels, added up."""
-    distance = 0.0
+    """Of arrays, without gradients."""
     kept = _kept_features(reference, layers)
-    for layer, unit, other in zip(_compared(layers), _unit_features(image, layers), kept, strict=True):
-        assert layer.weights is not None
-        distance += float((unit - other).square_().mean((1, 2)) @ layer.weights)
+    with torch.inference_mode():
+        return float(_weighted(_unit_features(_as_tensor(image), layers), kept, layers))
+
+
+def _as_tensor(image: Array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image, np.float32))
+
+
+def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_Layer, ...]) -> Tensor:
+    """Squared differences of unit features, weighted, averaged over pixels, added up (equation 1 of Zhang et al.)."""
+    distance = torch.zeros((), dtype=torch.float64)
+    for weights, unit, other in zip(_compared(layers), units, others, strict=True):
+        distance = distance + ((unit - other).square().mean((1, 2)) @ weights).double()
     return distance
 
 
-def _compared(layers: tuple[_Layer, ...]) -> list[_Layer]:
-    return [layer for layer in layers if layer.weights is not None]
+def _compared(layers: tuple[_Layer, ...]) -> list[Tensor]:
+    """The weights of those layers that are compared."""
+    return [layer.weights for layer in layers if layer.weights is not None]
 
 
 def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]:
     """Of a reference, which is often compared with several images in a row: the last few are remembered."""
     key = (id(layers), reference.shape, hashlib.sha256(np.ascontiguousarray(reference).tobytes()).digest())
     if key not in _REMEMBERED:
-        found = list(_unit_features(reference, layers))
+        with torch.inference_mode():
+            found = list(_unit_features(_as_tensor(reference), layers))
         if reference.shape[0] * reference.shape[1] > MOST_REMEMBERED:
             return found
         while len(_REMEMBERED) >= REMEMBERED:
@@ -182,18 +225,17 @@ def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]
 _REMEMBERED: dict[tuple[object, ...], tuple[tuple[_Layer, ...], list[Tensor]]] = {}
 
 
-def _unit_features(image: Array, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:
+def _unit_features(image: Tensor, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:
     """``[c,h,w]`` features of unit length at every pixel, of each layer that is compared."""
-    with torch.inference_mode():
-        values = 2 * torch.from_numpy(np.ascontiguousarray(image, np.float32)[None]) - 1
-        features = ((values - torch.tensor(SHIFT)) / torch.tensor(SCALE)).permute(0, 3, 1, 2)  # channels last in memory
-        for layer in layers:
-            conv = layer.conv
-            if conv.pool:
-                features = functional.max_pool2d(features, conv.pool, 2)
-            features = functional.conv2d(features, layer.kernel, layer.bias, conv.stride, conv.padding).relu_()
-            if layer.weights is not None:
-                yield (features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + EPSILON))[0]
+    values = (2 * image[None] - 1 - torch.tensor(SHIFT)) / torch.tensor(SCALE)
+    features = values.permute(0, 3, 1, 2)  # channels last in memory
+    for layer in layers:
+        conv = layer.conv
+        if conv.pool:
+            features = functional.max_pool2d(features, conv.pool, 2)
+        features = functional.conv2d(features, layer.kernel, layer.bias, conv.stride, conv.padding).relu_()
+        if layer.weights is not None:
+            yield (features / (torch.linalg.vector_norm(features, dim=1, keepdim=True) + EPSILON))[0]
 
 
 def _find_weights(net: str) -> Path | None:

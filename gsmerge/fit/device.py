@@ -107,9 +107,9 @@ def download(held: Held) -> None:
 def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """:func:`gsmerge.fit.full.fit_step` on tensors -> mean squared error of the view's training pixels."""
     level = 1 if progress < plan.options.coarse_share else 0
-    photos, weights = plan.photos[level], plan.weights[level][view]
+    photos = plan.photos[level]
     photo = torch.from_numpy(photos.images[view]).to(held.x)
-    weight = torch.from_numpy(weights if level == 1 else np.ones_like(weights)).to(held.x)
+    weight = torch.from_numpy(plan.weight(level, view)).to(held.x)
     background = rng.random(3, dtype=np.float32)
     means, quats, scales, opacities = shape_of(held.x)
     drawn = opacities

@@ -33,33 +33,51 @@ PROBE = 6  # steps that are timed to spend a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 
+HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
+Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a run goes: photos at full and half size with their training weights, steps, and what a step does."""
+    """How a run goes: photos at full and half size with their training weights, steps, and what a step does.
+
+    The weights are 0 on held-out blocks, ``HIDDEN`` on pixels that neither steps nor scores look at, 1 elsewhere.
+    """
 
     photos: tuple[Photos, Photos]
     weights: tuple[list[np.ndarray], list[np.ndarray]]
     options: FitOptions
     dropout: float
 
+    def weight(self, level: int, view: int) -> np.ndarray:
+        """``[h,w]`` float32 weights of the pixels of a photo in a step: full size looks at held-out blocks, too."""
+        weight = self.weights[level][view]
+        return np.where(weight == HIDDEN, np.float32(0), weight if level == 1 else np.float32(1))
 
-def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int) -> Plan:
-    """Held-out blocks, and dropout where there are few views."""
+
+def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
+    """Held-out blocks, pixels that are not looked at, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     usual = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
     dropout = usual if options.dropout is None else options.dropout
-    return Plan(photos, (full, reduced(full, photos[1])), options, dropout)
+    weights = full, reduced(full, photos[1])
+    if masks is not None:
+        weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
+    return Plan(photos, weights, options, dropout)
+
+
+def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
+    """Training weights where the masks are."""
+    return [np.where(mask, weight, HIDDEN) for weight, mask in zip(weights, masks, strict=True)]
 
 
 def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """One Adam step on one view -> mean squared error of its training pixels."""
     level = 1 if progress < plan.options.coarse_share else 0
     photos = plan.photos[level]
-    weight = plan.weights[level][view] if level == 1 else np.ones_like(plan.weights[level][view])
+    weight = plan.weight(level, view)
     background, opacities = rng.random(3, dtype=np.float32), None
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
@@ -152,6 +170,7 @@ def fit_full(
     seed: int = 0,
     progress: Progress | None = None,
     engine: Engine = KERNELS,
+    masks: Masks | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
@@ -166,8 +185,9 @@ def fit_full(
         seed: Order of the views, backgrounds, dropout, held-out blocks.
         progress: Told after every step.
         engine: What it steps with.
+        masks: Pixels that are looked at; None: all. Where no Gaussian is, none should be drawn to.
     """
-    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed)
+    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
     before, state.shares[:] = first_look(state, plan)
     after = before
     queue: list[int] = []

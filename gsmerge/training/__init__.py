@@ -1,7 +1,20 @@
-"""Training of the networks on what the fit itself finds out about scenes."""
+"""Training of the networks on what the fit itself finds out about scenes, and on renders against photos."""
 
 from gsmerge.training.examples import Example, make_example, read_examples
 from gsmerge.training.loop import Trained, train
 from gsmerge.training.options import TrainOptions, read_config
+from gsmerge.training.presets import preset_options
+from gsmerge.training.subjects import Subject, make_subject
 
-__all__ = ["Example", "TrainOptions", "Trained", "make_example", "read_config", "read_examples", "train"]
+__all__ = [
+    "Example",
+    "Subject",
+    "TrainOptions",
+    "Trained",
+    "make_example",
+    "make_subject",
+    "preset_options",
+    "read_config",
+    "read_examples",
+    "train",
+]

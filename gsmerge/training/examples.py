@@ -1,7 +1,9 @@
 """Scenes as examples: where the fit takes the K Gaussians of every merged Feature Gaussian.
 
-A full fit of the analytic Gaussians to the photos, without growth, gives a target for each: fitted minus analytic, in
-the columns that networks correct. No rendering is needed after that. Gaussians that no photo shows have no target.
+Some of the scene's views are given, evenly spread; what the others and held-out photos show is known to the teacher
+alone. A full fit of the analytic Gaussians to all photos, without growth, gives a target for each: fitted minus
+analytic, in the columns that networks correct. Gaussians that no photo shows have no target. The photos stay with the
+example, so that renders can be compared with them.
 """
 
 from __future__ import annotations
@@ -19,29 +21,30 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
-from gsmerge.canonical import canonicalise
 from gsmerge.decode import divide
 from gsmerge.encode import encode
 from gsmerge.errors import SceneError
-from gsmerge.fit.full import fit_full
+from gsmerge.evaluate import Views
+from gsmerge.fit.full import Masks, fit_full
 from gsmerge.fit.options import FitOptions
 from gsmerge.fit.stage import shown
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.grouping import group_scene, scene_canvas
-from gsmerge.io import find_scene_files, read_scene
+from gsmerge.io import SceneLoad, load_scene, read_targets
 from gsmerge.io.atomic import atomic_output
 from gsmerge.match import match
 from gsmerge.merge import merge
-from gsmerge.moments import Members, scene_members
+from gsmerge.moments import Members
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, sizes_of
 from gsmerge.networks.tokens import describe
 from gsmerge.options import CompactOptions
-from gsmerge.photos import scene_photos
+from gsmerge.photos import Photos
 from gsmerge.training.options import TrainOptions
+from gsmerge.training.subjects import Subject, covered, make_subject, reduced_masks, view_subsets
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
 
 Told = Callable[[int, int], None]
-LAYOUT = 1  # of the cached files
+LAYOUT = 2  # of the cached files
 SHAPE = tuple(f.name + "_" for f in fields(Gaussians))  # columns of a level's children, before K
 FITTED = ("parents_", "targets_", "mask_")
 
@@ -76,6 +79,8 @@ class Example:
         matches: A cluster for each.
         centres: ``[r,3]`` means after merging.
         levels: By number of children K.
+        photos: At the size that renders are compared at; those of the views come first, then novel ones.
+        masks: ``[p,h,w]`` bool: pixels of the photos that the scene has something to show for.
     """
 
     name: str
@@ -86,41 +91,79 @@ class Example:
     matches: Matches
     centres: Tensor
     levels: Mapping[int, Level]
+    photos: Photos
+    masks: np.ndarray
+
+    def photo_ids(self, *, novel: bool) -> list[int]:
+        """Photos with anything to compare, of the views or of others."""
+        span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
+        return [photo for photo in span if self.masks[photo].any()]
+
+
+@dataclass(frozen=True, eq=False)
+class Teacher:
+    """What is fitted to: all photos at full and half size, and which of their pixels count."""
+
+    name: str
+    photos: tuple[Photos, Photos]
+    masks: Masks
 
 
 def read_examples(
     path: Path, options: TrainOptions, cache: Path | None = None, progress: Told | None = None
 ) -> list[Example]:
-    """A scene folder or ``.ply`` at every density, see :func:`make_example`.
+    """A scene folder or ``.ply`` with each number of views and at every density, see :func:`make_example`.
+
+    Photos of a folder ``targets`` beside the ``.ply``, with their cameras, are novel views.
 
     Args:
         path: The scene.
-        options: Densities, matching, steps of the fit, seed.
+        options: Numbers of views, densities, matching, steps of the fit, seed.
         cache: Folder for what takes long; made if it is missing. None: nothing is kept.
         progress: Called with (step, steps) of the fits.
 
     Raises:
         SceneError: If the scene cannot be read, is not one Gaussian per pixel, has no photos, or cannot be fitted.
     """
-    ply = find_scene_files(path).ply
-    scene = read_scene(path)
+    load = load_scene(path)
+    scene, ply = load.scene, load.files.ply
     if not isinstance(scene, PixelScene):
         raise SceneError(ply, "expected one Gaussian per pixel to learn from, found them in no order")
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them beside it in images/")
-    name, found = path.stem if path.suffix else path.name, list[Example]()
-    for number, density in enumerate(options.densities):
+    held_out = _held_out(load)
+    name, found = scene_name(path), list[Example]()
+    subsets = view_subsets(len(scene), options.views)
+    total = len(subsets) * len(options.densities)
+    for ids in subsets:
+        subject = make_subject(scene, ids, held_out)
+        for density in options.densities:
 
-        def told(step: int, steps: int, number: int = number) -> None:
-            if progress:
-                progress(number * steps + step, len(options.densities) * steps)
+            def told(step: int, steps: int, number: int = len(found)) -> None:
+                if progress:
+                    progress(number * steps + step, total * steps)
 
-        found.append(make_example(scene, options, density, name, cache, told))
+            found.append(make_example(subject, options, density, name, cache, told))
     return found
 
 
+def scene_name(path: Path) -> str:
+    """The folder's name, and the file's where one is told."""
+    path = path.absolute()
+    return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
+
+
+def _held_out(load: SceneLoad) -> Views | None:
+    """Photos and cameras in the folder ``targets`` beside the scene, where there is one."""
+    folder = load.files.ply.parent / "targets"
+    if not folder.is_dir():
+        return None
+    read = read_targets(load, folder)
+    return Views(read.cameras, read.images, read.names)
+
+
 def make_example(
-    scene: PixelScene,
+    subject: Subject,
     options: TrainOptions,
     density: float,
     name: str,
@@ -130,8 +173,8 @@ def make_example(
     """Segment, encode, match and merge a scene without networks, fit the result, and note what the fit changed.
 
     Args:
-        scene: One Gaussian per pixel, with photos.
-        options: Levels, matching, steps of the fit, seed.
+        subject: One Gaussian per pixel, with photos.
+        options: Levels, matching, steps of the fit, size of the photos, seed.
         density: Superpixels per pixel.
         name: For people and errors.
         cache: Folder for what takes long; made if it is missing. None: nothing is kept.
@@ -140,36 +183,36 @@ def make_example(
     Raises:
         SceneError: If the fit does not make held-out parts of the photos better.
     """
-    sha256 = _content_hash(scene, options, density)
-    canonical, _ = canonicalise(scene)
-    members = scene_members(canonical)
+    sha256 = _content_hash(subject, options, density)
     kept = None if cache is None else cache / f"{sha256[:32]}.npz"
     columns = _read_columns(kept, options)
     if columns is None:
-        columns = _worked_out(canonical, members, options, density, name, progress)
+        columns = _worked_out(subject, options, density, name, progress)
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
             with atomic_output(kept, overwrite=True) as temporary:
                 np.savez(temporary, **columns)
+    masks = columns.pop("masks")
     tensors = {column: torch.from_numpy(values) for column, values in columns.items()}
     levels = {k: Level(Gaussians(*(tensors.pop(f"{n}{k}") for n in SHAPE)), *(tensors.pop(f"{n}{k}") for n in FITTED))
               for k in options.levels}  # fmt: skip
     clusters, centres = tensors.pop("clusters"), tensors.pop("centres")
-    matches = Matches(clusters, len(centres))
+    matches, photos = Matches(clusters, len(centres)), subject.photos(options.photo_scale)
     return Example(
-        name, sha256, members, canonical.cameras, FeatureGaussians(**tensors), matches, centres, levels
+        name, sha256, subject.members, subject.scene.cameras, FeatureGaussians(**tensors), matches, centres, levels,
+        photos, masks,
     )  # fmt: skip
 
 
-def _content_hash(scene: PixelScene, options: TrainOptions, density: float) -> str:
+def _content_hash(subject: Subject, options: TrainOptions, density: float) -> str:
     """Of all that the example hangs on."""
     made_with = {"layout": LAYOUT, "gsmerge": __version__, "density": density, "match": options.match}
     made_with |= {"fit_steps": options.fit_steps, "seed": options.seed, "levels": options.levels}
+    made_with |= {"photo_scale": options.photo_scale}
     state = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode("ascii"))
-    g, cameras = scene.gaussians, scene.cameras
-    tensors = [getattr(g, f.name) for f in fields(g)] + [cameras.viewmats, cameras.Ks, scene.valid]
-    for tensor in [*tensors, scene.images]:
-        assert tensor is not None
+    g, cameras = subject.scene.gaussians, subject.cameras
+    tensors = [getattr(g, f.name) for f in fields(g)] + [cameras.viewmats, cameras.Ks, subject.scene.valid]
+    for tensor in [*tensors, torch.from_numpy(subject.images)]:
         state.update(json.dumps([str(tensor.dtype), *tensor.shape]).encode("ascii"))
         state.update(np.ascontiguousarray(tensor.numpy()).data)
     return state.hexdigest()
@@ -179,7 +222,7 @@ def _read_columns(path: Path | None, options: TrainOptions) -> dict[str, Any] | 
     """Arrays of an example that is kept; None where there is none that can be read."""
     if path is None or not path.is_file():
         return None
-    wanted = {f.name for f in fields(FeatureGaussians)} | {"clusters", "centres"}
+    wanted = {f.name for f in fields(FeatureGaussians)} | {"clusters", "centres", "masks"}
     wanted |= {f"{name}{k}" for name in (*SHAPE, *FITTED) for k in options.levels}
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
@@ -190,18 +233,22 @@ def _read_columns(path: Path | None, options: TrainOptions) -> dict[str, Any] | 
 
 
 def _worked_out(
-    scene: PixelScene, members: Members, options: TrainOptions, density: float, name: str, progress: Told | None
+    subject: Subject, options: TrainOptions, density: float, name: str, progress: Told | None
 ) -> dict[str, Any]:
     """Arrays of an example, from scratch."""
     settings = {"density": density, "match": options.match, "fit": "none", "robust": False}
     chosen = CompactOptions().with_settings({**settings, "seed": options.seed})
+    scene, members = subject.scene, subject.members
     groups = group_scene(scene_canvas(scene, chosen), chosen).groups
     features = encode(scene, members, groups, chosen.encode)
     matches = match(features, chosen.match)
     merged = merge(features, matches)
     columns: dict[str, Any] = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
     columns |= {"clusters": matches.clusters.numpy(), "centres": merged.means.numpy()}
-    described = describe(merged, members, scene.cameras)
+    frames = describe(merged, members, scene.cameras).frames
+    masks = covered(subject)
+    columns["masks"] = reduced_masks(masks, subject.photos(options.photo_scale))
+    teacher = _teacher(subject, masks, name)
     for number, k in enumerate(options.levels):
 
         def told(step: int, steps: int, *_: float, number: int = number) -> None:
@@ -209,30 +256,38 @@ def _worked_out(
                 progress(number * steps + step, len(options.levels) * steps)
 
         children, parents = divide(merged, members, np.full(len(merged), k))
-        fitted, mask = _fitted(scene, children, chosen.decode.min_opacity, options, name, told)
-        frames = described.frames[torch.from_numpy(parents)]
+        fitted, mask = _fitted(teacher, children, chosen.decode.min_opacity, options, told)
         targets = torch.zeros(len(children), RESIDUAL)
-        targets[mask] = differences(children[mask], fitted, frames[mask])
+        targets[mask] = differences(children[mask], fitted, frames[torch.from_numpy(parents)][mask])
         columns |= {f"{f.name}_{k}": getattr(children, f.name).numpy() for f in fields(children)}
         columns |= {f"parents_{k}": parents, f"targets_{k}": targets.numpy(), f"mask_{k}": mask.numpy()}
     return columns
 
 
+def _teacher(subject: Subject, masks: np.ndarray, name: str) -> Teacher:
+    """All photos: the scene's own are whole, of the others the pixels that it has something to show for."""
+    photos, masks = (subject.photos(), subject.photos(2)), masks.copy()
+    masks[: len(subject.scene)] = True
+    return Teacher(name, photos, (masks, reduced_masks(masks, photos[1])))
+
+
 def _fitted(
-    scene: PixelScene,
+    teacher: Teacher,
     start: Gaussians,
     least: float,
     options: TrainOptions,
-    name: str,
     progress: Callable[[int, int, float, float], None],
 ) -> tuple[Gaussians, Tensor]:
     """Gaussians after a full fit without growth, and which of those given they are ``[n]``: what is not seen is not."""
-    fit, photos = FitOptions(fit_steps=options.fit_steps), (scene_photos(scene), scene_photos(scene, 2))
+    fit, photos = FitOptions(fit_steps=options.fit_steps), teacher.photos
     mask = start.opacities >= least
     mask[mask.clone()] = shown(start[mask], photos[1], fit.prune)
-    fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress)
+    fitted, report = fit_full(
+        start[mask], photos, fit, seed=options.seed, progress=progress, masks=teacher.masks
+    )  # fmt: skip
     if not report.accepted:
-        raise SceneError(name, f"expected a scene that the fit makes better ({report.stopped})", "leave it out")
+        why = f"expected a scene that the fit makes better ({report.stopped})"
+        raise SceneError(teacher.name, why, "leave it out")
     return fitted, mask
 
 

@@ -19,10 +19,10 @@ from gsmerge.networks.apply import (
     with_corrections,
     with_encoding,
 )
-from gsmerge.networks.residuals import MEAN, rotated
+from gsmerge.networks.residuals import MEAN, move_gaussians, rotated
 from gsmerge.networks.tokens import Described
 from gsmerge.training.examples import Example
-from gsmerge.types import FeatureGaussians, Matches
+from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +68,27 @@ def owners(matches: Matches) -> Tensor:
     return found
 
 
-def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:
-    """``[n,13]`` corrections that the networks make of a crop's children.
+@dataclass(frozen=True, eq=False)
+class Foreseen:
+    """What the networks make of a crop's children.
+
+    Args:
+        corrections: ``[n,13]`` of all stages together, as the targets are: from the analytic children.
+        gaussians: The children as the stages would make them, with gradients.
+    """
+
+    corrections: Tensor
+    gaussians: Gaussians
+
+
+def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
+    """A crop through all networks.
 
     Each stage looks at what the ones before it made; gradients go through the latents and the corrections. At K = 1
     the corrections of all stages add up; the children of a larger K are pooled anew from the members, so what reaches
     them from the stages before their head is the latent.
+
+    The Gaussians of K = 1 are those that the stages make, one after the other; their gradient is that of the sum.
     """
     example = crop.example
     learned = Learned(networks, example.members, example.cameras, seed)
@@ -89,10 +104,18 @@ def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:
     described = learned.describe(refined)
     if crop.k == 1:
         heads = head_residuals(described.base, np.arange(len(refined)), refined, described, learned)
-        return corrections + residuals + heads
-    level = example.levels[crop.k]
-    parents = torch.searchsorted(crop.rows, level.parents[crop.children]).numpy()
-    return head_residuals(level.children[crop.children], parents, refined, described, learned)
+        before = corrections + residuals
+        last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
+        return Foreseen(before + heads, move_gaussians(described.base, last, described.frames))
+    children = example.levels[crop.k].children[crop.children]
+    parents = torch.searchsorted(crop.rows, example.levels[crop.k].parents[crop.children])
+    heads = head_residuals(children, parents.numpy(), refined, described, learned)
+    return Foreseen(heads, move_gaussians(children, heads, described.frames[parents]))
+
+
+def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:
+    """``[n,13]`` corrections that the networks make of a crop's children, see :func:`foreseen`."""
+    return foreseen(crop, networks, seed).corrections
 
 
 def _merged(

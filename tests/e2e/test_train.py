@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from shutil import rmtree
 
+import numpy as np
 from learned import SMALL, noisy, written
 
 from gsmerge.networks import load_checkpoint
+from gsmerge.training import TrainOptions, read_examples
+from gsmerge.training.photometric import window_psnr
+from gsmerge.training.windows import whole_photo
 
 from .conftest import Run, listing
 
 FAST = ("--superpixels", 100, "--fit", "none", "--no-robust")
 CONFIG = {
     "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
+    "views": [3], "photo_start": 0.5, "window": 32, "validation_windows": 1, "lpips_weight": 0,
     "network": {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}},
 }  # fmt: skip
 
@@ -21,14 +28,17 @@ CONFIG = {
 def test_train_then_compact(scene_copy: Path, run: Run) -> None:
     config, out = scene_copy / "train.json", scene_copy / "run"
     config.write_text(json.dumps(CONFIG))
-    call = ("train", "--data", scene_copy, "--out", out, "--config", config)
+    call = ("train", "--data", scene_copy, "--out", out, "--config", config, "--preset", "paper")
     outcome = run(*call)
     assert outcome.code == 0, outcome.err
     assert "best.safetensors: 4 steps" in outcome.out
     assert "--validation" in outcome.err
     kept = {"best.safetensors", "last.safetensors", "losses.csv", "state.safetensors"}
+    kept |= {f"validation-{scene_copy.name}.png"}
     assert kept < set(listing(out))
-    assert load_checkpoint(out / "best.safetensors").networks.options.bounds.mean == 0.5
+    trained = load_checkpoint(out / "best.safetensors")
+    assert trained.networks.options.bounds.mean == 0.5
+    assert trained.training["options"]["photo_loss"] == "mse"
     document = json.loads(run(*call, "--validation", scene_copy, "--json").out)
     assert (document["step"], document["resumed"], document["notes"]) == (4, 4, [])
     small = scene_copy / "small.ply"
@@ -38,6 +48,26 @@ def test_train_then_compact(scene_copy: Path, run: Run) -> None:
     assert report["choices"]["networks"]["training"]["step"] in (2, 4)
     assert report["options"]["checkpoint"] == str(out / "best.safetensors")
     assert "refine" in report["seconds"]
+
+
+def test_photos_beside_the_scene_are_novel_views(scene_copy: Path) -> None:
+    options = TrainOptions(views=(2, 0), densities=(0.02,), fit_steps=6, levels=(1,))
+    few, whole = read_examples(scene_copy, options)
+    context, held_out = (
+        len(whole.cameras),
+        len(json.loads((scene_copy / "targets/transforms.json").read_text())["frames"]),
+    )
+    assert len(few.cameras) == 2
+    assert len(few.photos) == len(whole.photos) == context + held_out
+    assert whole.photo_ids(novel=True) == list(range(context, context + held_out))
+    assert few.name == whole.name == scene_copy.name
+    # between two views the scene's Gaussians render a photo that nobody fitted
+    assert np.mean([window_psnr(whole_photo(whole, photo), None) for photo in whole.photo_ids(novel=True)]) > 15
+    rmtree(scene_copy / "targets")
+    (alone,) = read_examples(scene_copy / "scene.ply", replace(options, views=(0,)))
+    assert len(alone.photos) == context
+    assert alone.sha256 != whole.sha256
+    assert alone.name == f"{scene_copy.name}-scene"
 
 
 def test_settings_and_scenes_are_told_in_one_line(scene_copy: Path, run: Run, tmp_path: Path) -> None:

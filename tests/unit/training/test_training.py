@@ -10,6 +10,7 @@ import pytest
 import torch
 from learned import noisy
 from scenes import arc, make_scene, room, two_planes
+from training_runs import OPTIONS, TINY
 
 import gsmerge
 from gsmerge.decode import DecodeOptions, decode
@@ -18,16 +19,11 @@ from gsmerge.merge import merge
 from gsmerge.networks import Learned, NetworkOptions, Networks, load_checkpoint
 from gsmerge.networks.apply import encode_features, head_residuals, refine_features
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussians
-from gsmerge.training import Example, TrainOptions, make_example, train
+from gsmerge.training import Example, TrainOptions, make_example, preset_options, read_config, train
 from gsmerge.training.examples import differences
 from gsmerge.training.predict import Crop, owners, predicted, random_crop
+from gsmerge.training.subjects import Subject, make_subject
 from gsmerge.types import PixelScene
-
-TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
-OPTIONS = TrainOptions(
-    network=TINY, densities=(0.1,), fit_steps=12, levels=(1, 2), steps=12, warmup=2, rate=3e-3, crop=60, save_every=4,
-    validation_crops=2,
-)  # fmt: skip
 
 
 class StoppedError(Exception):
@@ -38,9 +34,13 @@ def scene(views: int = 3) -> PixelScene:
     return make_scene(room(), arc(views, 32, 24))
 
 
+def subject() -> Subject:
+    return make_subject(scene(), range(3))
+
+
 @pytest.fixture(scope="module")
 def example() -> Example:
-    return make_example(scene(), OPTIONS, 0.1, "room")
+    return make_example(subject(), OPTIONS, 0.1, "room")
 
 
 def files(out: Path) -> dict[str, bytes]:
@@ -184,9 +184,9 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
     def told(step: int, _: int) -> None:
         fits.append(step)
 
-    first = make_example(scene(), OPTIONS, 0.1, "a", tmp_path, told)
+    first = make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
-    second = make_example(scene(), OPTIONS, 0.1, "b", tmp_path, told)
+    second = make_example(subject(), OPTIONS, 0.1, "b", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
     assert first.sha256 == second.sha256
     for k in OPTIONS.levels:
@@ -195,11 +195,11 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
             assert a.means.equal(b.means) if f.name == "children" else a.equal(b)
     (kept,) = tmp_path.iterdir()
     kept.write_bytes(kept.read_bytes()[:1000])
-    assert make_example(scene(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
+    assert make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
     assert len(fits) == 4 * OPTIONS.fit_steps
-    other = make_example(make_scene(two_planes(), arc(3, 32, 24)), OPTIONS, 0.1, "c", tmp_path)
+    other = make_example(make_subject(make_scene(two_planes(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "c", tmp_path)
     assert other.sha256 != first.sha256
-    sparse = make_example(scene(), OPTIONS, 0.05, "a", tmp_path)
+    sparse = make_example(subject(), OPTIONS, 0.05, "a", tmp_path)
     assert len(sparse.features) < len(first.features)
     assert len(list(tmp_path.iterdir())) == 3
 
@@ -214,6 +214,15 @@ def test_settings_are_checked(tmp_path: Path) -> None:
         {"densities": (2,)},
         {"match": "all"},
         {"seed": 1.5},
+        {"views": ()},
+        {"views": (-1,)},
+        {"photo_start": 1.5},
+        {"novel": -0.1},
+        {"photo_scale": 0},
+        {"window": 5},
+        {"photo_loss": "l2"},
+        {"lpips_weight": -1},
+        {"teacher_steps": 0},
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replace(OPTIONS, **wrong)  # type: ignore[arg-type]
@@ -221,6 +230,33 @@ def test_settings_are_checked(tmp_path: Path) -> None:
     for values in ({"step": 3}, {"network": {"depth": 1}}, {"network": 3}):
         with pytest.raises(ValueError, match=r"unknown|network"):
             TrainOptions.from_dict(values)
+
+
+def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
+    paper, config = preset_options("paper"), tmp_path / "run.json"
+    assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
+    assert (paper.teacher_weight, paper.diversity_weight, paper.steps) == (0.25, 1, 300_000)
+    assert (paper.rate_at(1999), paper.photo_step, paper.clip) == (5e-5, 0, 10)
+    assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
+    assert preset_options("default") == TrainOptions()
+    config.write_text(json.dumps({"steps": 10, "network": {"width": 16}}))
+    changed = read_config(config, paper)
+    assert changed == replace(paper, steps=10, network=NetworkOptions(width=16))
+    assert read_config(config) == replace(TrainOptions(), steps=10, network=NetworkOptions(width=16))
+    with pytest.raises(ValueError, match="preset"):
+        preset_options("papers")
+
+
+def test_what_holds_the_gaussians_fades() -> None:
+    options = replace(
+        OPTIONS, steps=100, photo_start=0.2, regression_weight=0.8, teacher_weight=0.25, teacher_steps=10,
+        diversity_weight=1.0, diversity_steps=1000,
+    )  # fmt: skip
+    assert options.photo_step == 20
+    assert options.held_by(20) == (0.8, 0.25, 1)
+    assert options.held_by(25) == pytest.approx((0.75, 0.125, 0.995))
+    assert options.held_by(60) == pytest.approx((0.4, 0, 0.96))
+    assert replace(options, photo_start=1.0).photo_step == 100
 
 
 def test_rate_rises_and_falls() -> None:
