@@ -168,9 +168,9 @@ def asked_per_view(scene: PixelScene | LooseScene, options: CompactOptions) -> i
 
 
 def uses_robust(scene: PixelScene | LooseScene, options: CompactOptions) -> bool:
-    """Whether the photos choose the merge: as asked, otherwise unless a full fit follows."""
-    asked = options.robust.robust
-    return scene.images is not None and (options.fit.fit != "full" if asked is None else asked)
+    """Whether the photos choose the merge: as asked, otherwise unless a full fit follows or it is a draft."""
+    asked, fit = options.robust.robust, options.fit
+    return scene.images is not None and (fit.fit != "full" and fit.effort != "draft" if asked is None else asked)
 
 
 def _behind(canvas: Canvas, options: CompactOptions) -> float:

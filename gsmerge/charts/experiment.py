@@ -49,7 +49,7 @@ class Grid:
         densities: Superpixels per pixel; beside the budgets, not times them.
         segmentations: Superpixel methods.
         fit: ``full``, ``color``, ``none``.
-        efforts: ``fast``, ``default``, ``best``.
+        efforts: ``draft``, ``fast``, ``default``, ``best``.
         matches: Merging across views: ``overlap``, ``aabb``, ``none``.
         views: Numbers of views; "all" for all.
         fixed: Any other settings of ours, each "name=value", the same in all runs.
@@ -190,7 +190,8 @@ def _senseless(
         if any(chosen[name] != value for name, value in first.items() if name not in own):
             return f"{method} takes " + ("effort alone" if own else "a size alone")
         return f"{method} keeps all Gaussians" if method in WHOLE and sizes and size != sizes[0] else None
-    if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and chosen["effort"] != grid.efforts[0]:
+    other = chosen["effort"] != grid.efforts[0] and "draft" not in (chosen["effort"], grid.efforts[0])
+    if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and other:
         return "effort changes nothing for other superpixels than rdseg without a full fit"
     if chosen["k"] == "auto" and sizes and size != sizes[0]:
         return "k = auto finds the number itself, so it has one size"

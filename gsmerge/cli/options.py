@@ -316,7 +316,7 @@ RobustOption = Annotated[
     typer.Option(
         "--robust/--no-robust",
         help="Choose among merges by what the photos say.",
-        show_default="unless --fit full",
+        show_default="unless --fit full or a draft",
         rich_help_panel=MERGING,
     ),
 ]

@@ -100,7 +100,7 @@ def test_told_defaults_are_the_library_s() -> None:
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None
-    worded = {"robust": "unless --fit full", "fit_steps": "by effort", "match": "overlap, none for a draft"}
+    worded = {"robust": "unless --fit full or a draft", "fit_steps": "by effort", "match": "overlap, none for a draft"}
     real = {name: worded.get(name, str(library[name])) for name in told}
     assert told == real
 

@@ -54,6 +54,7 @@ def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     assert "merge" in asked.choices
     assert "merge" in scenes.compacted(scene, fit="none").report.choices
     assert "merge" not in scenes.compacted(scene, fit="color", robust=False).report.choices
+    assert "merge" not in scenes.compacted(scene, fit="none", effort="draft").report.choices
 
 
 def test_progress_tells_every_stage(scene: PixelScene) -> None:
