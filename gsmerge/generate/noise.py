@@ -7,16 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gsmerge.generate.options import Noise
 from gsmerge.generate.patterns import enlarged
-from gsmerge.generate.photograph import Lens
+from gsmerge.generate.photograph import Float, Lens
 from gsmerge.generate.shapes import Array
 from gsmerge.kernels.harmonics import view_colors
 from gsmerge.types import SH_C0, Gaussians
-
-Float = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,9 @@ def pixel_gaussians(seen: Seen, lens: Lens, noise: Noise, rng: np.random.Generat
     means = (rays * depth[:, None]) @ seen.c2w[:3, :3].T + seen.c2w[:3, 3]
     normals = seen.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    quats = facing(np.where(length < 1e-6, rays, normals) / np.where(length < 1e-6, np.linalg.norm(rays, axis=1)[:, None], length))
+    quats = facing(
+        np.where(length < 1e-6, rays, normals) / np.where(length < 1e-6, np.linalg.norm(rays, axis=1)[:, None], length)
+    )
     shape = np.array([1.0, 1.0, noise.flatness]) * np.exp(rng.normal(0, noise.scale_jitter, (n, 3)))
     scales = noise.scale * (depth / lens.focal)[:, None] * shape
     oversized = rng.random(n) < noise.oversized

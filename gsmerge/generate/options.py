@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsmerge.errors import SceneError
 from gsmerge.generate.paths import PATHS
 from gsmerge.generate.styles import STYLES
+from gsmerge.io.tables import read_table
 
 Range = tuple[float, float]
 MIXED = "mixed"
@@ -105,9 +108,28 @@ class NoiseOptions:
                 ok = len(value) > 0 and all(degree in (0, 1, 2, 3) for degree in value)
             else:
                 ok = len(value) == 2 and 0 <= value[0] <= value[1] < float("inf")
-                ok = ok and not (f.name in (*SPREAD, "unit", "far", "scale", "bleed_width", "flatness") and value[0] == 0)
+                ok = ok and not (
+                    f.name in (*SPREAD, "unit", "far", "scale", "bleed_width", "flatness") and value[0] == 0
+                )
             if not ok:
                 raise ValueError(f"{f.name}: expected a range of what its docstring says, got {value!r}")
+
+
+def read_ranges(path: Path) -> NoiseOptions:
+    """Ranges from a TOML or JSON file: a table with some of the names, and two numbers for each.
+
+    Raises:
+        SceneError: If the file cannot be read, or holds a name or value that is none.
+    """
+    table = read_table(path)
+    unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
+    if unknown:
+        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/generator.md has the names")
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
+    try:
+        return NoiseOptions(**values)
+    except (ValueError, TypeError) as error:
+        raise SceneError(path, str(error), "docs/generator.md has the ranges") from error
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Grey = NDArray[np.float32]
+Grey: TypeAlias = NDArray[Any]  # float32
 
 
 def enlarged(cells: NDArray[np.float64], size: int) -> Grey:
@@ -16,7 +18,8 @@ def enlarged(cells: NDArray[np.float64], size: int) -> Grey:
     wide = np.pad(cells, pad, mode="wrap").astype(np.float32)
     y = (np.arange(size, dtype=np.float32) + 0.5) * rows / size - 0.5 + pad
     x = (np.arange(size, dtype=np.float32) + 0.5) * columns / size - 0.5 + pad
-    return cv2.remap(wide, *np.meshgrid(x, y), cv2.INTER_CUBIC)
+    at_x, at_y = np.meshgrid(x, y)
+    return cv2.remap(wide, at_x, at_y, cv2.INTER_CUBIC)
 
 
 def noise(

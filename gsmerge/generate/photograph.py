@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -20,9 +21,10 @@ SAMPLES = 2  # rays per pixel and axis for the colours; depth is that of the pix
 KEY_MAPS, KEY_SIZE = 5, 640  # maps of the direct light, for soft shade, and their side
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256
 BEHIND = 1000.0  # radii that the eye of a light's map stands away, so that its rays are parallel
+GLOW = 0.7  # of what shines by itself, against a white wall in full light
 FROM_BELOW = 0.5  # light from below, against that from above
 
-Float = NDArray[np.float32]
+Float: TypeAlias = NDArray[Any]  # float32
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Lens:
     focal: float
 
     @property
-    def K(self) -> Array:
+    def intrinsics(self) -> Array:
         """``[3,3]``, the principal point in the middle."""
         return np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]])
 
@@ -264,7 +266,7 @@ def _shaded(view: Lit, ids: NDArray[np.int32], albedo: Float, world: Float, norm
     out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
     out += shine[:, None] * key + rim[:, None] * ambient
     glow = np.array([s.glow for s in shapes])[ids]
-    out[glow] = albedo[glow] * float(key.mean() + ambient.mean())
+    out[glow] = albedo[glow] * GLOW * float(key.mean() + ambient.mean())
     return out
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gsmerge.generate.options import GenerateOptions
 from gsmerge.generate.scene import make_scene
@@ -24,6 +23,24 @@ class Generated:
 
     folder: Path
     kept: bool
+
+
+def plan(out: Path, count: int, options: GenerateOptions, *, seed: int = 0, overwrite: bool = False) -> list[Generated]:
+    """What :func:`generate` would do; nothing is written.
+
+    Raises:
+        ValueError: If ``count`` or ``seed`` is out of range.
+        UsageError: If a folder holds something else.
+    """
+    if count < 1 or seed < 0:
+        raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
+    found = []
+    for index in range(count):
+        folder = out / f"scene_{index:04d}"
+        found.append(Generated(folder, is_made(folder, scene_key(seed, index, options))))
+        if not found[-1].kept:
+            check_replaceable(folder, overwrite=overwrite)
+    return found
 
 
 def generate(
@@ -59,23 +76,16 @@ def generate(
         UsageError: If a folder holds something else.
         SceneError: If a folder cannot be written.
     """
-    if count < 1 or seed < 0:
-        raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
     options = options or GenerateOptions()
-    folders = [out / f"scene_{i:04d}" for i in range(count)]
-    keys = [scene_key(seed, i, options) for i in range(count)]
-    kept = [is_made(folder, key) for folder, key in zip(folders, keys, strict=True)]
-    for folder, there in zip(folders, kept, strict=True):
-        if not there:
-            check_replaceable(folder, overwrite=overwrite)
-    todo = [i for i in range(count) if not kept[i]]
+    planned = plan(out, count, options, seed=seed, overwrite=overwrite)
+    todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
-    def work(index: int) -> dict[str, Any]:
-        return write_scene(folders[index], make_scene(seed, index, options), keys[index])
+    def work(index: int) -> None:
+        write_scene(planned[index].folder, make_scene(seed, index, options), scene_key(seed, index, options))
 
     with use_threads(threads) as workers:
         for first in range(0, len(todo), workers):
             parallel_map(work, todo[first : first + workers])
             if progress is not None:
                 progress(count - len(todo) + min(first + workers, len(todo)), count)
-    return [Generated(folder, there) for folder, there in zip(folders, kept, strict=True)]
+    return planned

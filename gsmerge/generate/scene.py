@@ -66,9 +66,9 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> MadeScene:
     world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # many exporters begin at the first camera
     moved = [_moved(pose, world, noise.unit) for pose in poses]
     seen = []
-    for (image, depth, normals), pose in zip(photos[::2], moved[::2], strict=True):
+    for (image, depth, normals), pose_there in zip(photos[::2], moved[::2], strict=True):
         depth = np.minimum(depth, FAR) * noise.unit
-        believed = _shaken(pose, noise, float(np.median(depth)), rng)
+        believed = _shaken(pose_there, noise, float(np.median(depth)), rng)
         turned = (normals @ world[:3, :3].T).astype(np.float32)
         seen.append((Seen(image, depth, turned, believed), int(rng.integers(2**63))))
     parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, _rng(given[1])), seen)
@@ -105,9 +105,7 @@ def _found(rng: np.random.Generator, style: str, path: str, lens: Lens, num_view
     return view, pose
 
 
-def _photo(
-    view: Lit, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
-) -> tuple[Float, Array, Float]:
+def _photo(view: Lit, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]) -> tuple[Float, Array, Float]:
     """The photo from a pose, with the faults of lens, sensor and exposure, and exact depth and normals."""
     pose, seed = given
     rng = _rng(seed)
@@ -141,4 +139,4 @@ def _moved(pose: Array, world: Array, unit: float) -> Array:
 
 def _cameras(poses: Sequence[Array], lens: Lens) -> Cameras:
     viewmats = torch.from_numpy(np.stack([np.linalg.inv(pose) for pose in poses]))
-    return Cameras(viewmats, torch.from_numpy(np.repeat(lens.K[None], len(poses), 0)), lens.width, lens.height)
+    return Cameras(viewmats, torch.from_numpy(np.repeat(lens.intrinsics[None], len(poses), 0)), lens.width, lens.height)

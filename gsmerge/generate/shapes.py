@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET
 
-Array = NDArray[np.float64]
+Array: TypeAlias = NDArray[Any]
+Vector: TypeAlias = Sequence[float] | Array  # of length 3
 NUM_WAVES = 4
 NO_WAVES = np.zeros((NUM_WAVES, 5))
 
@@ -69,31 +71,31 @@ def about(axis: int, angle: float) -> Array:
 UPRIGHT, LYING = np.eye(3), about(0, np.pi / 2)  # of quads, leaves and sheets: facing -z, facing up
 
 
-def box(low: Sequence[float], high: Sequence[float], look: Look) -> Shape:
+def box(low: Vector, high: Vector, look: Look) -> Shape:
     """A box between two corners."""
     a, b = np.asarray(low, float), np.asarray(high, float)
     half = np.abs(b - a) / 2
     return Shape(BOX, (*half, 1.0), look, (a + b) / 2)
 
 
-def quad(centre: Sequence[float], half: tuple[float, float], look: Look, turn: Array = UPRIGHT) -> Shape:
+def quad(centre: Vector, half: tuple[float, float], look: Look, turn: Array = UPRIGHT) -> Shape:
     """A rectangle."""
     return Shape(QUAD, (*half, 0.0, 1.0), look, np.asarray(centre, float), turn)
 
 
-def ball(centre: Sequence[float], radii: Sequence[float], look: Look) -> Shape:
+def ball(centre: Vector, radii: Vector, look: Look) -> Shape:
     """An ellipsoid."""
     return Shape(ELLIPSOID, (radii[0], radii[1], radii[2], 1.0), look, np.asarray(centre, float))
 
 
-def column(foot: Sequence[float], height: float, radius: float, look: Look, *, top: float = 1.0) -> Shape:
+def column(foot: Vector, height: float, radius: float, look: Look, *, top: float = 1.0) -> Shape:
     """An upright cylinder that stands on ``foot``; its radius at the top is ``top`` times that at the foot."""
     x, y, z = foot
     size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel's radii are those at -y, which is up
     return Shape(CONE, size, look, np.array([x, y - height / 2, z]))
 
 
-def rod(start: Sequence[float], end: Sequence[float], radius: float, look: Look) -> Shape:
+def rod(start: Vector, end: Vector, radius: float, look: Look) -> Shape:
     """A cylinder between two points."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(b - a))
@@ -103,12 +105,12 @@ def rod(start: Sequence[float], end: Sequence[float], radius: float, look: Look)
     return Shape(CONE, (radius, length / 2, radius, 1.0), look, (a + b) / 2, np.stack([x, y, np.cross(x, y)], 1))
 
 
-def leaf(centre: Sequence[float], half: tuple[float, float], look: Look, turn: Array) -> Shape:
+def leaf(centre: Vector, half: tuple[float, float], look: Look, turn: Array) -> Shape:
     """A pointed leaf, its tips along local y."""
     return Shape(LEAF, (*half, 0.0, 1.0), look, np.asarray(centre, float), turn)
 
 
-def blob(centre: Sequence[float], radii: Sequence[float], look: Look, rng: np.random.Generator, rough: float) -> Shape:
+def blob(centre: Vector, radii: Vector, look: Look, rng: np.random.Generator, rough: float) -> Shape:
     """An uneven ellipsoid; ``rough`` is how far its surface swings, of its size."""
     waves = np.concatenate([rng.normal(0, 2.2, (NUM_WAVES, 3)), rng.uniform(0, 6.28, (NUM_WAVES, 1))], 1)
     waves = np.concatenate([waves, np.full((NUM_WAVES, 1), rough / NUM_WAVES)], 1)
@@ -116,7 +118,7 @@ def blob(centre: Sequence[float], radii: Sequence[float], look: Look, rng: np.ra
 
 
 def sheet(
-    centre: Sequence[float],
+    centre: Vector,
     half: tuple[float, float],
     look: Look,
     rng: np.random.Generator,
@@ -134,7 +136,7 @@ def sheet(
 
 
 def placed(
-    shapes: Iterable[Shape], at: Sequence[float] = (0, 0, 0), *, yaw: float = 0.0, turn: Array | None = None
+    shapes: Iterable[Shape], at: Vector = (0, 0, 0), *, yaw: float = 0.0, turn: Array | None = None
 ) -> list[Shape]:
     """Shapes turned about the origin, about y by ``yaw`` or by ``turn``, then moved."""
     rotation = about(1, yaw) if turn is None else turn

@@ -49,12 +49,28 @@ def light(rng: np.random.Generator, lamp_at: Array | None) -> Light:
 def _walls(pal: Palette, width: float, depth: float, height: float) -> Things:
     """Floor, ceiling and four walls about the origin, with pictures, a window, a skirting and a pipe."""
     rng = pal.rng
-    papers = [pal.look("plain", "plaster", "bricks", "cloth", "tiles", "wood", repeat=rng.uniform(0.3, 0.8), gloss=0.0) for _ in range(2)]
-    floor = pal.look("wood", "tiles", "carpet", "granite", "plaster", repeat=rng.uniform(0.3, 0.8))
+    papers = [
+        pal.look(
+            "plain",
+            "plain",
+            "plain",
+            "plaster",
+            "bricks",
+            "cloth",
+            "tiles",
+            "wood",
+            repeat=rng.uniform(0.3, 0.8),
+            gloss=0.0,
+        )
+        for _ in range(2)
+    ]
+    floor = pal.look("wood", "wood", "tiles", "carpet", "granite", "plaster", "plain", repeat=rng.uniform(0.3, 0.8))
     w, d, h = width / 2, depth / 2, height
     out = [quad((0, 0, 0), (w, d), floor, LYING), quad((0, -h, 0), (w, d), pal.look("plain", gloss=0.0), LYING)]
     out += [quad((0, -h / 2, z), (w, h / 2), papers[0]) for z in (d, -d)]
-    out += [quad((x, -h / 2, 0), (d, h / 2), look, FACING) for x, look in ((-w, papers[1]), (w, papers[rng.integers(2)]))]
+    out += [
+        quad((x, -h / 2, 0), (d, h / 2), look, FACING) for x, look in ((-w, papers[1]), (w, papers[rng.integers(2)]))
+    ]
     out = _shell(out)
     skirting = pal.look("plain", "wood")
     out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
@@ -96,7 +112,9 @@ def room(pal: Palette) -> Stage:
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
         at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
         things += placed(_furniture(pal), at, yaw=rng.normal(0, 0.5))
-    things += placed(plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90))), (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
+    things += placed(
+        plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90))), (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d)
+    )
     things += placed(lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d))
     a, b = (np.array([x * w, -h * rng.uniform(0.75, 1), rng.uniform(0, 0.45) * d]) for x in (-0.5, 0.5))
     things += wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
@@ -163,9 +181,14 @@ def garden(pal: Palette) -> Stage:
         at = rng.uniform(-1.6, 1.6), 0, rng.uniform(-0.3, 1.2)
         things += placed(bush(pal, rng.uniform(0.25, 0.6), int(rng.integers(200, 500))), at)
     for _ in range(rng.integers(1, 4)):
-        things += placed(plant(pal, rng.uniform(0.4, 1.0), int(rng.integers(30, 120))), (rng.uniform(-1.2, 1.2), 0, rng.uniform(-0.8, 0.4)))
+        things += placed(
+            plant(pal, rng.uniform(0.4, 1.0), int(rng.integers(30, 120))),
+            (rng.uniform(-1.2, 1.2), 0, rng.uniform(-0.8, 0.4)),
+        )
     for _ in range(rng.integers(1, 5)):
-        things += placed(tree(pal, rng.uniform(2.0, 4.5), int(rng.integers(30, 120))), (rng.uniform(-4, 4), 0, rng.uniform(2, 6)))
+        things += placed(
+            tree(pal, rng.uniform(2.0, 4.5), int(rng.integers(30, 120))), (rng.uniform(-4, 4), 0, rng.uniform(2, 6))
+        )
     if rng.random() < 0.6:
         things += placed(fence(pal, rng.uniform(2, 6), rng.uniform(0.6, 1.2)), (0, 0, rng.uniform(1.2, 2.5)))
     if rng.random() < 0.6:
@@ -183,7 +206,10 @@ def facade(pal: Palette) -> Stage:
     rng = pal.rng
     things = _outside(pal, ("gravel", "tiles", "grass", "plaster"), 10.0)
     w, h, z = rng.uniform(6, 12), rng.uniform(4, 8), 2.0
-    wall, trim = pal.look("bricks", "plaster", "bricks", "plain", repeat=0.35), pal.look("plaster", "plain", "granite", repeat=0.5)
+    wall, trim = (
+        pal.look("bricks", "plaster", "plaster", "plain", repeat=0.35),
+        pal.look("plaster", "plain", "granite", repeat=0.5),
+    )
     things.append(box((-w / 2, -h, z), (w / 2, 0, z + 3), wall))
     floors, columns = int(rng.integers(2, 4)), int(rng.integers(3, 7))
     pane, pitch, storey = pal.look("gradient", "sky", gloss=0.9), w / columns, h / floors
@@ -195,10 +221,18 @@ def facade(pal: Palette) -> Stage:
                 continue
             wide, tall = 0.45 * pitch, 0.55 * storey
             things += placed(window(pal, wide, tall, pane, glow=False), (x, -storey * (i + 0.25), z - 0.01))
-            things.append(box((x - 0.6 * wide, -storey * (i + 0.25), z - 0.12), (x + 0.6 * wide, 0.08 - storey * (i + 0.25), z), trim))
+            things.append(
+                box(
+                    (x - 0.6 * wide, -storey * (i + 0.25), z - 0.12),
+                    (x + 0.6 * wide, 0.08 - storey * (i + 0.25), z),
+                    trim,
+                )
+            )
     count, porch = int(rng.integers(2, 6)), rng.uniform(1.0, 1.8)
     things += placed(steps(pal, 2.4 * porch, count), (0, 0, z - 0.3 * (count + 1)))
-    things.append(box((-0.5 * porch, -0.75 * storey, z - 0.03), (0.5 * porch, 0, z), pal.look("wood", "plain", "printed")))
+    things.append(
+        box((-0.5 * porch, -0.75 * storey, z - 0.03), (0.5 * porch, 0, z), pal.look("wood", "plain", "printed"))
+    )
     for x in (-porch, porch, -0.75 * porch, 0.75 * porch)[: 2 * int(rng.integers(0, 3))]:
         things.append(column((x, 0, z - 0.4), 0.9 * storey, 0.14, trim, top=0.85))
         things.append(box((x - 0.2, -0.9 * storey - 0.1, z - 0.6), (x + 0.2, -0.9 * storey, z - 0.2), trim))
@@ -206,7 +240,9 @@ def facade(pal: Palette) -> Stage:
     things += [box((-w / 2 - 0.3, -h - 0.25, z - 0.3), (w / 2 + 0.3, -h, z + 3), trim)]
     things += [column((x, -h, z + 0.8), rng.uniform(1, 2), 0.9, roof, top=0.02) for x in (-w / 2 + 0.9, w / 2 - 0.9)]
     for x in rng.uniform(-0.7, 0.7, rng.integers(1, 4)) * w:
-        things += placed(tree(pal, rng.uniform(2, 5), 60) if abs(x) > w / 2 else bush(pal, 0.4, 250), (x, 0, z - rng.uniform(0.8, 2)))
+        things += placed(
+            tree(pal, rng.uniform(2, 5), 60) if abs(x) > w / 2 else bush(pal, 0.4, 250), (x, 0, z - rng.uniform(0.8, 2))
+        )
     things += placed(fence(pal, rng.uniform(2, 5), 0.9), (rng.uniform(-4, 4), 0, z - 2.2))
     focus = np.array([rng.normal(0, 0.5), -rng.uniform(0.25, 0.5) * h, z])
     return Stage(tuple(things), tuple(pal.textures), light(rng, None), focus, (0.7 * w, 1.2 * w), (0.8, 2.5), 45)
@@ -220,7 +256,7 @@ def single(pal: Palette) -> Stage:
         at = 2.7 * np.sin(angle), 0.0, 2.7 * np.cos(angle)
         things += placed(_furniture(pal) if inside else bush(pal, 0.5, 250), at, yaw=angle + np.pi)
     height = rng.uniform(0.3, 0.6)
-    surface = pal.look("granite", "wood", "tiles", "cloth", "plain", "marble", repeat=1.5)
+    surface = pal.look("granite", "wood", "wood", "tiles", "cloth", "plain", "plain", "marble", repeat=1.5)
     things.append(column((0, 0, 0), height, rng.uniform(0.35, 0.6), surface))
     main = toy(pal) if rng.random() < 0.5 else small_thing(pal)
     scale = rng.uniform(1.0, 1.6)
@@ -228,7 +264,9 @@ def single(pal: Palette) -> Stage:
     things += clutter(pal, int(rng.integers(0, 5)), (0.22, 0.22), height)
     focus = np.array([0, -height - rng.uniform(0.06, 0.16), 0])
     lamp_at = np.array([0.8, -2.5, -0.8]) if inside else None
-    return Stage(tuple(things), tuple(pal.textures), light(rng, lamp_at), focus, (0.55, 1.1), (height + 0.2, height + 0.6), 180)
+    return Stage(
+        tuple(things), tuple(pal.textures), light(rng, lamp_at), focus, (0.55, 1.1), (height + 0.2, height + 0.6), 180
+    )
 
 
 def _grown(shape: Shape, factor: float) -> Shape:

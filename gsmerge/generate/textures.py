@@ -6,6 +6,7 @@ Every maker is ``(rng, size) -> [size,size,3]`` float32 sRGB in [0, 1]; ``KINDS`
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -13,8 +14,8 @@ from numpy.typing import NDArray
 
 from gsmerge.generate.patterns import Grey, cells, courses, enlarged, glyphs, grid, noise, text_line, warped
 
-Picture = NDArray[np.float32]
-Color = NDArray[np.float32]
+Picture: TypeAlias = NDArray[Any]  # float32
+Color: TypeAlias = NDArray[Any]
 
 
 def color(
@@ -106,8 +107,8 @@ def bricks(rng: np.random.Generator, size: int) -> Picture:
     base = color(rng, hue=hue, strength=(0.05, 0.3) if stone else (0.35, 0.7), light=(0.4, 0.75))
     low, high = shades(rng, base, 0.35)
     tone, joint = courses(rng, size, rows, rows // 2, joint=rng.uniform(0.05, 0.1), offset=0.5)
-    bend = [noise(rng, size, first=16, fade=0.6) for _ in range(2)]
-    tone, joint = (warped(picture, *bend, 0.01) for picture in (tone, joint))
+    dx, dy = (noise(rng, size, first=16, fade=0.6) for _ in range(2))
+    tone, joint = (warped(picture, dx, dy, 0.01) for picture in (tone, joint))
     out = mix(low, high, 0.5 * tone + 0.5 * noise(rng, size, first=8, fade=0.85))
     return out + (color(rng, strength=(0, 0.15), light=(0.4, 0.8)) - out) * joint[..., None]
 
@@ -179,7 +180,10 @@ def crown(rng: np.random.Generator, size: int) -> Picture:
     base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
     clumps = noise(rng, size, first=4, fade=0.75)
-    return mix(low, high, np.clip(0.5 * tone + 0.6 * clumps - 0.1, 0, 1)) * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
+    return (
+        mix(low, high, np.clip(0.5 * tone + 0.6 * clumps - 0.1, 0, 1))
+        * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
+    )
 
 
 def gradient(rng: np.random.Generator, size: int) -> Picture:
@@ -248,7 +252,7 @@ def spines(rng: np.random.Generator, size: int) -> Picture:
 def sky(rng: np.random.Generator, size: int) -> Picture:
     """Blue or grey with clouds; the horizon at y = 1/2."""
     _, y = grid(size)
-    high, low = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95)), np.float32([0.9, 0.92, 0.95])
+    high, low = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95)), np.array([0.9, 0.92, 0.95], np.float32)
     clouds = np.clip(rng.uniform(0.8, 2.5) * (noise(rng, size, first=4, fade=0.55) - rng.uniform(0.3, 0.8)), 0, 1)
     out = mix(high, low, np.clip(1 - 2.2 * np.abs(y - 0.5), 0, 1) ** 2)
     return out + (0.97 - out) * clouds[..., None]
@@ -266,7 +270,7 @@ KINDS: dict[str, Maker] = {
 
 def pyramid(texture: Picture) -> list[Picture]:
     """The texture, and halves of it down to 8 pixels, so that what is far away does not flicker."""
-    out = [np.ascontiguousarray(texture, np.float32)]
+    out: list[Picture] = [np.ascontiguousarray(texture, np.float32)]
     while len(out[-1]) > 8:
         half = len(out[-1]) // 2
         out.append(cv2.resize(out[-1], (half, half), interpolation=cv2.INTER_AREA))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -29,7 +30,11 @@ Things = list[Shape]
 
 def table(pal: Palette, width: float, depth: float, height: float) -> Things:
     """A table with four legs, or a round one with one."""
-    rng, top, legs = pal.rng, pal.look("wood", "marble", "plain", "granite", repeat=0.8), pal.look("wood", "plain")
+    rng, top, legs = (
+        pal.rng,
+        pal.look("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8),
+        pal.look("wood", "plain"),
+    )
     thick = rng.uniform(0.02, 0.06)
     if rng.random() < 0.35:
         disc = column((0, -height + thick, 0), thick, width / 2, top)
@@ -37,7 +42,9 @@ def table(pal: Palette, width: float, depth: float, height: float) -> Things:
     out = [box((-width / 2, -height, -depth / 2), (width / 2, thick - height, depth / 2), top)]
     inset, radius = rng.uniform(0.05, 0.12), rng.uniform(0.012, 0.04)
     for x in (inset - width / 2, width / 2 - inset):
-        out += [rod((x * 1.02, 0, z), (x, thick - height, z), radius, legs) for z in (inset - depth / 2, depth / 2 - inset)]
+        out += [
+            rod((x * 1.02, 0, z), (x, thick - height, z), radius, legs) for z in (inset - depth / 2, depth / 2 - inset)
+        ]
     return out
 
 
@@ -66,7 +73,9 @@ def shelf(pal: Palette, width: float, height: float) -> Things:
         if y + 0.3 > height:
             break
         if rng.random() < 0.7:
-            left, right = np.sort(rng.uniform(-width / 2, width / 2, 2)) if rng.random() < 0.5 else (-width / 2, width / 2)
+            left, right = (
+                np.sort(rng.uniform(-width / 2, width / 2, 2)) if rng.random() < 0.5 else (-width / 2, width / 2)
+            )
             top, front = y + rng.uniform(0.18, 0.26), -depth * rng.uniform(0.6, 0.95)
             out.append(box((left, -top, front), (max(right, left + 0.1), -y - 0.02, -0.02), pal.look("spines")))
         else:
@@ -92,7 +101,13 @@ def carton(pal: Palette) -> Things:
 def can(pal: Palette) -> Things:
     """A can, a jar or a mug."""
     rng, r, h = pal.rng, pal.rng.uniform(0.025, 0.05), pal.rng.uniform(0.07, 0.16)
-    body = column((0, 0, 0), h, r, pal.look("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8)), top=rng.uniform(0.9, 1.15))
+    body = column(
+        (0, 0, 0),
+        h,
+        r,
+        pal.look("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8)),
+        top=rng.uniform(0.9, 1.15),
+    )
     return [body, column((0, -h, 0), 0.004, r * 0.85, pal.look("plain", gloss=0.8))]
 
 
@@ -189,7 +204,7 @@ def bush(pal: Palette, radius: float, leaves: int) -> Things:
         away *= radii * rng.uniform(0.8, 1.1) / np.linalg.norm(away)
         size = radius * rng.uniform(0.08, 0.22)
         look = flower if rng.random() < 0.15 else green
-        out.append(leaf(away + [0, -0.8 * radii[1], 0], (0.42 * size, size), look, tumbled(rng)))
+        out.append(leaf(away - np.array([0, 0.8 * radii[1], 0]), (0.42 * size, size), look, tumbled(rng)))
     return out
 
 
@@ -213,7 +228,9 @@ def steps(pal: Palette, width: float, count: int) -> Things:
     """Steps that rise away from the cameras."""
     look = pal.look("plaster", "granite", "wood", "bricks", repeat=0.7)
     rise, tread = pal.rng.uniform(0.12, 0.18), pal.rng.uniform(0.25, 0.35)
-    return [box((-width / 2, -rise * (k + 1), tread * k), (width / 2, 0, tread * (count + 1)), look) for k in range(count)]
+    return [
+        box((-width / 2, -rise * (k + 1), tread * k), (width / 2, 0, tread * (count + 1)), look) for k in range(count)
+    ]
 
 
 def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> Things:
@@ -221,7 +238,7 @@ def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> T
     t = np.linspace(0, 1, 9)[:, None]
     points = start + (end - start) * t + [0, 4 * sag, 0] * t * (1 - t)
     look = pal.look("plain", gloss=0.2)
-    return [rod(a, b, radius, look) for a, b in zip(points[:-1], points[1:], strict=True)]
+    return [rod(a, b, radius, look) for a, b in itertools.pairwise(points)]
 
 
 def fence(pal: Palette, width: float, height: float) -> Things:
@@ -229,7 +246,9 @@ def fence(pal: Palette, width: float, height: float) -> Things:
     look, gap = pal.look("plain", "wood", "bark"), pal.rng.uniform(0.1, 0.25)
     radius = pal.rng.uniform(0.006, 0.02)
     out = [rod((x, 0, 0), (x, -height, 0), radius, look) for x in np.arange(-width / 2, width / 2, gap)]
-    return out + [rod((-width / 2, -h, 0), (width / 2, -h, 0), 1.4 * radius, look) for h in (0.15 * height, 0.9 * height)]
+    return out + [
+        rod((-width / 2, -h, 0), (width / 2, -h, 0), 1.4 * radius, look) for h in (0.15 * height, 0.9 * height)
+    ]
 
 
 def window(pal: Palette, width: float, height: float, look: Look, *, glow: bool) -> Things:
@@ -262,7 +281,8 @@ def small_thing(pal: Palette) -> Things:
 
 def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) -> Things:
     """Small things over a rectangle, apart from one another, with papers and cables between them."""
-    rng, taken, out = pal.rng, [], []
+    rng, out = pal.rng, []
+    taken: list[Array] = []
     for _ in range(count * 4):
         at = rng.uniform(-1, 1, 2) * half
         if len(taken) < count and all(np.hypot(*(at - other)) > 0.16 for other in taken):

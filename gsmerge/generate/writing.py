@@ -52,7 +52,9 @@ def check_replaceable(folder: Path, *, overwrite: bool) -> None:
     if not (folder / RECORD).is_file():
         raise UsageError(f"{folder}: expected no folder, or a made scene, found something else; choose another OUT")
     if not overwrite:
-        raise UsageError(f"{folder}: holds a scene of other options; pass --overwrite to replace it, or choose another OUT")
+        raise UsageError(
+            f"{folder}: holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
+        )
 
 
 def write_scene(folder: Path, made: MadeScene, key: Mapping[str, Any]) -> dict[str, Any]:

@@ -159,7 +159,7 @@ def _march(blob, waves, pace, first, last, ox, oy, oz, dx, dy, dz):
 @kernel
 def _hit(kind, s, waves, reach, slope, limit, ox, oy, oz, dx, dy, dz):
     """Depth of the nearest hit, in the shape's own frame; what lies beyond ``limit`` need not be found."""
-    if kind == QUAD or kind == LEAF:
+    if kind in (QUAD, LEAF):
         return _flat(kind == LEAF, s, ox, oy, oz, dx, dy, dz)
     if kind == BOX:
         return _box(s, ox, oy, oz, dx, dy, dz)
@@ -185,7 +185,7 @@ def _hit(kind, s, waves, reach, slope, limit, ox, oy, oz, dx, dy, dz):
 @kernel
 def _normal(kind, s, waves, x, y, z):
     """Outward normal in the shape's own frame, any length."""
-    if kind == QUAD or kind == LEAF:
+    if kind in (QUAD, LEAF):
         return 0.0, 0.0, 1.0
     a, b, c = x / s[0], y / s[1], z / max(s[2], 1e-12)
     if kind == BOX:
@@ -205,7 +205,7 @@ def _normal(kind, s, waves, x, y, z):
         nx, ny, nz = a / length, b / length, c / length
     if kind == SHEET:
         a, b, c = x, y, 0.0
-    if kind == BLOB or kind == SHEET:
+    if kind in (BLOB, SHEET):
         for k in range(waves.shape[0]):
             swing = waves[k, 4] * math.cos(waves[k, 0] * a + waves[k, 1] * b + waves[k, 2] * c + waves[k, 3])
             nx -= swing * waves[k, 0]
