@@ -45,6 +45,7 @@ class NoiseOptions:
         shift: Error of a pose, of the median depth.
         exposure: Deviation of the logarithm of a photo's brightness.
         tint: The same for each colour.
+        blur: Deviation of the lens's blur, pixels.
         offset: Most that a mean lies beside its pixel's centre, pixels.
         scale: Deviation of a Gaussian across its normal, of the pixel's footprint.
         scale_jitter: Deviation of the scales' logarithms.
@@ -67,11 +68,11 @@ class NoiseOptions:
         ValueError: If a range is none.
     """
 
-    view_bias: Range = (0.0003, 0.02)
-    drift: Range = (0.0005, 0.02)
+    view_bias: Range = (0.0002, 0.02)
+    drift: Range = (0.0003, 0.02)
     patches: Range = (0.0, 0.15)
     patch_error: Range = (0.02, 0.4)
-    grain: Range = (0.0007, 0.004)
+    grain: Range = (0.0007, 0.003)
     blank: Range = (0.0, 3.0)
     bleed: Range = (0.1, 1.0)
     bleed_width: Range = (0.6, 1.8)
@@ -81,6 +82,7 @@ class NoiseOptions:
     shift: Range = (0.0001, 0.004)
     exposure: Range = (0.0, 0.08)
     tint: Range = (0.0, 0.03)
+    blur: Range = (0.3, 1.0)
     offset: Range = (0.0, 0.3)
     scale: Range = (0.5, 1.5)
     scale_jitter: Range = (0.05, 0.35)
@@ -109,7 +111,7 @@ class NoiseOptions:
             else:
                 ok = len(value) == 2 and 0 <= value[0] <= value[1] < float("inf")
                 ok = ok and not (
-                    f.name in (*SPREAD, "unit", "far", "scale", "bleed_width", "flatness") and value[0] == 0
+                    f.name in (*SPREAD, "unit", "far", "scale", "bleed_width", "flatness", "blur") and value[0] == 0
                 )
             if not ok:
                 raise ValueError(f"{f.name}: expected a range of what its docstring says, got {value!r}")
@@ -150,6 +152,7 @@ class Noise:
     shift: float
     exposure: float
     tint: float
+    blur: float
     offset: float
     scale: float
     scale_jitter: float

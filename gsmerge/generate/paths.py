@@ -11,7 +11,7 @@ from gsmerge.generate.shapes import Array
 from gsmerge.generate.stage import Stage
 
 LEAST_NEAR = 0.22  # nearest per cent of the depths, of their median
-MOST_TURN = 40  # degrees from view to view
+MOST_TURN = 50  # degrees from view to view
 Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
 Path = Callable[[Stage, np.random.Generator, int], Pose]
 

@@ -56,11 +56,11 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> MadeScene:
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
     noise = draw_noise(options.ranges, rng, options.noise)
-    lens = Lens(options.width, options.height, max(options.width, options.height) * rng.uniform(0.65, 1.4))
+    lens = Lens(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
     view, pose = _found(rng, style, path, lens, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
-    gain = exposure([radiance(view, p, _smaller(lens), 1)[0] for p in poses[::2]], rng.uniform(0.3, 0.58))
+    gain = exposure([radiance(view, p, _smaller(lens), 1)[0] for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
     photos = parallel_map(partial(_photo, view, lens, noise, gain), list(zip(poses, seeds, strict=True)))
     world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # many exporters begin at the first camera
@@ -114,8 +114,7 @@ def _photo(view: Lit, lens: Lens, noise: Noise, gain: float, given: tuple[Array,
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = np.hypot(x - lens.width / 2, y - lens.height / 2) / np.hypot(lens.width, lens.height)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
-    blur = rng.uniform(0.25, 0.5)
-    image = cv2.GaussianBlur(developed(linear), (0, 0), blur)
+    image = cv2.GaussianBlur(developed(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
     hits = trace(view.shapes, pose, lens, 1)
     return np.round(image * 255) / np.float32(255), hits.depth, hits.normals

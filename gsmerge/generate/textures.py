@@ -252,7 +252,8 @@ def spines(rng: np.random.Generator, size: int) -> Picture:
 def sky(rng: np.random.Generator, size: int) -> Picture:
     """Blue or grey with clouds; the horizon at y = 1/2."""
     _, y = grid(size)
-    high, low = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95)), np.array([0.9, 0.92, 0.95], np.float32)
+    high = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95))
+    low = np.array([0.9, 0.92, 0.95], np.float32)
     clouds = np.clip(rng.uniform(0.8, 2.5) * (noise(rng, size, first=4, fade=0.55) - rng.uniform(0.3, 0.8)), 0, 1)
     out = mix(high, low, np.clip(1 - 2.2 * np.abs(y - 0.5), 0, 1) ** 2)
     return out + (0.97 - out) * clouds[..., None]

@@ -197,7 +197,7 @@ def bush(pal: Palette, radius: float, leaves: int) -> Things:
     """An uneven core with leaves all over."""
     rng, green = pal.rng, pal.look("foliage")
     radii = radius * rng.uniform(0.7, 1.2, 3)
-    out = [blob((0, -0.8 * radii[1], 0), 0.8 * radii, pal.look("crown", repeat=0.6 / radius, gloss=0.0), rng, 0.5)]
+    out = [blob((0, -0.8 * radii[1], 0), 0.8 * radii, pal.look("crown", repeat=1.2 / radius, gloss=0.0), rng, 0.5)]
     flower = pal.look("foliage")
     for _ in range(leaves):
         away = rng.normal(size=3)

@@ -43,6 +43,7 @@ def test_commands_are_the_documented_ones() -> None:
         "report",
         "stress",
         "chart",
+        "generate",
         "train",
     }
 
