@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,7 @@ from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.generate import GenerateOptions
+    from gsmerge.generate import Generated, GenerateOptions
 
 SCENE, ERRORS = "Scenes", "Errors"
 
@@ -61,33 +62,47 @@ def generate(
     debug: opt.DebugOption = False,
 ) -> None:
     """Make scenes to train and test with, as a feed-forward network would export them."""
-    from gsmerge.generate import generate as make_scenes
-    from gsmerge.generate import plan
-    from gsmerge.report import document_head, to_json
-
     options = _options(views, size, style, path, noise, ranges)
     if out.exists() and not out.is_dir():
         raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     number = 0 if seed is None else seed
-    quiet = quiet or json
-    if dry_run:
-        found = plan(out, scenes, options, seed=number, overwrite=overwrite)
-    else:
-        with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
-
-            def told(done: int, total: int) -> None:
-                if progress is not None:
-                    progress("generate", done, total)
-
-            found = make_scenes(out, scenes, options, seed=number, overwrite=overwrite, threads=threads, progress=told)
-    document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "seed": number, "dry_run": dry_run}
-    document |= {"scenes": [{"folder": str(made.folder), "kept": made.kept} for made in found], "notes": []}
+    how = {"seed": number, "overwrite": overwrite}
+    found = _made(out, scenes, options, how, threads=threads, dry_run=dry_run, quiet=quiet or json)
     if json:
+        from gsmerge.report import document_head, to_json
+
+        document = {**document_head(), "options": options.to_dict(), "seed": number, "dry_run": dry_run, "notes": []}
+        document["scenes"] = [{"folder": str(made.folder), "kept": made.kept} for made in found]
         sys.stdout.write(to_json(document))
     elif not quiet:
         kept = sum(made.kept for made in found)
         line = f"{out}: {'would write ' if dry_run else ''}{len(found) - kept} scenes"
         print(one_line(line + (f", {kept} were there already" if kept else "")))
+
+
+def _made(
+    out: Path,
+    scenes: int,
+    options: GenerateOptions,
+    how: Mapping[str, Any],
+    *,
+    threads: int | None,
+    dry_run: bool,
+    quiet: bool,
+) -> list[Generated]:
+    """Make the scenes, or say which there would be."""
+    from gsmerge.generate import generate as make_scenes
+    from gsmerge.generate import plan
+
+    if dry_run:
+        return plan(out, scenes, options, **how)
+    with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
+
+        def told(done: int, total: int) -> None:
+            if progress is not None:
+                progress("generate", done, total)
+
+        return make_scenes(out, scenes, options, **how, threads=threads, progress=told)
 
 
 def _options(views: str, size: str, style: str, path: str, noise: float, ranges: Path | None) -> GenerateOptions:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gsmerge.generate.paths import PATHS, look_at, worth_a_photo
 from gsmerge.generate.photograph import Lens, developed, exposure, lit, radiance, rectangles, trace
-from gsmerge.generate.shapes import Look, Shape, ball, box, column, packed, placed, quad, rod, sheet
+from gsmerge.generate.shapes import LYING, Look, Shape, ball, box, column, packed, placed, quad, rod, sheet
 from gsmerge.generate.stage import Light, Palette, Stage
 from gsmerge.generate.styles import STYLES
 from gsmerge.generate.textures import KINDS
@@ -65,19 +67,12 @@ def test_no_rectangle_cuts_off_what_is_seen() -> None:
         y, x = np.nonzero(together.ids == m)
         assert len(x) == 0 or (x.min() >= rects[m, 0] and x.max() < rects[m, 2])
         assert len(y) == 0 or (y.min() >= rects[m, 1] and y.max() < rects[m, 3])
-    everywhere = [s for s in shapes if (np.abs(s.centre - c2w[:3, 3]) < 0.1).all()]
-    assert (rects[:, 2] > rects[:, 0]).sum() > 8 + len(everywhere)
+    assert 8 < (rects[:, 2] > rects[:, 0]).sum() < len(shapes)
 
 
 def test_a_thing_throws_shade_on_the_ground() -> None:
-    ground = Shape(*vars(quad((0, 0, 0), (4, 4), LOOK)).values())
-    flat = placed([ground], turn=np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))[0]
-    view = lit(
-        stage(
-            Shape(flat.kind, flat.size, flat.look, flat.centre, flat.turn, shell=True),
-            box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK),
-        )
-    )
+    ground = replace(quad((0, 0, 0), (4, 4), LOOK, LYING), shell=True)
+    view = lit(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
     from_side = look_at(np.array([0.0, -0.45, -3.0]), np.array([0.0, 0.0, 0.0]))
     image, hits = radiance(view, from_side, Lens(60, 60, 60.0), 1)
     y, x = np.mgrid[:60, :60] + 0.5
