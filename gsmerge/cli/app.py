@@ -14,6 +14,7 @@ from gsmerge.cli.chart import chart
 from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
 from gsmerge.cli.evaluate import evaluate
+from gsmerge.cli.generate import generate
 from gsmerge.cli.inspect import inspect
 from gsmerge.cli.options import debug_wanted, set_debug
 from gsmerge.cli.preview import preview
@@ -30,7 +31,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart, train):
+for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train):
     app.command()(command)
 
 

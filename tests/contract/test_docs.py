@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def test_commands_are_the_documented_ones() -> None:
         "report",
         "stress",
         "chart",
+        "generate",
         "train",
     }
 
@@ -176,3 +178,13 @@ def test_stability_cases_name_tests_that_are_there(root: Path) -> None:
             text = "".join(file.read_text() for file in files)
             for word in filter(None, re.split(r"[, ]+", words)):
                 assert re.search(rf"def test_\w*{word}", text), f"case {case}: {name} has no test of {word}"
+
+
+def test_generator_names_every_range_style_and_path(root: Path) -> None:
+    from gsmerge.generate import NoiseOptions
+    from gsmerge.generate.paths import PATHS
+    from gsmerge.generate.styles import STYLES
+
+    text = (root / "docs" / "generator.md").read_text()
+    names = [f.name for f in fields(NoiseOptions)] + [*STYLES, *PATHS]
+    assert [name for name in names if f"`{name}`" not in text] == []

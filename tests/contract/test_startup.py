@@ -26,7 +26,10 @@ def loaded_after(code: str) -> set[str]:
         ["--help"],
         ["--version"],
         [],
-        *([name, "--help"] for name in ("compact", "inspect", "segment", "render", "preview", "chart", "train")),
+        *(
+            [name, "--help"]
+            for name in ("compact", "inspect", "segment", "render", "preview", "chart", "generate", "train")
+        ),
     ],
     ids=" ".join,
 )

@@ -1,0 +1,146 @@
+"""Rays against shapes: the kernel, and looking at every point of a ray for what the shape's definition says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.generate.shapes import NO_WAVES, Look, Packed, Shape, packed
+from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET, cast, light_seen
+
+FAR, STEPS = 12.0, 60_000
+KINDS = {"quad": QUAD, "box": BOX, "ellipsoid": ELLIPSOID, "cone": CONE, "leaf": LEAF, "blob": BLOB, "sheet": SHEET}
+
+
+def rotation(rng: np.random.Generator) -> np.ndarray:
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def random_shape(kind: int, rng: np.random.Generator) -> Shape:
+    """Around (0, 0, 4), about 1 large, in any attitude."""
+    waves = NO_WAVES
+    if kind in (BLOB, SHEET):
+        numbers = rng.normal(0, 2, (4, 3)) * ([1, 1, 1] if kind == BLOB else [1, 1, 0])
+        waves = np.concatenate([numbers, rng.uniform(0, 6, (4, 1)), rng.uniform(0.02, 0.06, (4, 1))], 1)
+    size = (*rng.uniform(0.5, 1.2, 3), rng.uniform(0.3, 1.6))
+    return Shape(kind, size, Look(0), np.array([0, 0, 4.0]) + rng.normal(0, 0.2, 3), rotation(rng), waves)
+
+
+def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """On which side of the surface points in its frame are; the surface is where that changes."""
+    (x, y, z), (a, b, c, taper) = points.T, shape.size
+    number, phase, height = shape.waves[:, :3], shape.waves[:, 3], shape.waves[:, 4]
+    if shape.kind == BOX:
+        return (np.abs(x) <= a) & (np.abs(y) <= b) & (np.abs(z) <= c)
+    if shape.kind == CONE:
+        radius = 1 + (taper - 1) * (y / b + 1) / 2
+        return (np.abs(y) <= b) & (np.hypot(x / a, z / c) <= radius)
+    if shape.kind == SHEET:
+        return z > (np.sin(points @ number.T + phase) * height).sum(1)
+    if shape.kind in (ELLIPSOID, BLOB):
+        scaled = points / [a, b, c]
+        swing = (np.sin(scaled @ number.T + phase) * height).sum(1) if shape.kind == BLOB else 0.0
+        return np.linalg.norm(scaled, axis=1) <= 1 + swing
+    return z > 0
+
+
+def within(shape: Shape, point: np.ndarray) -> bool:
+    """Whether a point of the surface's level belongs to it: open surfaces end."""
+    (x, y, _), (a, b, *_) = np.abs(point), shape.size
+    if shape.kind in (QUAD, SHEET):
+        return bool(x <= a and y <= b)
+    if shape.kind == LEAF:
+        return bool(y <= b and x <= a * (1 - (y / b) ** 2))
+    return True
+
+
+def slow_depth(shape: Shape, ray: np.ndarray) -> float:
+    t = np.linspace(1e-4, FAR, STEPS)
+    points = (t[:, None] * ray - shape.centre) @ shape.turn
+    changes = np.flatnonzero(np.diff(sides(shape, points)))
+    hits = [t[i] for i in changes if within(shape, points[i])]
+    return float(hits[0]) if hits else np.inf
+
+
+def run(shapes: Packed, width: int, height: int, focal: float) -> tuple[np.ndarray, ...]:
+    depth, ids = np.full((height, width), 1e6), np.full((height, width), -1, np.int32)
+    points, normals = np.zeros((2, height, width, 3), np.float32)
+    lens = np.array([focal, focal, width / 2, height / 2])
+    rects = np.tile(np.array([0, 0, width, height], np.int32), (len(shapes.kinds), 1))
+    table = shapes.kinds, shapes.turns, shapes.centres, shapes.sizes, shapes.waves
+    cast(np.zeros(3), np.eye(3), lens, 1.0, *table, rects, depth, ids, points, normals)
+    return depth, ids, points, normals
+
+
+def ray(i: int, j: int, width: int, height: int, focal: float) -> np.ndarray:
+    return np.array([(j + 0.5 - width / 2) / focal, (i + 0.5 - height / 2) / focal, 1.0])
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
+    shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng([seed, KINDS[name]])), (11, 9, 18.0)
+    depth, ids, points, _ = run(packed([shape]), w, h, f)
+    slow = np.array([[slow_depth(shape, ray(i, j, w, h, f)) for j in range(w)] for i in range(h)])
+    hit = np.isfinite(slow)
+    assert hit.sum() >= 8
+    disagree = hit != (ids == 0)
+    assert disagree.sum() <= 1  # a ray that grazes an edge
+    both = hit & ~disagree
+    np.testing.assert_allclose(depth[both], slow[both], atol=2 * FAR / STEPS + 1e-4)
+    for i, j in zip(*np.nonzero(both), strict=True):
+        there = (depth[i, j] * ray(i, j, w, h, f) - shape.centre) @ shape.turn
+        np.testing.assert_allclose(points[i, j], there, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_normals_are_those_of_the_depth(name: str) -> None:
+    """A step along the surface is at right angles to the normal, which looks at the camera."""
+    shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng(KINDS[name])), (120, 90, 120.0)
+    depth, ids, _, normals = run(packed([shape]), w, h, f)
+    rays = np.stack([[ray(i, j, w, h, f) for j in range(w)] for i in range(h)])
+    world = rays * np.where(ids == 0, depth, np.nan)[..., None]
+    seen = ids == 0
+    assert seen.sum() > 300
+    assert ((normals * rays).sum(-1)[seen] < 1e-6).all()
+    np.testing.assert_allclose(np.linalg.norm(normals[seen], axis=1), 1, atol=1e-5)
+    for axis in (0, 1):
+        step = np.diff(world, axis=axis)
+        length = np.linalg.norm(step, axis=-1)
+        first = normals[:-1] if axis == 0 else normals[:, :-1]
+        off = np.abs((step * first).sum(-1)) / length
+        assert np.nanmedian(off) < 0.05
+
+
+def test_the_nearest_of_several_shapes_is_seen() -> None:
+    rng = np.random.default_rng(3)
+    shapes = [random_shape(kind, rng) for kind in (BOX, ELLIPSOID, CONE, BLOB, QUAD)]
+    alone = np.stack([run(packed([shape]), 24, 18, 20.0)[0] for shape in shapes])
+    depth, ids, _, _ = run(packed(shapes), 24, 18, 20.0)
+    np.testing.assert_allclose(
+        depth, alone.min(0), rtol=1e-4
+    )  # where a blob's search ends depends on what is before it
+    assert len(set(ids[ids >= 0])) >= 3
+    np.testing.assert_array_equal(ids, np.where(alone.min(0) < 1e6, alone.argmin(0), -1))
+
+
+def test_light_reaches_what_nothing_is_before() -> None:
+    rng = np.random.default_rng(0)
+    axes = np.stack([rotation(rng) for _ in range(3)])
+    maps = rng.uniform(-0.5, 0.5, (3, 8, 8)).astype(np.float32)
+    points, normals = rng.uniform(-1.2, 1.2, (2, 200, 3)).astype(np.float32)
+    centre, radius, bias, weights = np.array([0.1, 0.0, -0.1]), 1.1, 0.02, np.array([0.5, 1.0, 0.25])
+    out = np.zeros(200, np.float32)
+    light_seen(points, normals, axes, centre, radius, maps, bias, weights, out)
+    slow = np.zeros(200)
+    for k in range(3):
+        u, v, forward = ((points - centre) @ axes[k].T).T
+        column, row = np.floor((u / radius + 1) * 4).astype(int), np.floor((v / radius + 1) * 4).astype(int)
+        inside = (column >= 0) & (column < 8) & (row >= 0) & (row < 8)
+        found = maps[k][row.clip(0, 7), column.clip(0, 7)]
+        reached = ~inside | (found >= forward - bias)
+        slow += weights[k] * np.maximum(0, -(normals @ axes[k][2])) * reached
+    assert (slow == 0).any()
+    np.testing.assert_allclose(out, slow, atol=1e-5)
