@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsmerge.charts.store import content_hash
+from gsmerge.contents import cameras_of, content_hash, filled, photos_of, read_files, stem_of
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import CameraFile, SceneFiles, find_scene_files, read_cameras
+from gsmerge.io import SceneFiles, find_scene_files
 from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.read import find_cameras
-from gsmerge.io.scene_files import IMAGE_PLACES
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def find_places(scenes: Sequence[Path], targets: str | None = None, target_image
     """
     names = scene_names(scenes)
     return [
-        _place(scene, name, _filled(targets, scene), _filled(target_images, scene))
+        _place(scene, name, filled(targets, scene), filled(target_images, scene))
         for scene, name in zip(scenes, names, strict=True)
     ]
 
@@ -63,7 +62,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
     Raises:
         UsageError: If a scene is given twice.
     """
-    parts = [(*scene.absolute().parent.parts, _stem(scene.absolute())) for scene in scenes]
+    parts = [(*scene.absolute().parent.parts, stem_of(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0) + 1):
         names = ["/".join(part[-depth:]) for part in parts]
         if len(set(names)) == len(names):
@@ -73,29 +72,13 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
     raise UsageError("expected every scene once, got one twice")
 
 
-def _stem(scene: Path) -> str:
-    """Its name; of a file without the extension. Folders may have dots in theirs."""
-    return scene.stem if scene.suffix == ".ply" else scene.name
-
-
-def _filled(template: str | None, scene: Path) -> Path | None:
-    if template is None:
-        return None
-    parent = scene if scene.is_dir() else scene.parent
-    try:
-        return Path(template.format(scene=scene, parent=parent, stem=_stem(scene)))
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
-        raise UsageError(f"expected {{scene}}, {{parent}} or {{stem}} in braces, got {template}") from error
-
-
 def _place(scene: Path, name: str, targets: Path | None, target_images: Path | None) -> Place:
     files = find_scene_files(scene)
     if targets is not None and not targets.exists():
         raise SceneError(targets, f"expected cameras of held-out views of {scene}, found nothing")
     read = [files.ply, files.cameras, files.images, targets and _cameras_inside(targets), target_images]
-    for path in (files.cameras, targets):
-        read += [] if path is None else _photos(path)
-    cameras = None if files.cameras is None else _cameras(files.cameras, files.ply.stem)
+    read += [*read_files(files), *(photos_of(targets) if targets else [])]
+    cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
     num_views = None if cameras is None else len(cameras)
     once = dict.fromkeys(path for path in read if path is not None)
     return Place(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
@@ -105,19 +88,3 @@ def _cameras_inside(path: Path) -> Path:
     """The cameras that are read from a folder: what else lies in it, such as results, does not count."""
     found = find_cameras(path) if path.is_dir() and not is_colmap(path) else None
     return path if found is None else found
-
-
-def _photos(cameras: Path) -> list[Path]:
-    """Where the photos of a camera file may be found by its names or beside it."""
-    read = _cameras(cameras)
-    root = cameras if cameras.is_dir() else cameras.parent
-    named = [root / name for name in (() if read is None else read.names) if (root / name).is_file()]
-    return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
-
-
-def _cameras(path: Path, scene: str | None = None) -> CameraFile | None:
-    """None where the file cannot be read, which is told when the scene is."""
-    try:
-        return read_cameras(path, scene=scene)
-    except SceneError:
-        return None

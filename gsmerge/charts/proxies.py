@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gsmerge.charts.store import PROXIES, append_line, digest, read_lines
+from gsmerge.charts.store import PROXIES
+from gsmerge.contents import digest
+from gsmerge.lines import append_line, read_lines
 from gsmerge.metrics import psnr
 from gsmerge.preview import draw_means
 from gsmerge.sampling import pick_views

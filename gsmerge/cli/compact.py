@@ -8,19 +8,22 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
-from gsmerge.cli.paths import check_output, default_output, input_files, level_output
-from gsmerge.cli.settings import reading_of, settings_of, superpixels_per_view, told_as_usage
-from gsmerge.errors import SceneError, TargetError
+from gsmerge.cli.paths import check_output, default_output, input_files
+from gsmerge.cli.settings import given_settings, reading_of, told_as_usage
+from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
-    from gsmerge.io import Reading, SceneFiles, SceneLoad
+    from gsmerge.io import Reading, SceneFiles
     from gsmerge.io.ply import OpacityChoice
     from gsmerge.options import CompactOptions
 
 
 def compact(
+    context: typer.Context,
     scene: opt.SceneArgument,
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
@@ -64,6 +67,7 @@ def compact(
     """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
     reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    from gsmerge.files import level_output
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)
@@ -76,21 +80,7 @@ def compact(
         check_output(path, inputs, overwrite=overwrite)
     if report is not None:
         check_output(report, (*inputs, *outputs), overwrite=overwrite)
-    chosen: dict[str, Any] = {
-        "k": k,
-        "device": device,
-        "superpixels": superpixels,
-        "density": density,
-        "segmentation": segmentation,
-        "effort": effort,
-        "method": method,
-        "checkpoint": checkpoint,
-        "require_checkpoint": require_checkpoint or None,
-    }
-    chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
-    chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
-    chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads, "unseen": unseen}
-    settings = settings_of(chosen)
+    settings = given_settings(context.params)
     if dry_run:
         _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
@@ -116,67 +106,29 @@ def _run(
     hashed: bool,
 ) -> dict[str, Any]:
     """Read, compact and write; returns the report."""
-    from gsmerge import pipeline
-    from gsmerge.io import atomic_output, kept_comments, load_files, write_ply
-    from gsmerge.memory import release_memory
-    from gsmerge.report import report_document
+    from gsmerge.files import compact_files
 
     imported = perf_counter()
-    with atomic_output(out, overwrite=overwrite) as temporary:
-        loaded = load_files(files, opacity=opacity, reading=reading)
-        recognised, notes, scene = _recognised(loaded), loaded.notes, loaded.scene
-        comments = kept_comments(loaded.ply)
-        del loaded  # which knows the row of every pixel
-        release_memory()
-        if len(scene):
-            superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
-        read = perf_counter()
-        with (
-            announce_compilation(quiet=quiet, share=_fits_fully(settings)) as finish,
-            stage_progress(quiet=quiet) as progress,
-        ):
+    with (
+        announce_compilation(quiet=quiet, share=_fits_fully(settings)) as finish,
+        stage_progress(quiet=quiet) as progress,
+    ):
 
-            def moved(stage: str, done: int, total: int) -> None:
-                if stage == "fit":
-                    finish()
-                if progress is not None:
-                    progress(stage, done, total)
+        def moved(stage: str, done: int, total: int) -> None:
+            if stage == "fit":
+                finish()
+            if progress is not None:
+                progress(stage, done, total)
 
-            result = pipeline.compact(scene, settings, progress=moved)
-        if len(result.gaussians) == 0:
-            problem = "expected Gaussians that show something, found none that is left once they are merged"
-            raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
-        compacted = perf_counter()
-        write_ply(temporary, result.gaussians, overwrite=True, comments=comments)
-    coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
-    for path, level in coarser:
-        with atomic_output(path, overwrite=overwrite) as temporary:
-            write_ply(temporary, level.gaussians, overwrite=True, comments=comments)
-    return report_document(
-        result.report,
-        input_path=files.ply,
-        output_path=out,
-        seconds_before={"import": imported - start, "read": read - imported},
-        seconds_after={"write": perf_counter() - compacted},
-        coarser=[(path, level.report) for path, level in coarser],
-        recognised=recognised,
-        notes=notes,
-        hashed=hashed,
-    )
+        return compact_files(
+            files, settings, out, opacity=opacity, reading=reading, overwrite=overwrite, progress=moved,
+            hashed=hashed, seconds_before={"import": imported - start},
+        )  # fmt: skip
 
 
 def _fits_fully(settings: CompactOptions) -> bool:
     """Whether the kernels of the full fit will be needed."""
     return settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
-
-
-def _recognised(loaded: SceneLoad) -> dict[str, Any]:
-    """What the report says about the input."""
-    names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
-    cameras, recovery = loaded.scene.cameras, loaded.recovery
-    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-    views |= {"dialects": [dialect.name for dialect in loaded.dialects], "rows": recovery and recovery.words}
-    return views | {name: getattr(loaded.ply, name) for name in names}
 
 
 def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, quiet: bool, overwrite: bool) -> None:
@@ -198,6 +150,7 @@ def _print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
     from gsmerge.baselines import check_scene, find_baseline, unused_notes
+    from gsmerge.files import superpixels_per_view
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
     from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json

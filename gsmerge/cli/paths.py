@@ -19,11 +19,6 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def level_output(output: Path, level: int) -> Path:
-    """``out.ply`` -> ``out.level1.ply``: where a further level of detail goes, counted from 1."""
-    return output.with_name(f"{output.stem}.level{level}{output.suffix}")
-
-
 def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Refuse an output file that is one of the inputs, that exists, or whose folder does not.
 

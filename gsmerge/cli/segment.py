@@ -12,7 +12,7 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import check_folder, input_files
 from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
-from gsmerge.cli.settings import reading_of, superpixels_per_view, told_as_usage
+from gsmerge.cli.settings import reading_of, told_as_usage
 
 if TYPE_CHECKING:
     from gsmerge.segment import SegmentOptions
@@ -46,6 +46,7 @@ def segment(
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
     reading = reading_of(dialect, quats.value, order.value, scene_scale)
+    from gsmerge.files import superpixels_per_view
     from gsmerge.io import find_scene_files, load_files
     from gsmerge.segment import SegmentOptions
     from gsmerge.threads import use_threads

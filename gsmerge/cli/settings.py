@@ -15,23 +15,6 @@ if TYPE_CHECKING:
     from gsmerge.io.layouts import Order
     from gsmerge.io.reading import QuatChoice
     from gsmerge.options import CompactOptions
-    from gsmerge.segment import SegmentOptions
-
-
-def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> int:
-    """Superpixels that each view will get.
-
-    Raises:
-        UsageError: If there are more than pixels.
-    """
-    from gsmerge.segment import count_for
-
-    count = count_for(options, height, width)
-    if count > width * height:
-        raise UsageError(
-            f"--superpixels: expected at most {width * height}, one per pixel of {width} x {height}, got {count}"
-        )
-    return count
 
 
 def reading_of(
@@ -67,3 +50,10 @@ def settings_of(chosen: Mapping[str, Any]) -> CompactOptions:
     given = {name: value.value if isinstance(value, Enum) else value for name, value in chosen.items()}
     with told_as_usage():
         return CompactOptions().with_settings({name: value for name, value in given.items() if value is not None})
+
+
+def given_settings(params: Mapping[str, Any]) -> CompactOptions:
+    """The library's options with those of a command's parameters that carry their names."""
+    from gsmerge.options import CompactOptions
+
+    return settings_of({name: params[name] for name in CompactOptions().to_dict() if name in params})

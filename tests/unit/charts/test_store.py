@@ -11,16 +11,10 @@ import pytest
 
 import gsmerge
 from gsmerge.charts.record import SCORES, RunRecord
-from gsmerge.charts.store import (
-    RUNS,
-    append_line,
-    append_run,
-    content_hash,
-    experiment_key,
-    read_lines,
-    read_runs,
-)
+from gsmerge.charts.store import RUNS, append_run, experiment_key, read_runs
+from gsmerge.contents import content_hash
 from gsmerge.errors import SceneError
+from gsmerge.lines import append_line, read_lines
 
 
 def record(key: str, **changes: object) -> RunRecord:

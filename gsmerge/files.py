@@ -1,0 +1,111 @@
+"""From a scene's files to the compact file: read, compact, write, report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import AUTO, Reading, SceneFiles, SceneLoad, atomic_output, kept_comments, load_files, write_ply
+from gsmerge.io.ply import OpacityChoice
+from gsmerge.journal import Progress
+from gsmerge.memory import release_memory
+from gsmerge.options import CompactOptions
+from gsmerge.pipeline import compact
+from gsmerge.report import report_document
+from gsmerge.segment import SegmentOptions, count_for
+
+
+def compact_files(
+    files: SceneFiles,
+    settings: CompactOptions,
+    out: Path,
+    *,
+    opacity: OpacityChoice = "auto",
+    reading: Reading = AUTO,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    hashed: bool = False,
+    seconds_before: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Read a scene, compact it and write the result, and its further levels of detail beside it.
+
+    Args:
+        files: The scene.
+        settings: Of all stages.
+        out: The ``.ply`` to write; its folder must exist.
+        opacity: How opacities are stored.
+        reading: What is told of the file instead of found.
+        overwrite: Replace files that are there.
+        progress: See :func:`gsmerge.compact`.
+        hashed: Hash the input for the report.
+        seconds_before: Wall time by name of what the caller did before.
+
+    Returns:
+        The report, see :func:`gsmerge.report.report_document`.
+
+    Raises:
+        SceneError: If the scene cannot be read or the result cannot be written.
+        UsageError: If the settings ask for what the scene does not have.
+    """
+    start = perf_counter()
+    with atomic_output(out, overwrite=overwrite) as temporary:
+        loaded = load_files(files, opacity=opacity, reading=reading)
+        recognised, notes, scene = _recognised(loaded), loaded.notes, loaded.scene
+        comments = kept_comments(loaded.ply)
+        del loaded  # which knows the row of every pixel
+        release_memory()
+        if len(scene):
+            superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
+        read = perf_counter()
+        result = compact(scene, settings, progress=progress)
+        if len(result.gaussians) == 0:
+            problem = "expected Gaussians that show something, found none that is left once they are merged"
+            raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
+        compacted = perf_counter()
+        write_ply(temporary, result.gaussians, overwrite=True, comments=comments)
+    coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
+    for path, level in coarser:
+        with atomic_output(path, overwrite=overwrite) as temporary:
+            write_ply(temporary, level.gaussians, overwrite=True, comments=comments)
+    return report_document(
+        result.report,
+        input_path=files.ply,
+        output_path=out,
+        seconds_before={**(seconds_before or {}), "read": read - start},
+        seconds_after={"write": perf_counter() - compacted},
+        coarser=[(path, level.report) for path, level in coarser],
+        recognised=recognised,
+        notes=notes,
+        hashed=hashed,
+    )
+
+
+def _recognised(loaded: SceneLoad) -> dict[str, Any]:
+    """What the report says about the input."""
+    names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
+    cameras, recovery = loaded.scene.cameras, loaded.recovery
+    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    views |= {"dialects": [dialect.name for dialect in loaded.dialects], "rows": recovery and recovery.words}
+    return views | {name: getattr(loaded.ply, name) for name in names}
+
+
+def level_output(output: Path, level: int) -> Path:
+    """``out.ply`` -> ``out.level1.ply``: where a further level of detail goes, counted from 1."""
+    return output.with_name(f"{output.stem}.level{level}{output.suffix}")
+
+
+def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> int:
+    """Superpixels that each view will get.
+
+    Raises:
+        UsageError: If there are more than pixels.
+    """
+    count = count_for(options, height, width)
+    if count > width * height:
+        raise UsageError(
+            f"--superpixels: expected at most {width * height}, one per pixel of {width} x {height}, got {count}"
+        )
+    return count
