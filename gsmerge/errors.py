@@ -47,3 +47,11 @@ class BatchError(GsmergeError):
     """Some scenes of a batch failed."""
 
     exit_code = 5
+
+
+def error_line(error: BaseException) -> str:
+    """An error as one line."""
+    if isinstance(error, MemoryError):
+        return "out of memory; use fewer --threads or --jobs, or a smaller scene"
+    text = str(error) if isinstance(error, GsmergeError) else f"{type(error).__name__}: {error}"
+    return " ".join(text.split())

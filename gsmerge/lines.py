@@ -39,19 +39,24 @@ def read_lines(path: Path) -> Lines:
     Raises:
         SceneError: If the file cannot be read.
     """
-    values, notes = [], []
-    for number, value in enumerate(each_line(path), 1):
+    values: list[dict[str, Any]] = []
+    notes, last = [], 0
+    for number, (end, value) in enumerate(each_line(path), 1):
+        last = end
         if value is None:
             notes.append(f"{path}: line {number} is damaged and was dropped; its run is done again")
         else:
             values.append(value)
-    if path.exists() and _whole_bytes(path) < path.stat().st_size:
+    if path.exists() and last < path.stat().st_size:
         notes.append(f"{path}: the last line is incomplete and was dropped; its run is done again")
     return Lines(tuple(values), tuple(notes))
 
 
-def each_line(path: Path, start: int = 0) -> Iterator[dict[str, Any] | None]:
-    """The complete lines of a file from a byte on, one at a time; None for one that is damaged.
+def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
+    """The complete lines of a file from a byte on, one at a time.
+
+    Yields:
+        The byte after the line, and what it holds; None if it is damaged.
 
     Raises:
         SceneError: If the file cannot be read.
@@ -60,10 +65,11 @@ def each_line(path: Path, start: int = 0) -> Iterator[dict[str, Any] | None]:
         return
     try:
         with path.open("rb") as file:
-            file.seek(start)
+            end = file.seek(start)
             for line in file:
                 if line.endswith(b"\n"):
-                    yield _parsed(line)
+                    end += len(line)
+                    yield end, _parsed(line)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
 

@@ -11,26 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
+from gsmerge.costs import COST_FIXED, fit_of, is_robust, memory_bytes, work_seconds
 
 SCHEMA_VERSION = 1
-
-# Processor seconds per million pixels of all views together (or Gaussians, which is the same number), kernels compiled.
-# Measured on twelve views of 256 x 480; they only have to be right within a factor of two.
-COST_FIXED = 1.5  # imports
-COST_READ = 0.7
-COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
-COST_MERGE = 0.5
-COST_NETWORKS = 2.8  # at the usual density
-COST_SCORE = 1.3  # rendering the photos from input and output
-COST_ROBUST = 1.6
-COST_COLOR_FIT = 0.9
-COST_FULL_FIT = 0.36  # per step and million pixels of one view
-COST_RIVALS = {"paper": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
-COST_RIVAL = 0.2  # of the others
-COST_RIVAL_STEP = 0.15  # per step of the full fit, for each million Gaussians of an input that was not merged
-BYTES_FIXED = 350_000_000  # interpreter, torch and numba
-BYTES_PER_GAUSSIAN = 240
-BYTES_PER_PIXEL = 100  # the photo as floats and what segmentation and rendering keep of it
 
 
 def file_sha256(path: Path) -> str:
@@ -128,14 +111,15 @@ def _level(path: Path, numbers: Mapping[str, Any]) -> dict[str, Any]:
 
 def to_json(document: Mapping[str, Any]) -> str:
     """Strict JSON, indented, with a closing newline; infinities become null."""
-    return json.dumps(_finite(document), indent=2, allow_nan=False) + "\n"
+    return json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Plain JSON types with None in place of infinities and NaN."""
     if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float) and not (abs(value) < float("inf")):
         return None
     return value
@@ -229,19 +213,8 @@ def plan_document(
     views, height, width = grid
     pixels = max(views * height * width, count or 0)
     method, at_most = options["method"], usual if wanted is None else wanted
-    fit, robust = _fit_of(method, options, photos), False
-    if method == "gsmerge":
-        robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
-        work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * robust
-        work += COST_NETWORKS * (options["checkpoint"] != "none")
-    else:
-        work = COST_RIVALS.get(method, COST_RIVAL)
-        at_most = pixels if method.startswith("unmerged") else at_most
-    work += COST_READ + COST_SCORE * photos + COST_COLOR_FIT * (fit == "color")
-    steps = fit_steps if fit == "full" else 0
-    seconds = pixels / 1e6 * work + height * width / 1e6 * COST_FULL_FIT * steps
-    seconds += pixels / 1e6 * COST_RIVAL_STEP * steps * (method == "unmerged-fit")
-    memory = BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
+    at_most = pixels if method.startswith("unmerged") else at_most
+    seconds = work_seconds(pixels, height * width, options, photos=photos, fit_steps=fit_steps)
     return {
         **document_head(),
         "dry_run": True,
@@ -252,21 +225,15 @@ def plan_document(
         },
         "method": method,
         "superpixels_per_view": per_view if wanted is None and options["k"] != "auto" else None,
-        "robust": robust,
-        "fit": fit,
+        "robust": is_robust(options, photos=photos),
+        "fit": fit_of(options, photos=photos),
         "estimate": {
             "seconds": round(COST_FIXED + seconds / max(1, min(threads, views)), 1),
-            "memory_bytes": memory,
+            "memory_bytes": memory_bytes(pixels, photos=photos),
         },
         "options": dict(options),
         "notes": list(notes),
     }
-
-
-def _fit_of(method: str, options: Mapping[str, Any], photos: bool) -> str:
-    """What is fitted to the photos."""
-    own = {"gsmerge": options["fit"], "unmerged-fit": "full", "unmerged-color": "color"}
-    return own.get(method, "none") if photos else "none"
 
 
 def plan_lines(plan: Mapping[str, Any]) -> list[str]:

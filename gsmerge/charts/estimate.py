@@ -8,8 +8,7 @@ from statistics import median
 from gsmerge.charts.experiment import OURS, Experiment
 from gsmerge.charts.places import Place
 from gsmerge.charts.record import INPUT, RunRecord
-from gsmerge.fit.options import STEPS
-from gsmerge.report import (
+from gsmerge.costs import (
     COST_COLOR_FIT,
     COST_FULL_FIT,
     COST_MERGE,
@@ -21,6 +20,7 @@ from gsmerge.report import (
     COST_SCORE,
     COST_SEGMENT,
 )
+from gsmerge.fit.options import STEPS
 
 BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
 COST_EVALUATE = 2.5  # scoring input and result: seconds per million pixels of all views

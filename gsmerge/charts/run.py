@@ -20,7 +20,7 @@ from gsmerge.charts.places import Place
 from gsmerge.charts.proxies import measure_proxies, read_proxies, wanted_proxies
 from gsmerge.charts.record import INPUT, RunRecord
 from gsmerge.charts.store import append_run, experiment_key, read_runs
-from gsmerge.errors import GsmergeError
+from gsmerge.errors import error_line
 from gsmerge.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.io import AUTO, Reading, load_files
 from gsmerge.io.ply import OpacityChoice
@@ -195,12 +195,6 @@ def _read(place: Place, options: RunOptions) -> _Ready | str:
         return _Ready(load.scene, targets, where, tuple(load.notes))
     except Exception as error:
         return error_line(error)
-
-
-def error_line(error: BaseException) -> str:
-    """An error as one line."""
-    text = str(error) if isinstance(error, GsmergeError) else f"{type(error).__name__}: {error}"
-    return " ".join(text.split())
 
 
 def _blank(key: str, experiment: Experiment, place: Place, options: RunOptions) -> RunRecord:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from gsmerge import __version__
+from gsmerge.cli.batch import batch
 from gsmerge.cli.chart import chart
 from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
@@ -31,7 +32,7 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train):
+for command in (compact, batch, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train):
     app.command()(command)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
+from gsmerge.cli.console import announce_compilation, duration, one_line, say_notes, total_progress
 from gsmerge.cli.held_out import networks
 from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import BatchError, UsageError
@@ -197,34 +196,8 @@ def _run(plan: Plan, out: Path, options: RunOptions, *, quiet: bool) -> tuple[li
 
     if plan.total == 0:
         return [], []
-    with announce_compilation(quiet=quiet), grid_progress(plan.total, quiet=quiet) as progress:
+    with announce_compilation(quiet=quiet), total_progress(plan.total, quiet=quiet) as progress:
         return run_plan(plan, out, options, progress)
-
-
-@contextmanager
-def grid_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """One bar for the whole grid on stderr: done of total, time left; a line per run where there is no terminal."""
-    if quiet:
-        yield lambda what, done, total: None
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda what, done, total: say(f"{done}/{total} {what}")
-        return
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.description}"), console=console, transient=True) as bars:
-        task = bars.add_task("", total=total)
-        yield lambda what, done, total: bars.update(task, completed=done, total=total, description=one_line(what))
 
 
 def _print_plan(
@@ -259,14 +232,8 @@ def _print_plan(
     lines = [f"{place.name}: {describe(experiment)}" for _, experiment, place in runs]
     lines += [f"note: {note}" for note in notes]
     lines.append(f"would write {out}: {len(runs)} of {len(plan.runs)} runs to do, {proxies} points of superpixels")
-    lines.append(f"estimate    about {_duration(seconds)}")
+    lines.append(f"estimate    about {duration(seconds)}")
     print("\n".join(map(one_line, lines)))
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
 
 
 def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:

@@ -116,3 +116,40 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
             bars.update(tasks[name], completed=done, total=total, detail=detail)
 
         yield move
+
+
+@contextmanager
+def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """One bar for many runs on stderr: done of total, time left; a line per run where there is no terminal.
+
+    Yields:
+        ``(what, done, total) -> None``.
+    """
+    if quiet:
+        yield lambda what, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda what, done, total: say(f"{done}/{total} {what}")
+        return
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.description}"), console=console, transient=True) as bars:
+        task = bars.add_task("", total=total)
+        yield lambda what, done, total: bars.update(task, completed=done, total=total, description=one_line(what))
+
+
+def duration(seconds: float) -> str:
+    """``95`` -> ``95 s``, ``600`` -> ``10 min``, ``9000`` -> ``2.5 h``."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -46,6 +47,18 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         raise SceneError(path, f"could not be written ({error.strerror})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the temporary files that killed processes left of this output; nobody may be writing it."""
+    name = re.compile(rf"\.{re.escape(path.stem)}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+    try:
+        with os.scandir(path.parent) as entries:
+            left = [entry.path for entry in entries if name.fullmatch(entry.name)]
+        for one in left:
+            os.unlink(one)
+    except OSError as error:
+        raise SceneError(path, f"its temporary files cannot be removed ({error.strerror})") from error
 
 
 def _refuse(path: Path, overwrite: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
@@ -50,6 +51,16 @@ def open_ply(path: Path) -> PlyData:
         ) from error
     except (PlyParseError, ValueError, ArithmeticError, MemoryError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
+
+
+def count_rows(path: Path) -> int:
+    """Gaussians that a PLY file promises, from its header alone; 0 where there is none that can be read."""
+    try:
+        with path.open("rb") as file:
+            found = re.search(rb"^element vertex (\d{1,12})\s*$", file.read(1 << 16), re.MULTILINE)
+    except OSError:
+        return 0
+    return int(found[1]) if found else 0
 
 
 def _weigh(path: Path, start: bytes, size: int) -> None:

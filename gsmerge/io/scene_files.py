@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from gsmerge.io.images import list_images
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 _NO_GAUSSIANS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # point clouds that others put there
+_RESULT = re.compile(r"\.compact(\.level\d+)?\.ply$")
 
 
 @dataclass(frozen=True)
@@ -94,20 +96,31 @@ def _roots(ply: Path) -> list[Path]:
 
 
 def _find_ply(folder: Path) -> Path:
-    for place in PLY_PLACES:
-        if (folder / place).is_file():
-            return folder / place
-    trained = [p for p in folder.glob("point_cloud/iteration_*/point_cloud.ply") if p.parent.name[10:].isdecimal()]
-    if trained:
-        return max(trained, key=lambda p: int(p.parent.name[10:]))
-    found = sorted(
-        p
-        for p in folder.glob("*.ply")
-        if not p.name.startswith(".") and not p.name.endswith(".compact.ply") and p.name not in _NO_GAUSSIANS
-    )
+    named = named_ply(folder)
+    if named is not None:
+        return named
+    found = other_plys(folder)
     if not found:
         raise SceneError(folder, "expected a .ply file in the folder, found none")
     if len(found) > 1:
         names = ", ".join(p.name for p in found[:4])
         raise SceneError(folder, f"expected one .ply file in the folder, found {len(found)} ({names})", "name one")
     return found[0]
+
+
+def named_ply(folder: Path) -> Path | None:
+    """The file in a folder that is the scene whatever lies beside it; None without one."""
+    for place in PLY_PLACES:
+        if (folder / place).is_file():
+            return folder / place
+    trained = [p for p in folder.glob("point_cloud/iteration_*/point_cloud.ply") if p.parent.name[10:].isdecimal()]
+    return max(trained, key=lambda p: int(p.parent.name[10:]), default=None)
+
+
+def other_plys(folder: Path) -> list[Path]:
+    """The other files right in a folder that may be scenes: no results of ours, no point clouds."""
+    return sorted(
+        p
+        for p in folder.glob("*.ply")
+        if not p.name.startswith(".") and not _RESULT.search(p.name) and p.name not in _NO_GAUSSIANS
+    )

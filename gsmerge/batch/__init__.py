@@ -1,0 +1,7 @@
+"""Many scenes: each on its own, kept as soon as it is done, on this machine or on a cluster."""
+
+from gsmerge.batch.find import Job, find_jobs
+from gsmerge.batch.options import BatchOptions
+from gsmerge.batch.run import run_batch
+
+__all__ = ["BatchOptions", "Job", "find_jobs", "run_batch"]

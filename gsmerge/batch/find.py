@@ -1,0 +1,179 @@
+"""Scenes in any layout, and the files that their results go to."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmerge.batch.options import BatchOptions
+from gsmerge.contents import stem_of
+from gsmerge.costs import memory_bytes
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.files import level_output
+from gsmerge.io.bounds import read_text
+from gsmerge.io.ply_file import count_rows
+from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
+
+SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *IMAGE_PLACES}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene of a batch.
+
+    Args:
+        index: Its place in the list.
+        scene: A ``.ply``, or the folder of one.
+        output: Name of the result in the output folder.
+        num_gaussians: That its file promises; 0 where it cannot be read.
+    """
+
+    index: int
+    scene: str
+    output: str
+    num_gaussians: int
+
+    @property
+    def memory(self) -> int:
+        """Bytes that it may take, within a factor of about two."""
+        return memory_bytes(self.num_gaussians, photos=True)
+
+
+def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
+    """All scenes, each once, and where their results go.
+
+    Args:
+        given: Folders, which are searched; patterns; ``.ply`` files; text files with one of these per line.
+        out: The output folder, in which no scenes are looked for.
+        options: For the names of the results.
+        own: Real paths of results of former runs, which are no scenes.
+
+    Raises:
+        SceneError: If something that was named does not exist or holds no scene.
+        UsageError: If two scenes would be written to one file, or one over another.
+    """
+    jobs: list[Job] = []
+    owners: dict[str, str] = {}
+    inputs: set[str] = set()
+    for scene in find_scenes(given, out):
+        ply = _ply_of(scene)
+        real = os.path.realpath(ply)
+        if real in inputs or real in own:
+            continue
+        inputs.add(real)
+        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), count_rows(ply))
+        for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
+            if name in owners:
+                raise UsageError(
+                    f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
+                    f" {scene}; tell them apart with --output, such as '{{parent}}-{{stem}}.ply'"
+                )
+            owners[name] = str(scene)
+        jobs.append(job)
+    for name in owners:
+        if os.path.realpath(out / name) in inputs:
+            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --out")
+    return jobs
+
+
+def further_outputs(output: str, levels: int) -> list[str]:
+    """Names of the further levels of detail of a result."""
+    return [str(level_output(Path(output), level)) for level in range(1, levels)]
+
+
+def _ply_of(scene: Path) -> Path:
+    """The file that tells a scene from others; the folder itself where it is not clear which."""
+    if not scene.is_dir():
+        return scene
+    found = other_plys(scene)
+    return named_ply(scene) or (found[0] if len(found) == 1 else scene)
+
+
+def output_name(options: BatchOptions, scene: Path, index: int) -> str:
+    """Name of a scene's result in the output folder."""
+    whole = Path(os.path.abspath(scene))
+    values = {"stem": stem_of(whole), "parent": whole.parent.name, "index": index, "k": options.settings.decode.k}
+    try:
+        return os.path.normpath(options.output.format(**values))
+    except ValueError as error:  # a format that fits numbers only
+        raise UsageError(f"--output: {options.output!r} does not fit {values}: {error}") from error
+
+
+def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
+    """The scenes that are named, in the order of the arguments and sorted within each; some may come twice.
+
+    Raises:
+        SceneError: If an argument does not exist or holds no scene.
+        UsageError: If the output folder is searched for scenes.
+    """
+    skip = os.path.realpath(out)
+    for argument in given:
+        path = Path(argument)
+        if path.is_dir():
+            if os.path.realpath(path) == skip:
+                raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
+            yield from _some(_walk(path, skip), argument, "in the folder")
+        elif path.suffix == ".ply" and path.is_file():
+            yield path
+        elif glob.has_magic(argument) and not path.exists():
+            yield from _some(_matches(argument, skip), argument, "that match")
+        elif path.is_file() and path.suffix != ".ply":
+            yield from _some(_listed(path, skip), argument, "in the list")
+        else:
+            raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
+
+
+def _some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
+    """What is found; nothing at all is an error."""
+    first = next(scenes, None)
+    if first is None:
+        raise SceneError(argument, f"expected scenes {where}, found none")
+    yield first
+    yield from scenes
+
+
+def _walk(folder: Path, skip: str, above: tuple[str, ...] = ()) -> Iterator[Path]:
+    """A folder with a file of one of the usual names is one scene; every other ``.ply`` is one by itself."""
+    real = os.path.realpath(folder)
+    if real == skip or real in above:  # a link to a folder above would never end
+        return
+    is_scene = named_ply(folder) is not None
+    files = [] if is_scene else other_plys(folder)
+    yield from [folder] if is_scene else files
+    try:
+        with os.scandir(folder) as entries:
+            inside = sorted(entry.name for entry in entries if entry.is_dir() and not entry.name.startswith("."))
+    except OSError as error:
+        raise SceneError(folder, f"cannot be read ({error.strerror})") from error
+    for name in inside:
+        if not ((is_scene or files) and name in SCENE_PARTS):
+            yield from _walk(folder / name, skip, (*above, real))
+
+
+def _matches(pattern: str, skip: str) -> Iterator[Path]:
+    for name in sorted(glob.iglob(pattern, recursive=True)):
+        path = Path(name)
+        if path.is_dir():
+            yield from _walk(path, skip)
+        elif path.suffix == ".ply":
+            yield path
+
+
+def _listed(file: Path, skip: str) -> Iterator[Path]:
+    """The lines of a list; paths in it are relative to its folder. What does not exist fails when its turn comes."""
+    text = read_text(file)
+    if "\0" in text:
+        raise SceneError(file, "expected a text file with one path per line, found no text")
+    for line in text.splitlines():
+        entry = line.strip()
+        if not entry or entry.startswith("#"):
+            continue
+        path = file.parent / entry
+        if path.is_dir() and os.path.realpath(path) != skip:
+            found = list(_walk(path, skip))
+            yield from found or [path]
+        else:
+            yield path

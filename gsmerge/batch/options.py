@@ -1,0 +1,104 @@
+"""How many scenes are worked on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from string import Formatter
+from typing import Any
+
+from gsmerge.contents import digest
+from gsmerge.io import AUTO, Reading
+from gsmerge.io.ply import OpacityChoice
+from gsmerge.options import CompactOptions
+
+FIELDS = ("stem", "parent", "index", "k")
+ENGINES = ("local", "ray")
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Settings of :func:`gsmerge.batch.run_batch`.
+
+    Args:
+        settings: Of every scene. ``threads``: those of one scene; None: processors by jobs.
+        opacity: How all files store opacity.
+        reading: What is told of all files instead of found.
+        cameras: Cameras of a scene: one path for all, or with ``{scene}``, ``{parent}`` and ``{stem}`` in it; None:
+            found beside each.
+        images: The same for the folder of photos.
+        output: Name of a result in the output folder, made of ``{stem}`` (the scene's name), ``{parent}`` (name of
+            the folder it is in), ``{index}`` (its place in the list, from 0) and ``{k}``.
+        jobs: Scenes that are worked on at once; None: as many as processors and memory allow.
+        max_memory: Bytes that they may take together; None: what is free. Ray knows that of its nodes.
+        timeout: Seconds that a scene may take; None: any.
+        retries: How often a scene is tried again whose process died or took too long.
+        rerun: Do what is done already again.
+        overwrite: Replace files in the output folder that no batch wrote.
+        engine: ``"local"``: processes on this machine; ``"ray"``: a Ray cluster.
+        address: Of the Ray cluster; None: one of this machine alone, started for the run.
+
+    Raises:
+        ValueError: If a setting is out of range.
+    """
+
+    settings: CompactOptions = field(default_factory=CompactOptions)
+    opacity: OpacityChoice = "auto"
+    reading: Reading = AUTO
+    cameras: str | None = None
+    images: str | None = None
+    output: str = "{stem}.ply"
+    jobs: int | None = None
+    max_memory: int | None = None
+    timeout: float | None = None
+    retries: int = 1
+    rerun: bool = False
+    overwrite: bool = False
+    engine: str = "local"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        check_template(self.output)
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"jobs: expected at least 1, got {self.jobs}")
+        if self.max_memory is not None and self.max_memory < 1:
+            raise ValueError(f"max memory: expected at least 1 byte, got {self.max_memory}")
+        if self.timeout is not None and not self.timeout > 0:
+            raise ValueError(f"timeout: expected more than 0 s, got {self.timeout}")
+        if self.retries < 0:
+            raise ValueError(f"retries: expected at least 0, got {self.retries}")
+        if self.engine not in ENGINES:
+            raise ValueError(f"engine: expected one of {', '.join(ENGINES)}, got {self.engine!r}")
+        if self.address is not None and self.engine != "ray":
+            raise ValueError(f"address: expected engine ray, got {self.engine}")
+        if self.max_memory is not None and self.engine == "ray":
+            raise ValueError("max memory: expected engine local; Ray knows the memory of its nodes")
+
+    def told(self) -> dict[str, Any]:
+        """Everything that the bytes of a result hang on beside the scene's files, as plain values."""
+        settings = self.settings.to_dict()
+        del settings["threads"]
+        return {"settings": settings, "opacity": self.opacity, "reading": vars(self.reading)}
+
+    def name(self) -> str:
+        """One for all runs that may share an output folder: they make the same of the same scenes."""
+        return digest({**self.told(), "output": self.output, "cameras": self.cameras, "images": self.images})
+
+
+def check_template(template: str) -> None:
+    """Refuse a name for results that is none.
+
+    Raises:
+        ValueError: If it holds another field than those in ``FIELDS``, does not end in ``.ply``, or leaves the folder.
+    """
+    try:
+        names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]
+        shown = template.format(**dict.fromkeys(FIELDS, 1))
+    except (ValueError, LookupError, AttributeError, TypeError):
+        names, shown = [""], ""
+    if any(name not in FIELDS for name in names):
+        known = ", ".join(f"{{{name}}}" for name in FIELDS)
+        raise ValueError(f"output: expected {known} in braces, got {template!r}")
+    if not shown.endswith(".ply"):
+        raise ValueError(f"output: expected a name that ends in .ply, got {template!r}")
+    if shown.startswith(("/", "~", ".")) or ".." in shown.split("/") or "\\" in shown or "\0" in shown:
+        raise ValueError(f"output: expected a name inside the output folder, not hidden, got {template!r}")

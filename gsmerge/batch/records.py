@@ -1,0 +1,116 @@
+"""What a batch leaves of each scene: one JSON line, on the disk before the next scene begins."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsmerge.errors import SceneError
+from gsmerge.lines import each_line
+from gsmerge.report import document_head, file_sha256
+
+RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
+DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
+BUSY, LOST, STUCK = "busy", "lost", "stuck"  # of what is no record: another's, its process died, nothing can be kept
+
+
+@dataclass(frozen=True)
+class Known:
+    """A result that is done.
+
+    Args:
+        key: Of the scene's content, the settings and the version.
+        files: Name in the output folder and SHA-256 of each file.
+    """
+
+    key: str
+    files: tuple[tuple[str, str], ...]
+
+    def holds(self, folder: Path, key: str) -> bool:
+        """Whether it was made of the same, and every file still is what was written."""
+        try:
+            return self.key == key and all(file_sha256(folder / name) == sha256 for name, sha256 in self.files)
+        except OSError:
+            return False
+
+
+@dataclass
+class Index:
+    """The results of a folder, read on as lines are added by whichever process.
+
+    Args:
+        folder: The output folder.
+        end: Byte up to which its records are read.
+        known: What is done, by name of the result.
+        damaged: Lines that could not be read.
+    """
+
+    folder: Path
+    end: int = 0
+    known: dict[str, Known] = field(default_factory=dict)
+    damaged: int = 0
+
+    def read_on(self) -> None:
+        """Take in what was added since."""
+        for end, value in each_line(self.folder / RECORDS, self.end):
+            self.end = end
+            found = None if value is None else _known(value)
+            if found is None:
+                self.damaged += value is None
+            else:
+                self.known[found[0]] = found[1]
+
+    def results(self) -> set[str]:
+        """Real paths of all results."""
+        names = [name for known in self.known.values() for name, _ in known.files]
+        return {os.path.realpath(self.folder / name) for name in names}
+
+
+def _known(value: Mapping[str, Any]) -> tuple[str, Known] | None:
+    """Name and result of a record; None for one of another kind."""
+    if value.get("status") != DONE:
+        return None
+    try:
+        files = tuple((str(file["path"]), str(file["sha256"])) for file in value["files"])
+        return str(value["output"]), Known(str(value["key"]), files)
+    except (KeyError, TypeError):
+        return None
+
+
+def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
+    """A record: what every line has, with ``facts`` in place of nothing."""
+    blank: dict[str, Any] = {"key": None, "files": [], "attempt": 1, "error": None, "report": None}
+    place = {"host": socket.gethostname(), "pid": os.getpid()}
+    return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **place, **facts}
+
+
+def written_files(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
+    """What a record says of the files that were written."""
+    return [
+        {"path": name, "sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in names
+    ]
+
+
+def each_record(folder: Path) -> Iterator[dict[str, Any]]:
+    """The records of a folder in their order, without damaged ones."""
+    for _, value in each_line(folder / RECORDS):
+        if value is not None and {"status", "scene", "output"} <= value.keys():
+            yield value
+
+
+def check_folder(folder: Path) -> None:
+    """Make the output folder, and see that records can be added to it.
+
+    Raises:
+        SceneError: If that is not so.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / RECORDS).open("ab"):
+            pass
+    except OSError as error:
+        raise SceneError(folder, f"cannot be written ({error.strerror})", "name another folder with --out") from error

@@ -1,0 +1,154 @@
+"""What a batch came to: totals, a table, and a CSV file of all scenes."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsmerge.batch.locks import BusyError, scene_lock
+from gsmerge.batch.records import DONE, FAILED, SKIPPED, SUMMARY, each_record
+from gsmerge.io import atomic_output
+from gsmerge.io.atomic import remove_leftovers
+from gsmerge.report import human_bytes
+
+COLUMNS = (
+    "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
+    "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
+)  # fmt: skip
+SHOWN = 20  # scenes in the table, and failures below it
+
+
+@dataclass
+class Totals:
+    """What is known of a run so far; its size does not grow with the number of scenes.
+
+    Args:
+        total: Scenes.
+        counts: Of them by status.
+        num_input: Gaussians in the scenes that were done.
+        num_output: Gaussians in their results.
+        bytes_input: Bytes of the same.
+        bytes_output: Bytes of the same.
+        unmet: Results that do not meet the target that was asked for.
+        rows: The first ones done, as in the CSV file.
+        failures: The first scenes that failed, and why.
+    """
+
+    total: int
+    counts: dict[str, int] = field(default_factory=lambda: {DONE: 0, SKIPPED: 0, FAILED: 0})
+    num_input: int = 0
+    num_output: int = 0
+    bytes_input: int = 0
+    bytes_output: int = 0
+    unmet: int = 0
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    failures: list[tuple[str, str]] = field(default_factory=list)
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Count a scene."""
+        self.counts[record["status"]] += 1
+        row = row_of(record)
+        if record["status"] == DONE:
+            self.num_input += row["num_input"]
+            self.num_output += row["num_output"]
+            self.bytes_input += row["bytes_input"]
+            self.bytes_output += row["bytes_output"]
+            self.unmet += bool(row["unmet"])
+            self.rows += [row] if len(self.rows) < SHOWN else []
+        elif record["status"] == FAILED and len(self.failures) < SHOWN:
+            self.failures.append((str(record["scene"]), str(record["error"])))
+
+    @property
+    def ended(self) -> int:
+        """Scenes that are done with."""
+        return sum(self.counts.values())
+
+
+def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record as a row of the CSV file; None for what is not known."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {name: record.get(name) for name in ("scene", "output", "status", "attempt", "error")}
+    report = record.get("report")
+    if not report:
+        return row
+    psnr = report["psnr_input_views"]
+    files = [*report["levels"], report["output"]]
+    return row | {
+        "num_input": report["input"]["num_gaussians"],
+        "num_output": report["output"]["num_gaussians"],
+        "ratio": report["ratio"],
+        "bytes_input": report["input"]["bytes"],
+        "bytes_output": sum(file["bytes"] for file in files),
+        "psnr_before": psnr["before"],
+        "psnr_after": psnr["after"],
+        "seconds": report["total_seconds"],
+        "peak_memory_bytes": report["peak_memory_bytes"],
+        "unmet": report["unmet"],
+    }
+
+
+def write_summary(folder: Path) -> Path | None:
+    """Write the newest state of every scene in the folder; None if another run is writing it.
+
+    Raises:
+        SceneError: If the file cannot be written.
+    """
+    path = folder / SUMMARY
+    rows = {record["output"]: row_of(record) for record in each_record(folder)}
+    try:
+        with scene_lock(folder, [SUMMARY]) as lock:
+            remove_leftovers(path)
+            with (
+                atomic_output(path, overwrite=True) as temporary,
+                temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+            ):
+                writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows[output] for output in sorted(rows))
+            lock.finish()
+    except BusyError:
+        return None
+    return path
+
+
+def summary_lines(totals: Totals, path: Path | None) -> list[str]:
+    """The table of a run for people."""
+    lines = _table(totals.rows)
+    more = totals.counts[DONE] - len(totals.rows)
+    lines += [f"... and {more:,} more"] if more > 0 else []
+    lines += [f"failed: {scene}: {error}" for scene, error in totals.failures]
+    more = totals.counts[FAILED] - len(totals.failures)
+    lines += [f"... and {more:,} more failed"] if more > 0 else []
+    said = [f"{count:,} {status}" for status, count in totals.counts.items() if count or status == DONE]
+    left = totals.total - totals.ended
+    line = f"{totals.total:,} scenes: {', '.join(said)}" + (f", {left:,} left" if left else "")
+    if totals.num_input:
+        share = 100 * totals.num_output / totals.num_input
+        line += (
+            f"; {totals.num_input:,} -> {totals.num_output:,} Gaussians ({share:.2f} %),"
+            f" {human_bytes(totals.bytes_input)} -> {human_bytes(totals.bytes_output)}"
+        )
+    line += f"; {totals.unmet:,} missed the target" if totals.unmet else ""
+    return [*lines, line + (f"; all in {path}" if path is not None else "")]
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    if not rows:
+        return []
+    cells = [("result", "Gaussians", "of", "kept", "dB before", "after", "seconds")]
+    for row in sorted(rows, key=lambda row: str(row["output"])):
+        quality = ["" if row[name] is None else f"{row[name]:.2f}" for name in ("psnr_before", "psnr_after")]
+        share = f"{100 * row['ratio']:.2f} %"
+        cells.append(
+            (row["output"], f"{row['num_output']:,}", f"{row['num_input']:,}", share, *quality, f"{row['seconds']:.1f}")
+        )
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    return [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in cells
+    ]

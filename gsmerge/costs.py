@@ -1,0 +1,64 @@
+"""What a scene costs before it is worked on: seconds and bytes, from its number of pixels and the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# Processor seconds per million pixels of all views together (or Gaussians, which is the same number), kernels compiled.
+# Measured on twelve views of 256 x 480; they only have to be right within a factor of two.
+COST_FIXED = 1.5  # imports
+COST_READ = 0.7
+COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
+COST_MERGE = 0.5
+COST_NETWORKS = 2.8  # at the usual density
+COST_SCORE = 1.3  # rendering the photos from input and output
+COST_ROBUST = 1.6
+COST_COLOR_FIT = 0.9
+COST_FULL_FIT = 0.36  # per step and million pixels of one view
+COST_RIVALS = {"paper": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
+COST_RIVAL = 0.2  # of the others
+COST_RIVAL_STEP = 0.15  # per step of the full fit, for each million Gaussians of an input that was not merged
+BYTES_FIXED = 350_000_000  # interpreter, torch and numba
+BYTES_PER_GAUSSIAN = 240
+BYTES_PER_PIXEL = 100  # the photo as floats and what segmentation and rendering keep of it
+
+
+def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *, photos: bool, fit_steps: int) -> float:
+    """Processor seconds that a scene takes, without imports, within a factor of about two.
+
+    Args:
+        pixels: Of all views together, or Gaussians where they are more.
+        view_pixels: Of one view.
+        options: All settings by flat name.
+        photos: Whether the scene has photos.
+        fit_steps: Steps of the full fit.
+    """
+    method, fit = options["method"], fit_of(options, photos=photos)
+    if method == "gsmerge":
+        work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * is_robust(options, photos=photos)
+        work += COST_NETWORKS * (options["checkpoint"] != "none")
+    else:
+        work = COST_RIVALS.get(method, COST_RIVAL)
+    work += COST_READ + COST_SCORE * photos + COST_COLOR_FIT * (fit == "color")
+    steps = fit_steps if fit == "full" else 0
+    seconds = pixels / 1e6 * work + view_pixels / 1e6 * COST_FULL_FIT * steps
+    return seconds + pixels / 1e6 * COST_RIVAL_STEP * steps * (method == "unmerged-fit")
+
+
+def memory_bytes(pixels: int, *, photos: bool) -> int:
+    """Memory that a scene takes, imports included, within a factor of about two; ``pixels`` as of work_seconds."""
+    return BYTES_FIXED + BYTES_PER_GAUSSIAN * pixels + BYTES_PER_PIXEL * pixels * photos
+
+
+def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
+    """What is fitted to the photos: full, color or none."""
+    own = {"gsmerge": options["fit"], "unmerged-fit": "full", "unmerged-color": "color"}
+    return own.get(options["method"], "none") if photos else "none"
+
+
+def is_robust(options: Mapping[str, Any], *, photos: bool) -> bool:
+    """Whether merges are chosen among by the photos."""
+    if options["method"] != "gsmerge" or not photos:
+        return False
+    return fit_of(options, photos=photos) != "full" if options["robust"] is None else bool(options["robust"])
