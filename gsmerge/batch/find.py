@@ -149,7 +149,7 @@ def _walk(folder: Path, skip: str, above: tuple[str, ...] = ()) -> Iterator[Path
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
     for name in inside:
-        if not ((is_scene or files) and name in SCENE_PARTS):
+        if not (is_scene and name in SCENE_PARTS):
             yield from _walk(folder / name, skip, (*above, real))
 
 

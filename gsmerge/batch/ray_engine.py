@@ -94,7 +94,8 @@ class RayPool:
         ready, rest = self.ray.wait(list(self.tasks), num_returns=1, timeout=seconds)
         if ready and rest:
             ready += self.ray.wait(rest, num_returns=len(rest), timeout=0)[0]
-        return [(self.tasks.pop(ref), self._result(ref, self.tasks[ref])) for ref in ready]
+        ended = [(ref, self.tasks.pop(ref)) for ref in ready]
+        return [(task, self._result(ref, task)) for ref, task in ended]
 
     def _result(self, ref: Any, task: Task) -> dict[str, Any]:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,12 @@ class Known:
     Args:
         key: Of the scene's content, the settings and the version.
         files: Name in the output folder and SHA-256 of each file.
+        failed_since: Whether the scene failed when it was to be done again.
     """
 
     key: str
     files: tuple[tuple[str, str], ...]
+    failed_since: bool = False
 
     def holds(self, folder: Path, key: str) -> bool:
         """Whether it was made of the same, and every file still is what was written."""
@@ -58,11 +60,14 @@ class Index:
         """Take in what was added since."""
         for end, value in each_line(self.folder / RECORDS, self.end):
             self.end = end
-            found = None if value is None else _known(value)
-            if found is None:
-                self.damaged += value is None
-            else:
-                self.known[found[0]] = found[1]
+            if value is None:
+                self.damaged += 1
+                continue
+            output, found = value.get("output"), _known(value)
+            if found is not None:
+                self.known[str(output)] = found
+            elif value.get("status") == FAILED and output in self.known:
+                self.known[output] = replace(self.known[output], failed_since=True)
 
     def results(self) -> set[str]:
         """Real paths of all results."""
@@ -70,13 +75,13 @@ class Index:
         return {os.path.realpath(self.folder / name) for name in names}
 
 
-def _known(value: Mapping[str, Any]) -> tuple[str, Known] | None:
-    """Name and result of a record; None for one of another kind."""
+def _known(value: Mapping[str, Any]) -> Known | None:
+    """The result of a record; None for one of another kind."""
     if value.get("status") != DONE:
         return None
     try:
         files = tuple((str(file["path"]), str(file["sha256"])) for file in value["files"])
-        return str(value["output"]), Known(str(value["key"]), files)
+        return Known(str(value["key"]), files) if "output" in value else None
     except (KeyError, TypeError):
         return None
 

@@ -97,7 +97,13 @@ def write_summary(folder: Path) -> Path | None:
         SceneError: If the file cannot be written.
     """
     path = folder / SUMMARY
-    rows = {record["output"]: row_of(record) for record in each_record(folder)}
+    rows: dict[str, dict[str, Any]] = {}
+    done: dict[str, dict[str, Any]] = {}
+    for record in each_record(folder):
+        row = row_of(record)
+        if record["status"] == DONE:
+            done[record["output"]] = row
+        rows[record["output"]] = done.get(record["output"], row) if record["status"] == SKIPPED else row
     try:
         with scene_lock(folder, [SUMMARY]) as lock:
             remove_leftovers(path)

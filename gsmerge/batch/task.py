@@ -83,7 +83,8 @@ def run_task(task: Task, work: Work, later: Index) -> dict[str, Any]:
                 found = _worked(task, work, later, lock)
             except Exception as error:  # a bad scene must not end the batch
                 found = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
-            if found["status"] != SKIPPED:
+            known = later.known.get(job.output, task.known)
+            if found["status"] != SKIPPED or (known is not None and known.failed_since):
                 append_line(work.folder / RECORDS, found)
             lock.finish()
             return found

@@ -153,6 +153,10 @@ def batch(
             given_settings(context.params), opacity.value, reading, max_memory=_bytes(max_memory), rerun=not resume,
             engine=engine.value, **given,
         )  # fmt: skip
+    if options.engine == "ray" and not dry_run:
+        from gsmerge.batch.ray_engine import require_ray
+
+        require_ray()
     index = Index(out)
     index.read_on()
     found = find_jobs(scenes, out, options, index.results())

@@ -51,7 +51,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 def remove_leftovers(path: Path) -> None:
     """Remove the temporary files that killed processes left of this output; nobody may be writing it."""
-    name = re.compile(rf"\.{re.escape(path.stem)}-[0-9a-f]{{8}}{re.escape(path.suffix)}")
+    name = re.compile(rf"\.+{re.escape(path.stem)}(-[0-9a-f]{{8}})+{re.escape(path.suffix)}")  # also one's own one
     try:
         with os.scandir(path.parent) as entries:
             left = [entry.path for entry in entries if name.fullmatch(entry.name)]

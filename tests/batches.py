@@ -1,0 +1,74 @@
+"""Batches for tests: tiny scenes, and options under which each takes a fraction of a second."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from gsmerge.batch import BatchOptions, Job
+from gsmerge.batch.records import RECORDS, SUMMARY, Index
+from gsmerge.batch.task import Task, Work
+from gsmerge.options import CompactOptions
+
+FAST = ("--effort", "draft", "--fit", "none")
+QUICK = BatchOptions(CompactOptions().with_settings({"effort": "draft", "fit": "none", "threads": 1}))
+
+
+def records(folder: Path) -> list[dict[str, Any]]:
+    """All records of an output folder; every line must be whole."""
+    return [json.loads(line) for line in (folder / RECORDS).read_text().splitlines()]
+
+
+def statuses(folder: Path) -> dict[str, list[str]]:
+    """What was recorded of every result, in order."""
+    found: dict[str, list[str]] = {}
+    for record in records(folder):
+        found.setdefault(record["output"], []).append(record["status"])
+    return found
+
+
+def results(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file but the records: whatever is left half-done shows."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name not in (RECORDS, SUMMARY)]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    """The rows of the summary."""
+    with (folder / SUMMARY).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """``gsmerge batch ...`` in a process of its own."""
+    command = [sys.executable, "-m", "gsmerge", "batch", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def holders(folder: Path) -> list[int]:
+    """Processes that hold the locks of scenes."""
+    found = []
+    for path in (folder / ".batch").glob("*.lock"):
+        try:
+            found += [json.loads(path.read_text())["pid"]] if path.name != "run.lock" else []
+        except (OSError, ValueError):
+            continue  # it is being written, or has just gone
+    return found
+
+
+def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, Work, Index]:
+    """What :func:`run_task` takes for a single scene, as a run would have it that begins now."""
+    out.mkdir(exist_ok=True)
+    index = Index(out)
+    index.read_on()
+    name = f"{scene.name}.ply"
+    return (
+        Task(Job(0, str(scene), name, 0), index.known.get(name)),
+        Work(out, options, index.end),
+        Index(out, index.end),
+    )

@@ -1,0 +1,176 @@
+"""``gsmerge batch`` as people use it: folders of scenes, one of which is bad, resumed, planned, told in JSON."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from batches import FAST, records, results, rows, statuses
+
+import gsmerge
+from gsmerge.cli.app import app
+
+from .conftest import Outcome, Run, listing
+
+
+@pytest.fixture(scope="module")
+def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four folders with small scenes, and one with a damaged one. Read only."""
+    folder = tmp_path_factory.mktemp("batch") / "rooms"
+    for number in range(4):
+        make_scene(folder / f"room{number}", num_views=3, width=48, height=32, seed=number)
+    bad = Path(shutil.copytree(folder / "room0", folder / "bad"))
+    (bad / "scene.ply").write_bytes((bad / "scene.ply").read_bytes()[:3000])
+    return folder
+
+
+def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
+    return run("batch", rooms, "--out", out, *FAST, *options)
+
+
+@pytest.fixture(scope="module")
+def first(rooms: Path) -> tuple[int, Path]:
+    """Exit code and folder of a run over all five. Read only."""
+    from gsmerge.cli import main
+
+    out = rooms.parent / "out"
+    return main(["batch", str(rooms), "--out", str(out), *FAST, "-q", "--jobs", "2"]), out
+
+
+@pytest.fixture
+def out(first: tuple[int, Path], tmp_path: Path) -> Path:
+    """A copy of that folder."""
+    return Path(shutil.copytree(first[1], tmp_path / "out"))
+
+
+def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run: Run, tmp_path: Path) -> None:
+    code, out = first
+    assert code == 5
+    names = [f"room{number}.ply" for number in range(4)]
+    assert sorted(results(out)) == names
+    assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}
+    assert sorted(path.name for path in out.iterdir()) == ["batch.jsonl", *names, "summary.csv"]
+    found = {row["output"]: row for row in rows(out)}
+    assert "truncated or damaged" in found["bad.ply"]["error"]
+    assert int(found["room1.ply"]["num_input"]) == 3 * 48 * 32
+    assert run("compact", rooms / "room1", "-o", tmp_path / "one.ply", *FAST, "-q").code == 0
+    assert (tmp_path / "one.ply").read_bytes() == (out / "room1.ply").read_bytes()
+
+
+def test_records_are_reports(first: tuple[int, Path]) -> None:
+    for record in records(first[1]):
+        assert (record["schema_version"], record["tool"]["version"]) == (1, gsmerge.__version__)
+        if record["status"] == "done":
+            assert record["report"]["output"]["bytes"] == record["files"][0]["bytes"]
+            assert record["report"]["options"]["threads"] == 1
+
+
+def test_the_same_again_does_what_failed_and_nothing_else(rooms: Path, out: Path, run: Run) -> None:
+    before = results(out)
+    outcome = batch(run, rooms, out)
+    assert outcome.code == 5
+    assert "5 scenes: 0 done, 4 skipped, 1 failed; all in" in outcome.out
+    assert "failed: " in outcome.out
+    assert outcome.err.count("\n") == 1 + 5 + 1
+    assert "gsmerge: error: 1 of 5 scenes failed; the first: " in outcome.err
+    assert results(out) == before
+    assert statuses(out)["bad.ply"] == ["failed", "failed"]
+
+
+def test_a_mended_scene_is_done_and_json_is_a_line_each(rooms: Path, out: Path, run: Run, tmp_path: Path) -> None:
+    mended = Path(shutil.copytree(rooms, tmp_path / "rooms"))
+    shutil.copy(mended / "room0" / "scene.ply", mended / "bad" / "scene.ply")
+    outcome = batch(run, mended, out, "--json")
+    assert (outcome.code, outcome.err) == (0, "")
+    lines = [json.loads(line) for line in outcome.out.splitlines()]
+    assert {line["output"]: line["status"] for line in lines}["bad.ply"] == "done"
+    assert [line["status"] for line in lines].count("skipped") == 4
+    again = batch(run, mended, out, "--rerun", "--quiet")
+    assert (again.code, again.out, again.err) == (0, "", "")
+    assert [found.count("done") for found in statuses(out).values()] == [2] * 5
+
+
+def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path, run: Run) -> None:
+    before = listing(out)
+    outcome = batch(run, rooms, out, "--dry-run")
+    assert outcome.code == 0
+    assert f"{rooms / 'bad'} -> {out / 'bad.ply'}" in outcome.out
+    assert "1 of 5 scenes to do" in outcome.out
+    assert "estimate    about " in outcome.out
+    plan = json.loads(batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3).out)
+    assert (plan["dry_run"], plan["num_scenes"], plan["num_pending"], plan["jobs"]) == (True, 5, 5, 3)
+    assert plan["estimate"]["memory_bytes"] > 3 * 10**8
+    assert plan["scenes"][0]["num_gaussians"] == 3 * 48 * 32
+    assert listing(out) == before
+    new = batch(run, rooms, out.parent / "new", "--dry-run")
+    assert "5 of 5 scenes to do" in new.out
+    assert not (out.parent / "new").exists()
+
+
+def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, run: Run) -> None:
+    cameras = {"room0": tmp_path / "room0.json", "room1": tmp_path / "room1.json"}
+    for name, path in cameras.items():
+        shutil.copytree(rooms / name, tmp_path / "in" / name)
+        (tmp_path / "in" / name / "transforms.json").rename(path)
+    told = ("--cameras", f"{tmp_path}/{{stem}}.json", "--output", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
+    outcome = batch(run, tmp_path / "in", tmp_path / "out", *told)
+    assert outcome.code == 0, outcome.err
+    assert sorted(results(tmp_path / "out")) == ["in/0-room0.k1.ply", "in/1-room1.k1.ply"]
+
+
+def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
+    told = ("--effort", "draft", "--target-psnr", 90, "--density", 0.01, "--jobs", 1)
+    outcome = run("batch", rooms / "room0", "--out", tmp_path, *told)
+    assert outcome.code == 4
+    assert "1 of 1 results miss the target" in outcome.err
+    assert (tmp_path / "room0.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("told", "code", "said"),
+    [
+        (("--fit", "color", "--max-drop", 1, "--target-psnr", 30), 2, "expected one of max drop and target psnr"),
+        (("--method", "voxel", "--k", "auto"), 2, "method voxel"),
+        (("--require-checkpoint",), 2, "require_checkpoint"),
+        (("--jobs", "many"), 2, "auto"),
+        (("--jobs", 0), 2, "auto"),
+        (("--max-memory", "lots"), 2, "--max-memory: expected a size such as 8GB"),
+        (("--retries", -1), 2, "retries"),
+        (("--output", "{name}.ply"), 2, "{stem}"),
+        (("--output", "same.ply"), 2, "a file of its own for each scene"),
+        (("--address", "auto"), 2, "address: expected engine ray"),
+        (("--dialect", "nobody"), 2, "nobody"),
+    ],
+)
+def test_wrong_usage_is_told_at_once(
+    told: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
+) -> None:
+    outcome = run("batch", rooms, "--out", tmp_path / "out", *told)
+    assert outcome.code == code
+    assert said in outcome.err
+    assert outcome.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_places_that_make_no_sense_are_told_at_once(rooms: Path, tmp_path: Path, run: Run) -> None:
+    assert run("batch", tmp_path / "gone", "--out", tmp_path / "out").code == 3
+    assert run("batch", rooms, "--out", rooms).code == 2
+    (tmp_path / "file").touch()
+    assert run("batch", rooms, "--out", tmp_path / "file").code == 2
+    outcome = run("batch", rooms, "--out", tmp_path / "file" / "out")
+    assert outcome.code == 3
+    assert "cannot be written" in outcome.err
+    assert outcome.err.count("gsmerge: error") == 1
+
+
+def test_every_option_of_compact_is_there() -> None:
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    options = {name: {o: p for p in commands[name].params for o in p.opts} for name in ("compact", "batch")}
+    assert options["compact"].keys() - options["batch"].keys() == {"scene", "-o", "--report"}
+    own = {"--cameras", "--images", "--output", "--threads", "--overwrite", "--json"}  # which mean many things here
+    for name in options["compact"].keys() & options["batch"].keys() - own:
+        assert options["compact"][name].help == options["batch"][name].help

@@ -1,0 +1,188 @@
+"""What may happen to a batch: it is killed, its processes are, the disk is full, somebody else is there."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from batches import FAST, holders, records, results, start, statuses
+
+pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see processes")
+NAMES = [f"room{number}.ply" for number in range(5)]
+PATIENCE = 120  # seconds, on a machine that is busy with other things
+
+
+@pytest.fixture(scope="module")
+def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five folders with small scenes. Read only."""
+    folder = tmp_path_factory.mktemp("faults") / "rooms"
+    for number in range(5):
+        make_scene(folder / f"room{number}", num_views=3, width=96, height=64, seed=number)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(rooms: Path) -> dict[str, str]:
+    """What a run that nothing happens to makes of them."""
+    out = rooms.parent / "undisturbed"
+    assert start(rooms, "--out", out, *FAST, "--jobs", 2, "-q").wait() == 0
+    assert sorted(results(out)) == NAMES
+    return results(out)
+
+
+def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
+    """What a condition comes to once it holds; None if the process ended before."""
+    deadline = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        if process.poll() is not None:
+            return None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    return found
+
+
+def outlive(pids: list[int]) -> bool:
+    """Wait until processes have ended, which they do on their own; whether any has not."""
+    deadline = time.monotonic() + PATIENCE
+    while any(_runs(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return any(_runs(pid) for pid in pids)
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody has asked about does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+    """At random moments from the first scene on: what is recorded stays, what is not is done, once."""
+    out, chance = tmp_path / "out", random.Random(0)
+    for _ in range(4):
+        process = start(rooms, "--out", out, *FAST, "--jobs", 2)
+        workers = until(lambda: holders(out), process) or []
+        time.sleep(chance.uniform(0, 0.5))
+        process.kill()
+        process.communicate()
+        assert not outlive(workers)
+        if NAMES == sorted(statuses(out)):
+            break
+    process = start(rooms, "--out", out, *FAST, "--jobs", 2, "--json")
+    told, errors = process.communicate()
+    assert (process.returncode, errors) == (0, "")
+    assert sorted(json.loads(line)["output"] for line in told.splitlines()) == NAMES
+    assert results(out) == undisturbed
+    assert statuses(out) == {name: ["done"] for name in NAMES}
+
+
+def test_no_process_outlives_a_run_that_was_killed(rooms: Path, tmp_path: Path) -> None:
+    process = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1)
+    workers = until(lambda: holders(tmp_path), process)
+    process.kill()
+    process.communicate()
+    assert not outlive(workers)
+
+
+def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+    runs = [start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "--json") for _ in range(2)]
+    told = [[json.loads(line) for line in process.communicate()[0].splitlines()] for process in runs]
+    assert [process.returncode for process in runs] == [0, 0]
+    assert results(tmp_path) == undisturbed
+    assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
+    for lines in told:
+        assert sorted(line["output"] for line in lines) == NAMES
+    assert sum(line["status"] == "done" for lines in told for line in lines) == len(NAMES)
+
+
+def test_a_run_with_other_settings_is_refused_meanwhile(rooms: Path, tmp_path: Path) -> None:
+    first = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")
+    until(lambda: holders(tmp_path), first)
+    second = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q", "--k", 2)
+    errors = second.communicate()[1]
+    assert second.returncode == 2
+    assert f"a batch with other settings is at work there (process {first.pid} on" in errors
+    assert first.wait() == 0
+    assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
+
+
+@pytest.mark.parametrize(("retries", "code"), [(1, 0), (0, 5)])
+def test_a_killed_process_costs_its_scene_alone(
+    retries: int, code: int, rooms: Path, tmp_path: Path, undisturbed: dict[str, str]
+) -> None:
+    process = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "--retries", retries, "-q")
+    workers = until(lambda: holders(tmp_path), process)
+    os.kill(workers[0], signal.SIGKILL)
+    errors = process.communicate()[1]
+    assert process.returncode == code
+    failed = [record for record in records(tmp_path) if record["status"] == "failed"]
+    assert [record["error"].startswith("its process was killed (SIGKILL") for record in failed] == [True] * (code // 5)
+    if code:
+        assert "1 of 5 scenes failed" in errors
+        assert start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q").wait() == 0
+    assert results(tmp_path) == undisturbed
+
+
+def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) -> None:
+    quick, slow = rooms / "room0", tmp_path / "slow"
+    shutil.copytree(rooms / "room1", slow)
+    told = ("--timeout", 20, "--retries", 0, "--jobs", 1, "-q", "--fit-steps", 1_000_000, "--effort", "draft")
+    process = start(slow, "--out", tmp_path / "out", *told)
+    errors = process.communicate()[1]
+    assert process.returncode == 5
+    assert "took longer than 20 s (--timeout)" in errors
+    assert results(tmp_path / "out") == {}
+    assert start(quick, "--out", tmp_path / "out", *FAST, "--timeout", PATIENCE, "-q").wait() == 0
+
+
+def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+    process = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1)
+    until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path), process)
+    process.send_signal(signal.SIGINT)
+    told, errors = process.communicate()
+    assert process.returncode == 130
+    assert errors.endswith("gsmerge: error: interrupted\n")
+    done = [name for name, found in statuses(tmp_path).items() if found == ["done"]]
+    assert 1 <= len(done) < len(NAMES)
+    assert f"5 scenes: {len(done)} done" in told
+    assert results(tmp_path).keys() <= set(NAMES)  # nothing half-done, no locks
+    assert start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q").wait() == 0
+    assert results(tmp_path) == undisturbed
+    assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
+
+
+def limited(limit: int, *arguments: object) -> tuple[int, str]:
+    """A batch that may write no file beyond a size, as on a disk that fills up."""
+    code = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))\n"
+    code += "import sys; from gsmerge.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "batch", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+def test_a_full_disk_is_told_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+    """Results do not fit and records do; then records do not either."""
+    told = (rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")
+    code, errors = limited(30_000, *told)
+    assert code == 5
+    assert "5 of 5 scenes failed; the first: " in errors
+    assert "room0.ply: could not be written (" in errors
+    assert errors.count("\n") == 1
+    assert results(tmp_path) == {}
+    code, errors = limited((tmp_path / "batch.jsonl").stat().st_size + 100, *told)
+    assert code == 3
+    assert "batch.jsonl: the batch cannot go on: " in errors
+    assert errors.count("\n") == 1
+    assert start(*told).wait() == 0
+    assert results(tmp_path) == undisturbed

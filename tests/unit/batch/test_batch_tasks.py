@@ -1,0 +1,365 @@
+"""One scene at a time: what is done, skipped, refused, and what a kill at any moment leaves."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from batches import QUICK, one_task, records, results, statuses
+
+from gsmerge.batch import Job
+from gsmerge.batch import task as tasks
+from gsmerge.batch.locks import scene_lock
+from gsmerge.batch.records import BUSY, DONE, FAILED, LOST, SKIPPED, STUCK, record
+from gsmerge.batch.run import hand_out
+from gsmerge.batch.task import Task, Work, give_up, run_task, tidy
+from gsmerge.errors import SceneError
+from gsmerge.io import atomic
+
+
+def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
+    return run_task(*one_task(scene, out, options))
+
+
+@pytest.fixture
+def scene(made_scene: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made_scene, tmp_path / "room"))
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What the made scene comes to."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    scene = shutil.copytree(made_scene, out / "room")
+    run(scene, out / "out")
+    return results(out / "out")
+
+
+def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path) -> None:
+    first = run(scene, out)
+    assert (first["status"], first["error"], first["attempt"]) == (DONE, None, 1)
+    assert first["report"]["options"]["effort"] == "draft"
+    assert first["report"]["input"]["sha256"]
+    assert records(out) == [first]
+    again = run(scene, out)
+    assert (again["status"], again["key"], again["files"]) == (SKIPPED, first["key"], first["files"])
+    assert run(scene, out, replace(QUICK, retries=5, jobs=3))["status"] == SKIPPED
+    assert run(scene, out, replace(QUICK, rerun=True))["status"] == DONE
+    seed = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
+    assert run(scene, out, seed)["status"] == DONE
+    assert run(scene, out)["status"] == DONE  # back to the first settings: the file is of the others
+    (out / "room.ply").write_bytes(b"spoiled")
+    assert run(scene, out)["status"] == DONE
+    photo = next((scene / "images").iterdir())
+    photo.write_bytes(photo.read_bytes() + b"\0")
+    assert run(scene, out)["status"] == DONE
+    assert run(scene, out)["status"] == SKIPPED
+    assert list(results(out)) == ["room.ply"]
+
+
+def test_a_scene_that_moved_is_still_the_same(scene: Path, out: Path, tmp_path: Path) -> None:
+    run(scene, out)
+    (tmp_path / "elsewhere").mkdir()
+    moved = scene.rename(tmp_path / "elsewhere" / "room")
+    assert run(moved, out)["status"] == SKIPPED
+
+
+def test_a_new_version_does_it_again(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(scene, out)
+    monkeypatch.setattr(tasks, "__version__", "99")
+    assert run(scene, out)["status"] == DONE
+
+
+def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: Path) -> None:
+    networks = tmp_path / "networks.safetensors"
+    networks.write_bytes(b"no networks")  # which is a note, and the analytic stages go on
+    told = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(networks)}))
+    assert run(scene, out, told)["status"] == DONE
+    other = Path(shutil.copy(networks, tmp_path / "same.safetensors"))
+    same = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(other)}))
+    assert run(scene, out, same)["status"] == SKIPPED
+    other.write_bytes(b"no networks either")
+    assert run(scene, out, same)["status"] == DONE
+
+
+def test_levels_are_part_of_a_result(scene: Path, out: Path) -> None:
+    levels = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}))
+    assert [file["path"] for file in run(scene, out, levels)["files"]] == ["room.ply", "room.level1.ply"]
+    assert run(scene, out, levels)["status"] == SKIPPED
+    (out / "room.level1.ply").unlink()
+    assert run(scene, out, levels)["status"] == DONE
+
+
+def test_a_bad_scene_is_a_record(scene: Path, out: Path) -> None:
+    (scene / "scene.ply").write_bytes((scene / "scene.ply").read_bytes()[:5000])
+    found = run(scene, out)
+    assert found["status"] == FAILED
+    assert "truncated or damaged" in found["error"]
+    assert "\n" not in found["error"]
+    assert records(out) == [found]
+    assert results(out) == {}
+    assert run(scene, out)["status"] == FAILED  # and is tried again
+
+
+def test_what_nobody_foresaw_is_a_record(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise ZeroDivisionError("odd\nthing")
+
+    monkeypatch.setattr(tasks, "compact_files", broken)
+    assert run(scene, out)["error"] == "ZeroDivisionError: odd thing"
+
+    def greedy(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(tasks, "compact_files", greedy)
+    assert run(scene, out)["error"].startswith("out of memory; use fewer")
+
+
+def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> None:
+    out.mkdir()
+    (out / "room.ply").write_bytes(b"mine")
+    for _ in range(2):  # the first refusal is no claim
+        found = run(scene, out)
+        assert "exists already, and no batch wrote it; pass --overwrite" in found["error"]
+        assert (out / "room.ply").read_bytes() == b"mine"
+    with scene_lock(out, ["room.ply"]):
+        pass  # killed before it was refused
+    assert run(scene, out)["status"] == FAILED
+    assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
+
+
+def test_what_another_run_has_done_meanwhile_is_skipped(scene: Path, out: Path) -> None:
+    task, work, later = one_task(scene, out)
+    assert run(scene, out)["status"] == DONE
+    assert run_task(task, work, later)["status"] == SKIPPED
+    task, work, later = one_task(scene, out, replace(QUICK, rerun=True))
+    assert run_task(task, work, later)["status"] == DONE
+    assert run_task(task, work, later)["status"] == SKIPPED  # done again since the run began
+
+
+def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
+    task, work, later = one_task(scene, out)
+    with scene_lock(out, ["room.ply"]) as lock:
+        assert run_task(task, work, later)["status"] == BUSY
+        assert give_up(task, work, "died")["status"] == BUSY
+        tidy(task, work)
+        assert lock.path.exists()
+    assert not (out / "batch.jsonl").exists()
+
+
+def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import warnings
+
+    compact_files = tasks.compact_files
+
+    def odd(*args: Any, **kwargs: Any) -> Any:
+        warnings.warn("odd thing", stacklevel=1)
+        return compact_files(*args, **kwargs)
+
+    monkeypatch.setattr(tasks, "compact_files", odd)
+    assert run(scene, out)["report"]["notes"][-1] == "odd thing"
+
+
+KILLS = {
+    "while it reads": ("gsmerge.batch.task.scene_key", True),
+    "while it writes": ("gsmerge.files.write_ply", False),
+    "before the result is renamed": ("pathlib.Path.replace", True),
+    "before the record": ("gsmerge.batch.task.append_line", True),
+    "before the lock is gone": ("gsmerge.batch.locks.Lock.finish", True),
+}
+
+
+@pytest.mark.parametrize("moment", KILLS)
+def test_a_kill_at_any_moment_loses_nothing(
+    moment: str, scene: Path, out: Path, root: Path, undisturbed: dict[str, str]
+) -> None:
+    where, before = KILLS[moment]
+    code = f"""
+import os, signal, sys
+sys.path.insert(0, {str(root / "tests")!r})
+from pathlib import Path
+from batches import one_task
+from gsmerge.batch.task import run_task
+target, name = {where!r}.rsplit(".", 1)
+owner = __import__("pkgutil").resolve_name(target)
+kept = getattr(owner, name)
+def killed(*args, **kwargs):
+    if not {before}:
+        kept(*args, **kwargs)
+    os.kill(os.getpid(), signal.SIGKILL)
+setattr(owner, name, killed)
+run_task(*one_task(Path({str(scene)!r}), Path({str(out)!r})))
+"""
+    killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert (out / ".batch").is_dir()
+    after = run(scene, out)
+    recorded = moment == "before the lock is gone"
+    assert after["status"] == (SKIPPED if recorded else DONE)
+    assert results(out) == undisturbed
+    assert statuses(out) == {"room.ply": [DONE]}
+
+
+def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undisturbed: dict[str, str]) -> None:
+    run(scene, out)
+    path = out / "batch.jsonl"
+    kept = (out / "room.ply").rename(out / "kept.ply")
+    with scene_lock(out, ["room.ply"]):
+        kept.rename(out / "room.ply")
+        path.write_bytes(path.read_bytes()[:100])
+    assert run(scene, out)["status"] == DONE
+    assert results(out) == undisturbed
+    assert len(records(out)) == 1
+
+
+def failing(code: int, where: Path) -> Any:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(code, os.strerror(code), str(where))
+
+    return refuse
+
+
+def test_a_full_disk_fails_the_scene_and_leaves_nothing(
+    scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.files.write_ply", failing(errno.ENOSPC, out))
+    found = run(scene, out)
+    assert found["status"] == FAILED
+    assert "room.ply: could not be written (No space left on device)" in found["error"]
+    assert results(out) == {}
+    monkeypatch.undo()
+    assert run(scene, out)["status"] == DONE
+
+
+def test_where_nothing_can_be_recorded_nothing_is_forgotten(
+    scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, str]
+) -> None:
+    def refuse(path: Path, _: Any) -> None:
+        raise SceneError(path, "cannot be written (No space left on device)")
+
+    monkeypatch.setattr(tasks, "append_line", refuse)
+    found = run(scene, out)
+    assert found["status"] == STUCK
+    assert "batch.jsonl: cannot be written (No space left" in found["error"]
+    task, work, _ = one_task(scene, out)
+    assert give_up(task, work, "died")["status"] == STUCK
+    tidy(task, work)
+    monkeypatch.undo()
+    assert run(scene, out)["status"] == DONE  # the result is there without a record, and known as ours
+    assert results(out) == undisturbed
+
+
+def test_a_folder_that_cannot_be_written_fails_the_scene(
+    scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.open
+
+    def refuse(path: Any, *args: Any, **kwargs: Any) -> int:
+        if str(path).endswith(".ply"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, *args, **kwargs)
+
+    monkeypatch.setattr(atomic.os, "open", refuse)
+    assert "cannot be written (Permission denied)" in run(scene, out)["error"]
+
+
+def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
+    task, work, _ = one_task(scene, out)
+    with scene_lock(out, ["room.ply"]):
+        (out / ".room-00112233.ply").touch()  # its process died here
+        (out / ".room-mine.ply").touch()
+    found = give_up(replace(task, attempt=2), work, "killed")
+    assert (found["status"], found["error"], found["attempt"]) == (FAILED, "killed", 2)
+    assert records(out) == [found]
+    assert list(results(out)) == [".room-mine.ply"]
+
+
+def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
+    task, work, _ = one_task(scene, out)
+    with scene_lock(out, ["room.ply"]):
+        (out / ".room-00112233.ply").touch()
+    tidy(task, work)
+    assert list(out.iterdir()) == []
+
+
+class Script:
+    """A pool whose tasks end as it is told, in order; a scene without a script is done."""
+
+    def __init__(self, scripts: dict[str, list[str]], room: int = 2) -> None:
+        self.scripts, self.room, self.tasks, self.seen = scripts, room, list[Task](), list[tuple[str, int]]()
+
+    @property
+    def has_room(self) -> bool:
+        return len(self.tasks) < self.room
+
+    def submit(self, task: Task) -> None:
+        self.tasks.append(task)
+        self.seen.append((task.job.scene, task.attempt))
+
+    def wait(self, _: float) -> list[tuple[Task, dict[str, Any]]]:
+        task = self.tasks.pop(0)
+        script = self.scripts.get(task.job.scene, [])
+        status = script.pop(0) if script else DONE
+        return [(task, record(status, task.job.scene, task.job.output, error="told so"))]
+
+    def close(self) -> None:
+        pass
+
+
+def handed_out(pool: Script, work: Work, count: int) -> list[tuple[str, str]]:
+    def each() -> Iterator[Task]:
+        for number in range(count):
+            assert len(pool.tasks) < pool.room  # nothing is asked for before there is room
+            yield Task(Job(number, str(number), f"{number}.ply", 0), None)
+
+    return [(found["scene"], found["status"]) for found in hand_out(each(), pool, work)]
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Work:
+    return Work(tmp_path, replace(QUICK, retries=2), 0)
+
+
+def test_what_was_lost_is_tried_again_as_often_as_told(work: Work) -> None:
+    pool = Script({"1": [LOST, LOST], "2": [LOST, LOST, LOST]})
+    assert sorted(handed_out(pool, work, 4)) == [("0", DONE), ("1", DONE), ("2", FAILED), ("3", DONE)]
+    assert [attempt for scene, attempt in pool.seen if scene == "2"] == [1, 2, 3]
+    assert [(r["scene"], r["error"], r["attempt"]) for r in records(work.folder)] == [("2", "told so", 3)]
+
+
+def test_what_failed_is_not_tried_again(work: Work) -> None:
+    pool = Script({"0": [FAILED]})
+    assert handed_out(pool, work, 2) == [("0", FAILED), ("1", DONE)]
+    assert len(pool.seen) == 2
+
+
+def test_what_others_work_on_comes_last(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.batch.run.AGAIN", 0.05)
+    pool = Script({"0": [BUSY, BUSY, SKIPPED]})
+    start = time.monotonic()
+    assert handed_out(pool, work, 3) == [("1", DONE), ("2", DONE), ("0", SKIPPED)]
+    assert time.monotonic() - start >= 0.1
+
+
+def test_a_batch_that_cannot_record_ends(work: Work) -> None:
+    with pytest.raises(SceneError, match=r"batch\.jsonl: the batch cannot go on: told so"):
+        handed_out(Script({"1": [STUCK]}), work, 3)
+
+
+def test_nothing_to_do_is_done_at_once(work: Work) -> None:
+    assert handed_out(Script({}), work, 0) == []
