@@ -50,6 +50,13 @@ def start(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def finish(*arguments: object) -> int:
+    """Exit code of ``gsmerge batch ...``."""
+    process = start(*arguments)
+    process.communicate()
+    return process.returncode
+
+
 def holders(folder: Path) -> list[int]:
     """Processes that hold the locks of scenes."""
     found = []

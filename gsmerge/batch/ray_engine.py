@@ -11,6 +11,7 @@ import contextlib
 import faulthandler
 import logging
 import os
+import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,6 +27,7 @@ from gsmerge.errors import SceneError, UsageError
 
 SCENES = 200  # that a process works on before it makes way for a new one
 WAITING = 2  # scenes that Ray is given beyond those that it has processors for
+KNOCK = 10.0  # seconds to reach a cluster
 COUNT_AGAIN = 5.0  # seconds until the cluster is asked for its size again
 
 
@@ -123,12 +125,24 @@ def _join(ray: ModuleType, options: BatchOptions) -> None:
         ray.init(address="local", include_dashboard=False, object_store_memory=100 << 20, **quiet)
         return
     try:
+        _knock(options.address)
         ray.init(address=options.address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         told = " ".join(str(error).split())[:200]
         raise SceneError(
-            options.address, f"no Ray cluster answers ({told})", "start one with ray start --head"
+            options.address, f"no Ray cluster answers there ({told})", "start one with ray start --head"
         ) from error
+
+
+def _knock(address: str) -> None:
+    """See that somebody listens there; Ray itself would wait for minutes.
+
+    Raises:
+        OSError: If nobody does.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK).close()
 
 
 def run_remote(task: Task, work: Work) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json as json_lines
+import os
 import sys
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, redirect_stdout
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
@@ -205,11 +206,19 @@ def _run(
     silent = quiet or as_json
     spread = f"{shape.jobs or 'all it has room for'} at once, {shape.threads} thread(s) each"
     say(f"{len(found):,} scenes, {spread}", quiet=silent)
+    interrupted = False
     try:
-        with closing(run_batch(found, out, options, index=index, shape=shape)) as records:
-            _follow(records, totals, as_json=as_json, quiet=silent)
+        lines = sys.stdout
+        with (
+            _apart(options, quiet=silent),
+            closing(run_batch(found, out, options, index=index, shape=shape)) as records,
+        ):
+            _follow(records, totals, lines if as_json else None, quiet=silent)
+    except KeyboardInterrupt:
+        interrupted = True
+        raise
     finally:
-        if totals.ended:
+        if totals.ended or interrupted:
             path = write_summary(out)
             if not silent:
                 print("\n".join(map(one_line, summary_lines(totals, path))))
@@ -221,13 +230,23 @@ def _run(
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
 
 
-def _follow(records: Iterable[dict[str, Any]], totals: Totals, *, as_json: bool, quiet: bool) -> None:
+@contextmanager
+def _apart(options: BatchOptions, *, quiet: bool) -> Iterator[None]:
+    """A block in which Ray, which tells on stdout of processes that were lost, does not mix with our lines."""
+    if options.engine != "ray":
+        yield
+        return
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere if quiet else sys.stderr):
+        yield
+
+
+def _follow(records: Iterable[dict[str, Any]], totals: Totals, lines: TextIO | None, *, quiet: bool) -> None:
     """Tell of every scene as it ends."""
     with total_progress(totals.total, quiet=quiet) as progress:
         for record in records:
             totals.add(record)
-            if as_json:
-                print(json_lines.dumps(record, separators=(",", ":")), flush=True)
+            if lines is not None:
+                print(json_lines.dumps(record, separators=(",", ":")), file=lines, flush=True)
             failed = f", {totals.counts['failed']} failed" if totals.counts["failed"] else ""
             why = f": {record['error']}" if record["error"] else ""
             progress(f"{record['scene']} {record['status']}{why}{failed}", totals.ended, totals.total)

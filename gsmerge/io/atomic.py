@@ -41,6 +41,10 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         yield temporary
         _refuse(path, overwrite)  # somebody else may have been quicker
         temporary.replace(path)
+    except SceneError as error:
+        if error.path != str(temporary):
+            raise
+        raise SceneError(path, error.problem, error.remedy) from error  # nobody knows the other name
     except OSError as error:
         if error.errno not in _DISK_ERRORS and error.filename != str(temporary):
             raise

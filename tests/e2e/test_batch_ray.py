@@ -1,0 +1,108 @@
+"""A batch on a real Ray cluster of this machine, of which a process or a node is killed."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from batches import FAST, finish, holders, records, results, start, statuses
+
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
+NAMES = [f"room{number}.ply" for number in range(4)]
+PATIENCE = 180  # seconds, on a machine that is busy with other things
+
+
+@pytest.fixture(scope="module")
+def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four folders with small scenes. Read only."""
+    folder = tmp_path_factory.mktemp("ray") / "rooms"
+    for number in range(4):
+        make_scene(folder / f"room{number}", num_views=3, width=96, height=64, seed=number)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(rooms: Path) -> dict[str, str]:
+    """What a run without Ray makes of them."""
+    out = rooms.parent / "undisturbed"
+    assert finish(rooms, "--out", out, *FAST, "-q") == 0
+    return results(out)
+
+
+@needs_ray
+def test_a_killed_process_is_survived(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
+    process = start(rooms, "--out", tmp_path, *FAST, "--engine", "ray", "-q")
+    deadline = time.monotonic() + PATIENCE
+    while not (found := holders(tmp_path)):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    os.kill(found[0], signal.SIGKILL)
+    assert (process.communicate()[0], process.returncode) == ("", 0)
+    assert results(tmp_path) == undisturbed
+    assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
+    assert len({record["pid"] for record in records(tmp_path)} - {process.pid}) >= 1
+    assert max(record["attempt"] for record in records(tmp_path)) == 2
+
+
+CLUSTER = """
+import sys, threading, time
+from pathlib import Path
+from ray.cluster_utils import Cluster
+from batches import holders
+from gsmerge.cli import main
+
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+other = cluster.add_node(num_cpus=1)
+rooms, out, *told = sys.argv[1:]
+
+def strike():
+    while len(holders(Path(out))) < 2:  # one processor each, so one on each node
+        time.sleep(0.005)
+    cluster.remove_node(other, allow_graceful=False)
+
+threading.Thread(target=strike, daemon=True).start()
+code = main(["batch", rooms, "--out", out, "--engine", "ray", "--address", cluster.address, *told])
+print("nodes:", len(cluster.list_all_nodes()))
+cluster.shutdown()
+sys.exit(code)
+"""
+
+
+@needs_ray
+def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undisturbed: dict[str, str]) -> None:
+    paths = os.pathsep.join([str(root), str(root / "tests"), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", CLUSTER, str(rooms), str(tmp_path), *FAST, "-q"],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": paths},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "nodes: 1" in done.stdout
+    assert results(tmp_path) == undisturbed
+    assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
+    assert max(record["attempt"] for record in records(tmp_path)) == 2
+
+
+@needs_ray
+def test_no_cluster_at_the_address_is_told(rooms: Path, tmp_path: Path) -> None:
+    process = start(rooms, "--out", tmp_path / "out", *FAST, "--engine", "ray", "--address", "127.0.0.1:1", "-q")
+    errors = process.communicate()[1]
+    assert process.returncode == 3
+    assert "127.0.0.1:1: no Ray cluster answers there" in errors
+
+
+def test_without_ray_one_line_says_what_to_install(rooms: Path, tmp_path: Path) -> None:
+    code = "import sys; sys.modules['ray'] = None\n"
+    code += "from gsmerge.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "batch", str(rooms), "--out", str(tmp_path / "out"), "--engine", "ray"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "gsmerge: error: engine ray: Ray is not installed; pip install 'gsmerge[ray]'\n"
+    assert not (tmp_path / "out").exists()
