@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmerge.batch.locks import BusyError, scene_lock
+from gsmerge.batch.locks import PATIENCE, BusyError, scene_lock
 from gsmerge.batch.records import DONE, FAILED, SKIPPED, SUMMARY, each_record
+from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.atomic import remove_leftovers
 from gsmerge.report import human_bytes
@@ -90,13 +92,29 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def write_summary(folder: Path) -> Path | None:
-    """Write the newest state of every scene in the folder; None if another run is writing it.
+def write_summary(folder: Path) -> Path:
+    """Write the newest state of every scene in the folder, after other runs that are at it.
 
     Raises:
         SceneError: If the file cannot be written.
     """
     path = folder / SUMMARY
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            with scene_lock(folder, [SUMMARY]) as lock:
+                remove_leftovers(path)
+                _write_rows(path, _newest(folder))
+                lock.finish()
+                return path
+        except BusyError:
+            if time.monotonic() > deadline:
+                raise SceneError(path, "another run has been writing it for long", "run the same again") from None
+            time.sleep(0.05)
+
+
+def _newest(folder: Path) -> list[dict[str, Any]]:
+    """The newest row of every scene, by the name of its result."""
     rows: dict[str, dict[str, Any]] = {}
     done: dict[str, dict[str, Any]] = {}
     for record in each_record(folder):
@@ -104,20 +122,17 @@ def write_summary(folder: Path) -> Path | None:
         if record["status"] == DONE:
             done[record["output"]] = row
         rows[record["output"]] = done.get(record["output"], row) if record["status"] == SKIPPED else row
-    try:
-        with scene_lock(folder, [SUMMARY]) as lock:
-            remove_leftovers(path)
-            with (
-                atomic_output(path, overwrite=True) as temporary,
-                temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
-            ):
-                writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows[output] for output in sorted(rows))
-            lock.finish()
-    except BusyError:
-        return None
-    return path
+    return [rows[output] for output in sorted(rows)]
+
+
+def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    with (
+        atomic_output(path, overwrite=True) as temporary,
+        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+    ):
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def summary_lines(totals: Totals, path: Path | None) -> list[str]:

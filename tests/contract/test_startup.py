@@ -28,7 +28,7 @@ def loaded_after(code: str) -> set[str]:
         [],
         *(
             [name, "--help"]
-            for name in ("compact", "inspect", "segment", "render", "preview", "chart", "generate", "train")
+            for name in ("compact", "batch", "inspect", "segment", "render", "preview", "chart", "generate", "train")
         ),
     ],
     ids=" ".join,
