@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -166,13 +166,11 @@ def serve(pipe: Connection, work: Work) -> None:
     os.dup2(2, 1)  # stdout is the run's: nobody prints into its lines
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     later = Index(work.folder, work.start)
-    while True:
-        try:
+    with suppress(EOFError, OSError):  # the run has ended
+        while True:
             task = pipe.recv()
-        except (EOFError, OSError):
-            return
-        pipe.send(BEGUN)
-        pipe.send(run_task(task, work, later))
+            pipe.send(BEGUN)
+            pipe.send(run_task(task, work, later))
 
 
 def _end_with(parent: BaseProcess | None) -> None:

@@ -20,7 +20,7 @@ from gsmerge.errors import SceneError, UsageError
 
 try:
     import fcntl
-except ImportError:  # not a POSIX system: nobody else is expected
+except ImportError:  # not a POSIX system
     fcntl = None  # type: ignore[assignment]
 
 LOCKS = ".batch"
@@ -107,7 +107,7 @@ def _locked(descriptor: int, path: Path, *, shared: bool) -> bool:
         SceneError: If the file system knows no locks.
     """
     if fcntl is None:
-        return True
+        raise SceneError(path, "expected a system with file locks, found none", "run batches on Linux or macOS")
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except OSError as error:

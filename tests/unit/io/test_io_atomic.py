@@ -8,6 +8,7 @@ import pytest
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
+from gsmerge.io.atomic import remove_leftovers
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -77,6 +78,33 @@ def test_a_disk_error_while_writing_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"out\.txt: could not be written \(No space left"):
         write_half_and_fail(tmp_path / "out.txt", OSError(errno.ENOSPC, "No space left on device"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_writer_inside_says_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    """Writers that are atomic themselves know the temporary file only."""
+    with pytest.raises(SceneError) as raised, atomic_output(tmp_path / "out.ply") as temporary:
+        raise SceneError(temporary, "could not be written (No space left on device)")
+    assert str(raised.value) == f"{tmp_path / 'out.ply'}: could not be written (No space left on device)"
+    with pytest.raises(SceneError, match="other.ply"), atomic_output(tmp_path / "out.ply"):
+        raise SceneError(tmp_path / "other.ply", "no such file")
+
+
+def test_leftovers_of_one_output_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    left = [".a[1]-00112233.ply", "..a[1]-00112233-44556677.ply"]
+    others = [
+        "a[1].ply",
+        ".a[1]-0011223.ply",
+        ".a1-00112233.ply",
+        ".a[1]-00112233.png",
+        ".b-00112233.ply",
+        "a[1]-x.ply",
+    ]
+    for name in (*left, *others):
+        (tmp_path / name).touch()
+    remove_leftovers(tmp_path / "a[1].ply")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
+    with pytest.raises(SceneError, match="temporary files cannot be removed"):
+        remove_leftovers(tmp_path / "gone" / "a.ply")
 
 
 def test_an_error_of_the_caller_stays_what_it_is(tmp_path: Path) -> None:
