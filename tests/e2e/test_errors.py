@@ -32,7 +32,7 @@ class Broken:
 def test_failures_inside_the_work(
     error: BaseException, code: int, line: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.pipeline.compact", Broken(error))
+    monkeypatch.setattr("gsmerge.files.compact", Broken(error))
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--quiet")
     assert (outcome.code, outcome.err, outcome.out) == (code, line, "")
@@ -40,7 +40,7 @@ def test_failures_inside_the_work(
 
 
 def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.pipeline.compact", Broken(KeyError("lost")))
+    monkeypatch.setattr("gsmerge.files.compact", Broken(KeyError("lost")))
     outcome = run("compact", scene_copy, "--quiet", "--debug")
     assert outcome.code == 1
     assert outcome.err.startswith("Traceback (most recent call last):")
@@ -52,7 +52,7 @@ def test_failures_while_writing_leave_nothing(scene_copy: Path, run: Run, monkey
         Path(path).write_bytes(b"ply\n")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.io.write_ply", half)
+    monkeypatch.setattr("gsmerge.files.write_ply", half)
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--quiet", "--superpixels", 40, "--fit", "none", "--no-robust")
     assert outcome.code == 3

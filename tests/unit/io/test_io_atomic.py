@@ -85,7 +85,7 @@ def test_what_a_writer_inside_says_names_the_file_that_was_asked_for(tmp_path: P
     with pytest.raises(SceneError) as raised, atomic_output(tmp_path / "out.ply") as temporary:
         raise SceneError(temporary, "could not be written (No space left on device)")
     assert str(raised.value) == f"{tmp_path / 'out.ply'}: could not be written (No space left on device)"
-    with pytest.raises(SceneError, match="other.ply"), atomic_output(tmp_path / "out.ply"):
+    with pytest.raises(SceneError, match="other"), atomic_output(tmp_path / "out.ply"):
         raise SceneError(tmp_path / "other.ply", "no such file")
 
 
