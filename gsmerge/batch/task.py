@@ -193,8 +193,11 @@ def tidy(task: Task, work: Work) -> None:
 
 
 def _finish(lock: Lock, task: Task, work: Work) -> None:
-    """The lock's file goes, unless it says that a result without a record is ours."""
-    if task.known is not None or not os.path.lexists(work.folder / task.job.output):
+    """The lock's file goes, unless it is all that says that a result is ours."""
+    later = Index(work.folder, work.start)
+    later.read_on()
+    recorded = task.known is not None or task.job.output in later.known
+    if recorded or not os.path.lexists(work.folder / task.job.output):
         lock.finish()
 
 

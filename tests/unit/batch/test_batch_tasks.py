@@ -297,6 +297,20 @@ def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
     assert list(out.iterdir()) == []
 
 
+def test_who_is_stopped_between_result_and_record_leaves_the_lock_that_says_whose_it_is(scene: Path, out: Path) -> None:
+    task, work, _ = one_task(scene, out)
+    with scene_lock(out, ["room.ply"]) as lock:
+        (out / "room.ply").write_bytes(b"ours")
+    tidy(task, work)
+    assert lock.path.exists()
+    assert run(scene, out)["status"] == DONE
+    assert not lock.path.exists()
+    with scene_lock(out, ["room.ply"]):
+        pass  # killed when the record was written
+    tidy(task, work)
+    assert list(results(out)) == ["room.ply"]
+
+
 class Script:
     """A pool whose tasks end as it is told, in order; a scene without a script is done."""
 
