@@ -40,8 +40,8 @@ class TrainOptions:
         crop: Merged Feature Gaussians of a crop: the nearest to one of them.
         inner: Share of a crop that is judged; the rest are neighbours.
         turn_weight: Weight of the rotation in the loss: axes of like length have none.
-        photo_start: Share of the steps after which renders are compared with photos; 1: never. Steps of regression
-            alone before that made renders worse than none did (one run of 400 steps each).
+        photo_start: Share of the steps after which renders are compared with photos; 1: never. Of two runs of
+            400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.
         novel: Share of the windows that are in novel views, where there are any.
         photo_scale: Sides of the photos are divided by it.
         window: Side of a window of a photo that is rendered, pixels.
