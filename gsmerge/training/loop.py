@@ -1,7 +1,7 @@
 """The training run: AdamW on random crops, validation, checkpoints; killed at any time, it goes on where it was.
 
-The first steps learn from what the fit changed. Regression to a mean overshoots what is ambiguous, so later ones
-compare renders with photos.
+The first steps, if so wanted, learn from what the fit changed alone. Regression to a mean overshoots what is ambiguous,
+so all others compare renders with photos.
 
 Every random number hangs on the seed and the step, and crops are worked on alone and added up in order. So a run that
 was interrupted ends with the same bytes as one that was not, on any number of threads.
