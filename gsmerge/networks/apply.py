@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.geometry import rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
 from gsmerge.networks.residuals import HALF, RESIDUAL, bounded, move_features, move_gaussians, squashed
@@ -112,6 +113,8 @@ def with_encoding(
 
 def match_geometry(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
     """Feature Gaussians as the K = 1 head would decode them, for matching (paper section 4.3)."""
+    if learned.networks.options.outputs == "absolute":
+        return features  # a head that begins at nothing says nothing of moments
     described = learned.describe(features)
     residuals = head_residuals(described.base, np.arange(len(features)), features, described, learned)
     return move_features(features, described.base, residuals, described.frames)
@@ -236,8 +239,34 @@ def decode_gaussians(
         learned: The networks and the scene.
     """
     described = learned.describe(features)
+    children = head_starts(children, parents, features, described, learned.networks)
     residuals = head_residuals(children, parents, features, described, learned)
     return move_gaussians(children, residuals, described.frames[torch.from_numpy(parents)])
+
+
+def head_starts(
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, networks: Networks
+) -> Gaussians:
+    """What the heads correct: the children; for absolute outputs a round grey Gaussian in the place of each.
+
+    It stands at its group's place, as large as the group, half transparent, with the axes of the group's frame. Those
+    of the backing layer, and five or more of one parent, stay: no head looks at them.
+    """
+    if networks.options.outputs == "residual":
+        return children
+    sizes = np.bincount(parents, minlength=len(features))[parents]
+    taken = torch.from_numpy((sizes <= SLOTS[-1]) & ~features.backing.numpy()[parents])
+    own = torch.from_numpy(parents)
+    place, size = described.base.means[own], described.sizes[own, None].expand(-1, 3)
+    axes = rotmat_to_quat(described.frames.double())[own].to(children.quats)
+    return replace(
+        children,
+        means=torch.where(taken[:, None], place, children.means),
+        quats=torch.where(taken[:, None], axes, children.quats),
+        scales=torch.where(taken[:, None], size, children.scales),
+        opacities=torch.where(taken, 0.5, children.opacities),
+        sh0=torch.where(taken[:, None, None], 0.0, children.sh0),
+    )
 
 
 def head_residuals(
@@ -258,7 +287,7 @@ def head_residuals(
         raw = _head_outputs(slots, children, (rows, ids, mask), features, described, networks)
         taken = torch.from_numpy(mask.reshape(-1))
         where = torch.from_numpy(ids.reshape(-1))[taken]
-        residuals = residuals.index_copy(0, where, bounded(raw[taken], networks.options.bounds))
+        residuals = residuals.index_copy(0, where, bounded(raw[taken], networks.options.head_bounds))
     return residuals
 
 
