@@ -100,7 +100,7 @@ def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
     parts, shifts = with_encoding(parts, described, encoder_outputs(parts, described, learned), networks)
     merged, corrections = _merged(parts, described, shifts, Matches(local, len(crop.rows)), learned)
     described = learned.describe(merged)
-    raw = refiner_outputs(merged, described, nearest(merged, networks.options.neighbors), networks)
+    raw = refiner_outputs(merged, described, nearest(merged, networks.options.neighbors), learned)
     refined, residuals = with_corrections(merged, described, raw, networks)
     described = learned.describe(refined)
     analytic = example.levels[crop.k].children[crop.children]

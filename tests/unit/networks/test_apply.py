@@ -319,3 +319,19 @@ def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
 def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:
     """The Feature Gaussian of each child."""
     return divide(features, scene.members, np.full(len(features), k))[1]
+
+
+def test_half_the_digits_give_nearly_the_same(scene: Made) -> None:
+    """Only the networks' own arithmetic is rounded: what they correct keeps all its digits."""
+    exact = scene.learned(noisy())
+    rough = replace(exact, precision="bfloat16")
+    options = DecodeOptions(k=2, min_opacity=0.0)
+    found = [
+        decode(encode_features(scene.features, learned), scene.members, options, learned=learned)
+        for learned in (exact, rough)
+    ]
+    assert found[1].means.dtype == torch.float32
+    assert not torch.equal(found[0].means, found[1].means)
+    sizes = found[0].scales.amax(1, keepdim=True)
+    assert float(((found[0].means - found[1].means) / sizes).abs().max()) < 0.1
+    assert float((found[0].opacities - found[1].opacities).abs().max()) < 0.1
