@@ -40,7 +40,8 @@ class CompactOptions:
         target: What decides the number of Gaussians.
         method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
-        checkpoint: File of trained networks that correct what the analytic stages make; ``"none"``: those alone.
+        checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
+            come with the package; ``"none"``: the analytic stages alone; ``"auto"``: see :attr:`networks`.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
             faster on processors that know it.
@@ -82,6 +83,21 @@ class CompactOptions:
         asked |= {"target psnr": self.target.target_psnr is not None, "max drop": self.target.max_drop is not None}
         for name in (name for name, wanted in asked.items() if wanted):
             raise ValueError(f"method {self.method}: expected a budget, a preset or a density, got {name}")
+
+    @property
+    def networks(self) -> str:
+        """The checkpoint to use: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
+
+        That is not where time counts most (drafts, fast runs), and not where the photos choose the merge.
+        """
+        if self.checkpoint != "auto":
+            return self.checkpoint
+        hasty = self.fit.effort in ("draft", "fast")
+        return (
+            "none"
+            if hasty or self.robust.robust or self.fit.fit == "color" or self.encode.rule != "depth"
+            else "shipped"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""

@@ -169,11 +169,12 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
     with journal.stage("prepare"):
         ready = make_ready(scene, settings)
         canonical, frame, options = ready.scene, ready.frame, ready.options
-        journal.notes += ready.notes
+        checkpoint, notes = find_checkpoint(options.networks, required=options.require_checkpoint)
+        journal.notes += [*ready.notes, *notes]
+        if checkpoint is not None and options.robust.robust is None:  # the networks do what the choice was for
+            options = replace(options, robust=replace(options.robust, robust=False))
         canvas = scene_canvas(canonical, options)
     members = scene_members(canonical) if isinstance(canonical, PixelScene) else None
-    checkpoint, notes = find_checkpoint(settings.checkpoint, required=settings.require_checkpoint)
-    journal.notes += notes
     source = Source(canonical, members, checkpoint)
     plain = not target.searches and options.decode.k != "auto" and canvas.limit is None
     tree = None

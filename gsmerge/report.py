@@ -211,7 +211,7 @@ def plan_document(
     Args:
         files: Paths of the ``ply``, the ``cameras`` and the ``images``.
         grid: Views, height and width of the Gaussian grid.
-        options: All settings by flat name, as of ``CompactOptions.to_dict()``.
+        options: All settings by flat name, as of ``CompactOptions.to_dict()``, but the checkpoint that is used.
         output_path: The ``.ply`` that would be written.
         per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.
@@ -231,9 +231,11 @@ def plan_document(
     method, at_most = options["method"], usual if wanted is None else wanted
     fit, robust = _fit_of(method, options, photos), False
     if method == "gsmerge":
-        robust = photos and (fit != "full" if options["robust"] is None else options["robust"])
+        learned = options["checkpoint"] != "none"
+        usual_robust = fit != "full" and options["effort"] != "draft" and not learned
+        robust = photos and (usual_robust if options["robust"] is None else options["robust"])
         work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * robust
-        work += COST_NETWORKS * (options["checkpoint"] != "none")
+        work += COST_NETWORKS * learned
     else:
         work = COST_RIVALS.get(method, COST_RIVAL)
         at_most = pixels if method.startswith("unmerged") else at_most

@@ -43,6 +43,7 @@ def compact(
     levels: opt.LevelsOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
+    geometry: opt.GeometryOption = None,
     fit: opt.FitOption = None,
     device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
@@ -89,7 +90,14 @@ def compact(
         "require_checkpoint": require_checkpoint or None,
         "precision": precision,
     }
-    chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
+    chosen |= {
+        "robust": robust,
+        "match": match,
+        "geometry": geometry,
+        "fit": fit,
+        "fit_steps": fit_steps,
+        "time_budget": time_budget,
+    }
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}
     chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads, "unseen": unseen}
     settings = settings_of(chosen)
@@ -218,7 +226,7 @@ def _print_plan(
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
-        settings.to_dict(),
+        settings.to_dict() | {"checkpoint": settings.networks},
         output_path=out,
         per_view=asked_per_view(scene, settings) if len(scene) else 0,
         photos=scene.images is not None,

@@ -74,6 +74,13 @@ class Match(str, Enum):
     none = "none"
 
 
+class Geometry(str, Enum):
+    """What is matched where networks are loaded."""
+
+    analytic = "analytic"
+    decoded = "decoded"
+
+
 class Unseen(str, Enum):
     """Choices of ``--unseen``."""
 
@@ -323,13 +330,21 @@ RobustOption = Annotated[
     typer.Option(
         "--robust/--no-robust",
         help="Choose among merges by what the photos say.",
-        show_default="unless --fit full or a draft",
+        show_default="unless --fit full, a draft or networks",
         rich_help_panel=MERGING,
     ),
 ]
 MatchOption = Annotated[
     Match | None,
     typer.Option(help="Merging across views.", show_default="overlap, none for a draft", rich_help_panel=MERGING),
+]
+GeometryOption = Annotated[
+    Geometry | None,
+    typer.Option(
+        help="What is matched where networks are loaded: moments, or what the K = 1 head makes of them.",
+        show_default="analytic",
+        rich_help_panel=MERGING,
+    ),
 ]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
@@ -345,8 +360,9 @@ MethodOption = Annotated[
 CheckpointOption = Annotated[
     str | None,
     typer.Option(
-        metavar="FILE|none",
-        help="Trained networks that correct what the analytic stages make; none: those alone.",
+        metavar="FILE|NAME",
+        help="Trained networks that correct what the analytic stages make: a file, shipped, none, or auto: the "
+        "shipped ones where they gain.",
         show_default="none",
         rich_help_panel=MERGING,
     ),

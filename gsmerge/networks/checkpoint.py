@@ -23,6 +23,7 @@ from gsmerge.networks.options import NetworkOptions
 SCHEMA = 1  # of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --checkpoint none"
+SHIPPED = Path(__file__).with_name("shipped.safetensors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,8 @@ class Checkpoint:
     def facts(self) -> dict[str, Any]:
         """What a report says of it."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
-        head = {"checkpoint": str(self.path), "schema": SCHEMA, "gsmerge": self.version}
+        name = "shipped" if self.path == SHIPPED else str(self.path)
+        head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
         return head | sizes | {"training": dict(self.training)}
 
 
@@ -119,7 +121,7 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     """The checkpoint that was asked for and what to tell the user; None where the analytic stages work alone.
 
     Args:
-        name: A file, or ``"none"``.
+        name: A file, ``"shipped"``: the one in the package, or ``"none"``.
         required: A checkpoint that cannot be used is an error; otherwise it is told, and the stages work without.
 
     Raises:
@@ -128,7 +130,7 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     if name == "none":
         return None, []
     try:
-        return load_checkpoint(name), []
+        return load_checkpoint(SHIPPED if name == "shipped" else name), []
     except SceneError as error:
         if required:
             raise

@@ -98,11 +98,15 @@ def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device", "checkpoint", "precision"}
+    known |= {"levels", "device", "checkpoint", "precision", "geometry"}
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None
-    worded = {"robust": "unless --fit full or a draft", "fit_steps": "by effort", "match": "overlap, none for a draft"}
+    worded = {
+        "robust": "unless --fit full, a draft or networks",
+        "fit_steps": "by effort",
+        "match": "overlap, none for a draft",
+    }
     real = {name: worded.get(name, str(library[name])) for name in told}
     assert told == real
 
