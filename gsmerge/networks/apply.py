@@ -113,7 +113,7 @@ def with_encoding(
 def match_geometry(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
     """Feature Gaussians as the K = 1 head would decode them, for matching (paper section 4.3)."""
     described = learned.describe(features)
-    residuals = head_residuals(described.base, np.arange(len(features)), features, described, learned)
+    residuals = head_residuals(described.base, np.arange(len(features)), features, described, learned.networks)
     return move_features(features, described.base, residuals, described.frames)
 
 
@@ -235,16 +235,22 @@ def decode_gaussians(
         features: The Feature Gaussians.
         learned: The networks and the scene.
     """
-    described = learned.describe(features)
-    residuals = head_residuals(children, parents, features, described, learned)
+    return decode_described(children, parents, features, learned.describe(features), learned.networks)
+
+
+def decode_described(
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, networks: Networks
+) -> Gaussians:
+    """:func:`decode_gaussians` of Feature Gaussians that are described already."""
+    residuals = head_residuals(children, parents, features, described, networks)
     return move_gaussians(children, residuals, described.frames[torch.from_numpy(parents)])
 
 
 def head_residuals(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, networks: Networks
 ) -> Tensor:
     """``[n,13]`` bounded corrections of children; zero for the backing layer and for five or more of one parent."""
-    networks, count = learned.networks, len(children)
+    count = len(children)
     sizes = np.bincount(parents, minlength=len(features))
     first = np.cumsum(sizes) - sizes
     residuals = torch.zeros(count, RESIDUAL)

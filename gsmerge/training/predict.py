@@ -103,13 +103,13 @@ def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
     refined, residuals = with_corrections(merged, described, raw, networks)
     described = learned.describe(refined)
     if crop.k == 1:
-        heads = head_residuals(described.base, np.arange(len(refined)), refined, described, learned)
+        heads = head_residuals(described.base, np.arange(len(refined)), refined, described, networks)
         before = corrections + residuals
         last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
         return Foreseen(before + heads, move_gaussians(described.base, last, described.frames))
     children = example.levels[crop.k].children[crop.children]
     parents = torch.searchsorted(crop.rows, example.levels[crop.k].parents[crop.children])
-    heads = head_residuals(children, parents.numpy(), refined, described, learned)
+    heads = head_residuals(children, parents.numpy(), refined, described, networks)
     return Foreseen(heads, move_gaussians(children, heads, described.frames[parents]))
 
 

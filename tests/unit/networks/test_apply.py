@@ -252,7 +252,7 @@ def test_gradients_reach_every_parameter(scene: Made) -> None:
         sizes = np.full(len(features), k)
         parents = np.repeat(np.arange(len(features)), sizes)
         base = feature_to_gaussians(scene.features)[torch.from_numpy(parents)]
-        total = total + head_residuals(base, parents, features, described, learned).square().sum()
+        total = total + head_residuals(base, parents, features, described, networks).square().sum()
     merged = merge(features, pairs(features), learned)
     total = total + refine_features(merged, learned).latents.square().sum()
     total.backward()

@@ -95,7 +95,7 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     with torch.no_grad():
         found = predicted(crop, networks, 5)
     described = learned.describe(refined)
-    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, learned)
+    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, networks)
     torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
     first = replace(crop, k=1, children=everything, judged=example.levels[1].mask)
     with torch.no_grad():
