@@ -36,12 +36,14 @@ def divide_all(features: FeatureGaussians, members: Members, most: int, rule: Ru
         grown, first = found == number, np.cumsum(found) - found
         if number == 2:
             alone = rows[~grown]
-            whole = pool_children(features, members, *gather_groups(starts, ids, first[~grown]), alone, rule)
+            own_starts, own = gather_groups(starts, ids, first[~grown])
+            whole = pool_children(features, members, own_starts, own, alone, rule)
         rows, before = rows[grown], sizes[grown]
         sizes = np.diff(starts)[first[grown, None] + np.arange(number)]
         slot = np.argmax(sizes[:, :-1] != before, axis=1)  # the run that got smaller is the one that was split
         pairs = (first[grown] + slot)[:, None] + np.arange(2)
-        parts.append(pool_children(features, members, *gather_groups(starts, ids, pairs.ravel()), rows.repeat(2), rule))
+        own_starts, own = gather_groups(starts, ids, pairs.ravel())
+        parts.append(pool_children(features, members, own_starts, own, rows.repeat(2), rule))
         owners.append(rows)
         slots.append(slot)
     owner = np.concatenate(owners)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsmerge.canonical import Frame
@@ -112,3 +113,9 @@ class Encoded:
     def num_most(self) -> int:
         """Most Gaussians that it decodes to."""
         return len(self) + len(self.division.slots) + self.num_kept
+
+
+def without_members(features: FeatureGaussians) -> FeatureGaussians:
+    """Feature Gaussians that know of no members."""
+    starts = torch.zeros(len(features) + 1, dtype=torch.int64)
+    return replace(features, starts=starts, members=torch.zeros(0, dtype=torch.int64))

@@ -34,6 +34,8 @@ MINOR = 0  # what was added since
 FORMAT = "gsmerge-encoded"
 REMEDY = "copy it again, or encode the scene again"
 SUFFIX = ".gsm"
+MAX_COUNT = 1 << 40
+PREFIXES = ("features.", "division.", "kept.", "cameras.", "frame.", "heads.", "networks.")
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views", "backing"))
 Take = Callable[..., Tensor]
@@ -96,7 +98,8 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
     try:
         with safe_open(path, "pt") as file:
             header = _header(path, file.metadata() or {})
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            known = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
+            tensors = {name: file.get_tensor(name) for name in known}
     except (SafetensorError, OSError, ValueError) as error:
         told = str(error).splitlines()[0]
         raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({told})", REMEDY) from error
@@ -141,17 +144,16 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _settings(path: Path, told: Mapping[str, Any]) -> StoredSettings:
     """The settings that are known here, each within its range."""
-    limit, share = 1 << 40, {"min_opacity", "prune"}
     found: dict[str, Any] = {}
     for f in fields(StoredSettings):
-        value = told.get(f.name)
-        least, most = {"k": (1, MAX_CHILDREN), "most": (1, MAX_CHILDREN)}.get(f.name, (0, 1 if f.name in share else limit))
-        if f.name == "k" and value == "auto" or f.name in ("wanted", "places") and f.name in told and value is None:
-            found[f.name] = value
-            continue
-        kind = int | float if f.name in share else int
-        if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
-            raise SceneError(path, f"{f.name}: expected a number from {least} to {most}, found {value!r:.40}", REMEDY)
+        value, share = told.get(f.name), f.name in ("min_opacity", "prune")
+        least, most = (1, MAX_CHILDREN) if f.name in ("k", "most") else (0, 1 if share else MAX_COUNT)
+        absent = value is None and f.name in told and f.name in ("wanted", "places")
+        if not absent and not (f.name == "k" and value == "auto"):
+            number = isinstance(value, int | float if share else int) and not isinstance(value, bool)
+            if not number or not least <= value <= most:  # type: ignore[operator]
+                problem = f"{f.name}: expected a number from {least} to {most}, found {value!r:.40}"
+                raise SceneError(path, problem, REMEDY)
         found[f.name] = value
     return StoredSettings(**found)
 
