@@ -200,6 +200,7 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 def print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
+    """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import check_scene, find_baseline, unused_notes
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
     from gsmerge.io import load_files

@@ -32,7 +32,9 @@ def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> byte
     largest, others = smallest_three(columns.quats)
     words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / np.sqrt(2.0) + 0.5, (10, 10, 10))
     words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
-    harmonics = to_bytes(np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1).reshape(count, -1))
+    harmonics = to_bytes(
+        np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1).reshape(count, num_rest)
+    )
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element chunk {len(chunks)}", *(f"property float {name}" for name in (*RANGES, *COLORS))]
     header += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]

@@ -20,21 +20,21 @@ from gsmerge.types import SH_C0, Gaussians
 
 MAX_DEGREE = 3  # of four degrees older readers know nothing
 MAGIC, VERSION = 0x5053474E, 3
-MAX_FRACTION = 20  # bits behind the point
+FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
+MAX_FRACTION = 23
 LARGEST = 2**23 - 1
 COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 
 
 def spz_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.spz`` file. Positions keep as many bits behind the point as the farthest one leaves.
+    """Content of a ``.spz`` file.
 
     Raises:
         ValueError: If there is NaN or inf.
     """
     columns = columns_of(gaussians, MAX_DEGREE)
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
-    farthest = max(float(np.abs(columns.means).max(initial=0)), 1e-6)
-    fraction = int(np.clip(np.floor(np.log2(LARGEST / farthest)), 0, MAX_FRACTION))
+    fraction = _fraction_bits(columns.means)
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(columns), degree, fraction, 0, 0)
     parts = [
         _positions(columns, fraction),
@@ -45,6 +45,16 @@ def spz_bytes(gaussians: Gaussians) -> bytes:
         _harmonics(columns.harmonics),
     ]
     return gzip.compress(header + b"".join(parts), mtime=0)  # the same bytes at any time
+
+
+def _fraction_bits(means: np.ndarray) -> int:
+    """Bits behind the point: as many as the scene's size asks for and its farthest Gaussian leaves."""
+    if len(means) == 0:
+        return 0
+    size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
+    wanted = FINE - np.log2(max(size, 1e-6))
+    left = np.log2(LARGEST / max(np.abs(means).max(), 1e-6))
+    return int(np.clip(min(np.ceil(wanted), np.floor(left)), 0, MAX_FRACTION))
 
 
 def _positions(columns: Columns, fraction: int) -> bytes:

@@ -37,7 +37,8 @@ def encode_scene(
     """All of :func:`gsmerge.compact` up to decoding, kept: superpixels, merging, matching, networks; never a fit.
 
     ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", **settings)``, bit for bit; so is
-    any other ``k`` at decoding where no budget, preset or ``k="auto"`` shaped the superpixels.
+    any other ``k`` at decoding, unless a budget, a preset, ``k="auto"`` or the size of the input limits the number of
+    superpixels of either, or Gaussians that no view sees are kept: these are merged for one K.
 
     Args:
         scene: As of :func:`gsmerge.compact`.

@@ -83,7 +83,7 @@ def _tensors(encoded: Encoded) -> dict[str, Tensor]:
     if heads is not None:
         found |= {"heads.views": heads.views.int(), "heads.group": heads.group.float()}
         found |= {f"networks.{name}": tensor for name, tensor in heads.networks.state_dict().items()}
-    return {name: tensor.detach().cpu().contiguous() for name, tensor in found.items()}
+    return {name: tensor.detach().cpu().clone().contiguous() for name, tensor in found.items()}  # none share memory
 
 
 def load_encoded(path: str | PathLike[str]) -> Encoded:
