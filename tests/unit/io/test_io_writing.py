@@ -51,7 +51,7 @@ def drawn(scene: PixelScene, degree: int) -> Gaussians:
 
 def psnr(scene: PixelScene, one: Gaussians, other: Gaussians) -> float:
     a, b = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (one, other))
-    return float(-10 * np.log10(((a - b) ** 2).mean()))
+    return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
 
 
 def tensors(*columns: np.ndarray, harmonics: np.ndarray) -> Gaussians:
