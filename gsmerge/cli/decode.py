@@ -91,7 +91,7 @@ def _run(
     quiet: bool,
 ) -> dict[str, Any]:
     """Read, decode and write; returns the report."""
-    from gsmerge.io import lost_harmonics, write_gaussians
+    from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.report import document_head
     from gsmerge.stored.decode import decode_scene, plan_decode
     from gsmerge.stored.file import load_encoded
@@ -110,12 +110,13 @@ def _run(
     if dry_run:
         most = int(plan.counts.sum()) + encoded.num_kept
         return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
-    with announce_compilation(quiet=quiet):
-        gaussians = decode_scene(encoded, **wish, threads=threads)
-    if len(gaussians) == 0:
-        raise SceneError(path, "expected Gaussians that show something, found none", "encode the scene again")
-    decoded = perf_counter()
-    write_gaussians(out, gaussians, overwrite=overwrite, comments=_comments(encoded))
+    with atomic_output(out, overwrite=overwrite) as temporary:
+        with announce_compilation(quiet=quiet):
+            gaussians = decode_scene(encoded, **wish, threads=threads)
+        if len(gaussians) == 0:
+            raise SceneError(path, "expected Gaussians that show something, found none", "encode the scene again")
+        decoded, ending = perf_counter(), output_format(out)
+        write_gaussians(temporary, gaussians, overwrite=True, comments=_comments(encoded), ending=ending)
     seconds = {"import": imported - start, "read": read - imported, "decode": decoded - read}
     seconds["write"] = perf_counter() - decoded
     return document | {
