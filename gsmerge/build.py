@@ -75,7 +75,8 @@ def merged_groups(
             members = members_of(source.scene, grouping.groups, options)
     learned = None
     if source.checkpoint is not None:
-        learned = Learned(source.checkpoint.networks, members, source.scene.cameras, options.seed)
+        networks, cameras = source.checkpoint.networks, source.scene.cameras
+        learned = Learned(networks, members, cameras, options.seed, options.precision)
         journal.choices["networks"] = source.checkpoint.facts()
     return _merged_features(source.scene, members, grouping, options, journal, learned), members, learned
 

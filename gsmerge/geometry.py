@@ -29,6 +29,23 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
+def rotmat_to_quat(rotations: Tensor) -> Tensor:
+    """Unit quaternions ``[n,4]`` wxyz of rotation matrices ``[n,3,3]``, the largest component positive.
+
+    Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
+    ways = [
+        torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
+        torch.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
+        torch.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
+        torch.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
+    ]
+    best = torch.stack([way[..., k] for k, way in enumerate(ways)], -1).argmax(-1)
+    chosen = torch.stack(ways, -2)[torch.arange(len(best)), best]
+    return torch.nn.functional.normalize(chosen, dim=-1)
+
+
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """Covariances ``R diag(scales)^2 R^T`` (paper section 3).
 

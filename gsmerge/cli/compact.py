@@ -51,6 +51,7 @@ def compact(
     method: opt.MethodOption = None,
     checkpoint: opt.CheckpointOption = None,
     require_checkpoint: opt.RequireCheckpointOption = False,
+    precision: opt.PrecisionOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -87,6 +88,7 @@ def compact(
         "method": method,
         "checkpoint": checkpoint,
         "require_checkpoint": require_checkpoint or None,
+        "precision": precision,
     }
     chosen |= {"robust": robust, "match": match, "fit": fit, "fit_steps": fit_steps, "time_budget": time_budget}
     chosen |= {"budget": budget, "max_bytes": max_bytes, "preset": preset, "levels": levels}

@@ -62,6 +62,7 @@ def encode(
     unseen: opt.UnseenOption = None,
     checkpoint: opt.CheckpointOption = None,
     require_checkpoint: opt.RequireCheckpointOption = False,
+    precision: opt.PrecisionOption = None,
     output: EncodedOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -83,7 +84,7 @@ def encode(
     chosen: dict[str, Any] = {"k": k, "superpixels": superpixels, "density": density, "segmentation": segmentation}
     chosen |= {"effort": effort, "budget": budget, "max_bytes": max_bytes, "preset": preset, "robust": robust}
     chosen |= {"match": match, "unseen": unseen, "checkpoint": checkpoint, "fit": "none", "seed": seed}
-    chosen |= {"require_checkpoint": require_checkpoint or None, "threads": threads}
+    chosen |= {"require_checkpoint": require_checkpoint or None, "precision": precision, "threads": threads}
     settings = settings_of(chosen)
     if dry_run:
         print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)

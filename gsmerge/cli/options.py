@@ -89,6 +89,13 @@ class Fit(str, Enum):
     none = "none"
 
 
+class Precision(str, Enum):
+    """Arithmetic of the networks."""
+
+    float32 = "float32"
+    bfloat16 = "bfloat16"
+
+
 class Device(str, Enum):
     """Where the full fit runs."""
 
@@ -352,6 +359,11 @@ RequireCheckpointOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
+PrecisionOption = Annotated[
+    Precision | None,
+    typer.Option(help="Arithmetic of the networks.", show_default="float32", rich_help_panel=MERGING),
+]
+TrainDeviceOption = Annotated[Device, typer.Option(help="Where the networks run; windows are rendered on the CPU.")]
 UnseenOption = Annotated[
     Unseen | None,
     typer.Option(

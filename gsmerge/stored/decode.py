@@ -11,8 +11,8 @@ from gsmerge.allocate import parse_budget
 from gsmerge.decode import MAX_CHILDREN
 from gsmerge.errors import UsageError
 from gsmerge.fit import shown
-from gsmerge.moments import feature_to_gaussians
-from gsmerge.networks import decode_described, described_by
+from gsmerge.moments import feature_to_gaussians, gaussian_members
+from gsmerge.networks import Learned, decode_described, described_by
 from gsmerge.photos import blank_photos
 from gsmerge.stored.divide import pick_children
 from gsmerge.stored.encoded import Encoded
@@ -117,7 +117,9 @@ def decode_scene(
         if encoded.heads is not None:
             heads = encoded.heads
             described = described_by(features, heads.views, heads.group, encoded.cameras)
-            gaussians = decode_described(gaussians, parents, features, described, heads.networks)
+            nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
+            learned = Learned(heads.networks, nothing, encoded.cameras, precision=heads.precision)
+            gaussians = decode_described(gaussians, parents, features, described, learned)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
         if plan.prune > 0:
             gaussians = gaussians[shown(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]

@@ -111,7 +111,7 @@ def _kept(
     heads = None
     if learned is not None:
         described = learned.describe(features)
-        heads = StoredHeads(learned.networks, described.views, described.group)
+        heads = StoredHeads(learned.networks, learned.precision, described.views, described.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, members, most, options.encode.rule),

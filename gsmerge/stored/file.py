@@ -35,6 +35,7 @@ FORMAT = "gsmerge-encoded"
 REMEDY = "copy it again, or encode the scene again"
 SUFFIX = ".gsm"
 MAX_COUNT = 1 << 40
+PRECISIONS = ("float32", "bfloat16")
 PREFIXES = ("features.", "division.", "kept.", "cameras.", "frame.", "heads.", "networks.")
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views", "backing"))
@@ -62,7 +63,9 @@ def save_encoded(
     about = {**encoded.about, **({} if source is None else {"source": dict(source)})}
     header = {"schema": SCHEMA, "minor": MINOR, "gsmerge": __version__, "settings": asdict(encoded.settings)}
     header |= {"unit": encoded.frame.unit, "width": encoded.cameras.width, "height": encoded.cameras.height}
-    header |= {"networks": None if encoded.heads is None else asdict(encoded.heads.networks.options), "about": about}
+    heads = encoded.heads
+    header |= {"networks": None if heads is None else asdict(heads.networks.options), "about": about}
+    header |= {"precision": "float32" if heads is None else heads.precision}
     data = save(_tensors(encoded), {FORMAT: json.dumps(header)})  # one entry: the order of several is not fixed
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
         file.write(data)
@@ -116,7 +119,7 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
         frame=Frame(take("frame.origin", torch.float64, 3), _unit(path, header["unit"])),
         cameras=cameras,
         settings=settings,
-        heads=_heads(path, take, tensors, header["networks"], features, len(cameras)),
+        heads=_heads(path, take, tensors, header, features, len(cameras)),
         about=header["about"],
     )
 
@@ -135,7 +138,7 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         newer = f"written by gsmerge {str(told.get('gsmerge'))[:40]}; this is {__version__}, update it"
         problem = f"expected schema {SCHEMA}, found {told['schema']}"
         raise SceneError(path, problem, newer if told["schema"] > SCHEMA else REMEDY)
-    kinds = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict, "networks": dict | None}
+    kinds = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict, "networks": dict | None, "precision": str}
     for name, kind in kinds.items():
         if name not in told or not isinstance(told[name], kind):
             raise SceneError(path, f"expected {name} in the header, found {told.get(name)!r:.40}", REMEDY)
@@ -240,15 +243,18 @@ def _heads(
     path: Path,
     take: Take,
     tensors: Mapping[str, Tensor],
-    options: Mapping[str, Any] | None,
+    header: Mapping[str, Any],
     features: FeatureGaussians,
     num_views: int,
 ) -> StoredHeads | None:
     """The networks, if there are any, and what they know of the groups."""
-    if options is None:
+    if header["networks"] is None:
         return None
+    if header["precision"] not in PRECISIONS:
+        problem = f"precision: expected {' or '.join(PRECISIONS)}, found {header['precision']!r:.40}"
+        raise SceneError(path, problem, REMEDY)
     own = {name.removeprefix("networks."): t for name, t in tensors.items() if name.startswith("networks.")}
-    networks = build_networks(path, options, own, REMEDY)
+    networks = build_networks(path, header["networks"], own, REMEDY)
     views = take("heads.views", torch.int32, len(features)).long()
     if len(views) and not 0 <= int(views.min()) <= int(views.max()) < num_views:
         raise SceneError(path, "heads.views: expected views of the scene, found others", REMEDY)
@@ -256,4 +262,5 @@ def _heads(
     if wide != networks.options.latent:
         problem = f"features.latents: expected {networks.options.latent} numbers, as of its networks, found {wide}"
         raise SceneError(path, problem, REMEDY)
-    return StoredHeads(networks, views, take("heads.group", torch.float32, len(features), GROUP))
+    group = take("heads.group", torch.float32, len(features), GROUP)
+    return StoredHeads(networks, header["precision"], views, group)

@@ -119,6 +119,8 @@ DAMAGED: dict[str, Spoil] = {
     "a unit that is none": with_header(unit=float("nan")),
     "no networks": with_header(networks={"width": -1}),
     "networks of another size": with_header(networks={"width": 32, "heads": 2, "latent": 4}),
+    "another precision": with_header(precision="int4"),
+    "no precision": without("precision"),
     "no width": without("width"),
     "views without pixels": with_header(width=0),
     "k of nine": with_settings(k=9),

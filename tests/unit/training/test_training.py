@@ -19,7 +19,7 @@ from gsmerge.merge import merge
 from gsmerge.networks import Learned, NetworkOptions, Networks, load_checkpoint
 from gsmerge.networks.apply import encode_features, head_residuals, refine_features
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussians
-from gsmerge.training import Example, TrainOptions, make_example, preset_options, read_config, train
+from gsmerge.training import Example, TrainOptions, make_example, network_device, preset_options, read_config, train
 from gsmerge.training.examples import differences
 from gsmerge.training.predict import Crop, owners, predicted, random_crop
 from gsmerge.training.subjects import Subject, make_subject
@@ -95,7 +95,7 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     with torch.no_grad():
         found = predicted(crop, networks, 5)
     described = learned.describe(refined)
-    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, networks)
+    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, learned)
     torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
     first = replace(crop, k=1, children=everything, judged=example.levels[1].mask)
     with torch.no_grad():
@@ -265,3 +265,22 @@ def test_rate_rises_and_falls() -> None:
     assert rates[0] == pytest.approx(OPTIONS.rate / 10)
     assert rates[-1] < 0.01 * OPTIONS.rate
     assert (np.diff(rates[10:]) < 0).all()
+
+
+def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there, told in ((False, "cpu"), (True, "cuda")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert network_device("cpu") == "cpu"
+        assert network_device("auto") == told
+    assert network_device("cuda") == "cuda"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for wanted in ("cuda", "tpu"):
+        with pytest.raises(ValueError, match="device: expected"):
+            network_device(wanted)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_training_on_cuda(example: Example, tmp_path: Path) -> None:
+    on_cpu, on_cuda = (train([example], [], tmp_path / device, OPTIONS, device=device) for device in ("cpu", "cuda"))
+    assert on_cuda.loss == pytest.approx(on_cpu.loss, rel=0.05)
+    assert load_checkpoint(on_cuda.best).networks.num_parameters > 0
