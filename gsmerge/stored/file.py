@@ -138,7 +138,15 @@ def _header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         newer = f"written by gsmerge {str(told.get('gsmerge'))[:40]}; this is {__version__}, update it"
         problem = f"expected schema {SCHEMA}, found {told['schema']}"
         raise SceneError(path, problem, newer if told["schema"] > SCHEMA else REMEDY)
-    kinds = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict, "networks": dict | None, "precision": str}
+    kinds = {
+        "settings": dict,
+        "unit": float,
+        "width": int,
+        "height": int,
+        "about": dict,
+        "networks": dict | None,
+        "precision": str,
+    }
     for name, kind in kinds.items():
         if name not in told or not isinstance(told[name], kind):
             raise SceneError(path, f"expected {name} in the header, found {told.get(name)!r:.40}", REMEDY)

@@ -94,7 +94,9 @@ def test_the_same_without_photos(settings: dict[str, Any], bare: PixelScene) -> 
     assert_equal_to_compact(bare, **settings)
 
 
-@pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"k": 4}, {"budget": "7%"}, {"precision": "bfloat16"}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{"k": 1}, {"k": 2}, {"k": 4}, {"budget": "7%"}, {"precision": "bfloat16"}], ids=str
+)
 def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: PixelScene, tmp_path: Path) -> None:
     checkpoint = written(tmp_path / "networks.safetensors", noisy())
     found = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
