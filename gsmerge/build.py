@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
-import numpy as np
 import torch
 
 from gsmerge.allocate import split_counts
@@ -54,6 +53,22 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     Returns:
         Canonical Gaussians.
     """
+    features, members, learned = merged_groups(source, grouping, options, journal)
+    with journal.stage("decode"):
+        wanted = wanted_count(features, members, grouping, options)
+        children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
+        gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+    del features, members, learned
+    if source.scene.images is None:
+        return gaussians
+    with journal.stage("fit"):
+        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal)
+
+
+def merged_groups(
+    source: Source, grouping: Grouping, options: CompactOptions, journal: Journal
+) -> tuple[FeatureGaussians, Members, Learned | None]:
+    """The Feature Gaussians of some superpixels, merged across views, with their members and any networks."""
     members = source.members
     if members is None:
         with journal.stage("members"):
@@ -63,15 +78,7 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
         networks, cameras = source.checkpoint.networks, source.scene.cameras
         learned = Learned(networks, members, cameras, options.seed, options.precision)
         journal.choices["networks"] = source.checkpoint.facts()
-    features = _merged_features(source.scene, members, grouping, options, journal, learned)
-    with journal.stage("decode"):
-        children = _filled(features, members, grouping, options)
-        gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
-    del features, members, learned
-    if source.scene.images is None:
-        return gaussians
-    with journal.stage("fit"):
-        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal)
+    return _merged_features(source.scene, members, grouping, options, journal, learned), members, learned
 
 
 def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Gaussians:
@@ -114,15 +121,13 @@ def _merged_features(
     return _matched(features, options, journal, learned, closed)
 
 
-def _filled(
+def wanted_count(
     features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
-) -> np.ndarray | None:
-    """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
+) -> int | None:
+    """Gaussians that the groups are to become where a number is to be met and no fit grows to it; None: K each."""
     if grouping.exact and not options.fit.grows:
-        wanted: int | None = grouping.wanted
-    else:
-        wanted = loose_count(features, members, grouping, options)
-    return None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
+        return grouping.wanted
+    return loose_count(features, members, grouping, options)
 
 
 def _matched(

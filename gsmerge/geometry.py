@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsmerge.types import Cameras
+
+MORTON_BITS = 21  # per axis: three fit into 63 bits
 
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:
@@ -72,3 +75,16 @@ def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     camera = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     image = camera @ Ks.transpose(1, 2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def morton_codes(points: np.ndarray) -> np.ndarray:
+    """``[n]`` int64 places along a space-filling curve (Morton's) of points ``[n,3]``: the bits interleaved."""
+    codes = np.zeros(len(points), np.int64)
+    if len(points) == 0:
+        return codes
+    low, high = points.min(0), points.max(0)
+    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**MORTON_BITS - 1)
+    for axis, column in enumerate(steps.astype(np.int64).T):
+        for bit in range(MORTON_BITS):
+            codes |= (column >> bit & 1) << (3 * bit + axis)
+    return codes

@@ -13,6 +13,8 @@ from gsmerge import __version__
 from gsmerge.cli.chart import chart
 from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
+from gsmerge.cli.decode import decode
+from gsmerge.cli.encode import encode
 from gsmerge.cli.evaluate import evaluate
 from gsmerge.cli.generate import generate
 from gsmerge.cli.inspect import inspect
@@ -31,7 +33,10 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train):
+COMMANDS = (
+    compact, encode, decode, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train,
+)  # fmt: skip
+for command in COMMANDS:
     app.command()(command)
 
 

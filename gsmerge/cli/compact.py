@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
-from gsmerge.cli.paths import check_output, default_output, input_files, level_output
+from gsmerge.cli.paths import check_format, check_output, default_output, input_files, level_output
 from gsmerge.cli.settings import reading_of, settings_of, superpixels_per_view, told_as_usage
 from gsmerge.errors import SceneError, TargetError
 
@@ -63,7 +63,7 @@ def compact(
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
-    """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
+    """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
     reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files
@@ -76,6 +76,7 @@ def compact(
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:
         check_output(path, inputs, overwrite=overwrite)
+    check_format(out, max_bytes)
     if report is not None:
         check_output(report, (*inputs, *outputs), overwrite=overwrite)
     chosen: dict[str, Any] = {
@@ -102,7 +103,7 @@ def compact(
     chosen |= {"max_drop": max_drop, "target_psnr": target_psnr, "seed": seed, "threads": threads, "unseen": unseen}
     settings = settings_of(chosen)
     if dry_run:
-        _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
+        print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
     document = _run(
         files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
@@ -127,14 +128,14 @@ def _run(
 ) -> dict[str, Any]:
     """Read, compact and write; returns the report."""
     from gsmerge import pipeline
-    from gsmerge.io import atomic_output, kept_comments, load_files, write_ply
+    from gsmerge.io import atomic_output, kept_comments, load_files, lost_harmonics, output_format, write_gaussians
     from gsmerge.memory import release_memory
     from gsmerge.report import report_document
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
         loaded = load_files(files, opacity=opacity, reading=reading)
-        recognised, notes, scene = _recognised(loaded), loaded.notes, loaded.scene
+        recognised, notes, scene = recognised_of(loaded), loaded.notes, loaded.scene
         comments = kept_comments(loaded.ply)
         del loaded  # which knows the row of every pixel
         release_memory()
@@ -157,11 +158,13 @@ def _run(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
-        write_ply(temporary, result.gaussians, overwrite=True, comments=comments)
+        ending = output_format(out)
+        write_gaussians(temporary, result.gaussians, overwrite=True, comments=comments, ending=ending)
+    lost = lost_harmonics(out, result.gaussians.sh_degree)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
     for path, level in coarser:
         with atomic_output(path, overwrite=overwrite) as temporary:
-            write_ply(temporary, level.gaussians, overwrite=True, comments=comments)
+            write_gaussians(temporary, level.gaussians, overwrite=True, comments=comments, ending=ending)
     return report_document(
         result.report,
         input_path=files.ply,
@@ -170,7 +173,7 @@ def _run(
         seconds_after={"write": perf_counter() - compacted},
         coarser=[(path, level.report) for path, level in coarser],
         recognised=recognised,
-        notes=notes,
+        notes=[*notes, *([lost] if lost else [])],
         hashed=hashed,
     )
 
@@ -180,7 +183,7 @@ def _fits_fully(settings: CompactOptions) -> bool:
     return settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
 
 
-def _recognised(loaded: SceneLoad) -> dict[str, Any]:
+def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     """What the report says about the input."""
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
     cameras, recovery = loaded.scene.cameras, loaded.recovery
@@ -204,9 +207,10 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
         print("\n".join(map(one_line, summary_lines(document))))
 
 
-def _print_plan(
+def print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
+    """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import check_scene, find_baseline, unused_notes
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
     from gsmerge.io import load_files

@@ -282,7 +282,7 @@ BudgetOption = Annotated[
     typer.Option(help='Gaussians in the result, such as 40000 or "2%"; met exactly.', rich_help_panel=COUNT),
 ]
 MaxBytesOption = Annotated[
-    str | None, typer.Option(help="Largest size of the result, such as 5MB.", rich_help_panel=COUNT)
+    str | None, typer.Option(help="Largest size of the result as a .ply, such as 5MB.", rich_help_panel=COUNT)
 ]
 PresetOption = Annotated[
     Preset | None,
@@ -389,7 +389,13 @@ UnseenOption = Annotated[
 ]
 OutputOption = Annotated[
     Path | None,
-    typer.Option("--output", "-o", help="The compact .ply.", show_default="SCENE.compact.ply", rich_help_panel=OUTPUT),
+    typer.Option(
+        "--output",
+        "-o",
+        help="The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.",
+        show_default="SCENE.compact.ply",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 SeedOption = Annotated[
     int | None, typer.Option(min=0, help="Seed of everything random.", show_default="0", rich_help_panel=OUTPUT)

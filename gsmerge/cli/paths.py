@@ -21,7 +21,23 @@ def default_output(ply: Path) -> Path:
 
 def level_output(output: Path, level: int) -> Path:
     """``out.ply`` -> ``out.level1.ply``: where a further level of detail goes, counted from 1."""
-    return output.with_name(f"{output.stem}.level{level}{output.suffix}")
+    compressed = output.name.lower().endswith(".compressed.ply")
+    length = len(".compressed.ply" if compressed else output.suffix)
+    cut = len(output.name) - length
+    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
+
+
+def check_format(output: Path, max_bytes: str | None = None) -> None:
+    """Refuse an output whose name asks for no format, or a file size for one whose size is not known beforehand.
+
+    Raises:
+        UsageError: In either case.
+    """
+    from gsmerge.io import output_format
+
+    ending = output_format(output)
+    if max_bytes is not None and ending != ".ply":
+        raise UsageError(f"--max-bytes: expected an output as .ply, got {ending}; give a --budget")
 
 
 def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:

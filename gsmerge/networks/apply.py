@@ -247,7 +247,13 @@ def decode_gaussians(
         features: The Feature Gaussians.
         learned: The networks and the scene.
     """
-    described = learned.describe(features)
+    return decode_described(children, parents, features, learned.describe(features), learned)
+
+
+def decode_described(
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+) -> Gaussians:
+    """:func:`decode_gaussians` of Feature Gaussians that are described already: no members are looked at."""
     children = head_starts(children, parents, features, described, learned.networks)
     residuals = head_residuals(children, parents, features, described, learned)
     return move_gaussians(children, residuals, described.frames[torch.from_numpy(parents)])

@@ -36,6 +36,8 @@ def readme_commands(root: Path) -> list[str]:
 def test_commands_are_the_documented_ones() -> None:
     assert set(COMMANDS) == {
         "compact",
+        "encode",
+        "decode",
         "evaluate",
         "inspect",
         "segment",
