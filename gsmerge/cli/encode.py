@@ -59,6 +59,7 @@ def encode(
     preset: opt.PresetOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
+    geometry: opt.GeometryOption = None,
     unseen: opt.UnseenOption = None,
     checkpoint: opt.CheckpointOption = None,
     require_checkpoint: opt.RequireCheckpointOption = False,
@@ -79,11 +80,18 @@ def encode(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or files.ply.with_suffix(".gsm")
-    named = () if checkpoint in (None, "none") else (Path(str(checkpoint)),)
+    named = () if checkpoint in (None, *opt.CHECKPOINTS) else (Path(str(checkpoint)),)
     check_output(out, (*input_files(files), *named), overwrite=overwrite)
     chosen: dict[str, Any] = {"k": k, "superpixels": superpixels, "density": density, "segmentation": segmentation}
     chosen |= {"effort": effort, "budget": budget, "max_bytes": max_bytes, "preset": preset, "robust": robust}
-    chosen |= {"match": match, "unseen": unseen, "checkpoint": checkpoint, "fit": "none", "seed": seed}
+    chosen |= {
+        "match": match,
+        "geometry": geometry,
+        "unseen": unseen,
+        "checkpoint": checkpoint,
+        "fit": "none",
+        "seed": seed,
+    }
     chosen |= {"require_checkpoint": require_checkpoint or None, "precision": precision, "threads": threads}
     settings = settings_of(chosen)
     if dry_run:

@@ -357,6 +357,7 @@ MethodOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
+CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
 CheckpointOption = Annotated[
     str | None,
     typer.Option(
