@@ -71,7 +71,7 @@ def compact(
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
     inputs = input_files(files)
-    if checkpoint is not None and checkpoint != "none":
+    if checkpoint not in (None, *opt.CHECKPOINTS):
         inputs = (*inputs, Path(checkpoint))
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:
