@@ -22,6 +22,7 @@ from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_photos
 from gsmerge.refine import refine
 from gsmerge.robust import choose_merge, close_holes
+from gsmerge.starts import views_psnr
 from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
 from gsmerge.unaligned import loose_count, members_of
 
@@ -55,9 +56,7 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     """
     features, members, learned = merged_groups(source, grouping, options, journal)
     with journal.stage("decode"):
-        wanted = wanted_count(features, members, grouping, options)
-        children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
-        gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+        gaussians = _decoded(features, members, learned, grouping, options)
     del features, members, learned
     if source.scene.images is None:
         return gaussians
@@ -73,12 +72,58 @@ def merged_groups(
     if members is None:
         with journal.stage("members"):
             members = members_of(source.scene, grouping.groups, options)
-    learned = None
-    if source.checkpoint is not None:
-        networks, cameras = source.checkpoint.networks, source.scene.cameras
-        learned = Learned(networks, members, cameras, options.seed, options.precision)
+    if source.checkpoint is None:
+        return _merged_features(source.scene, members, grouping, options, journal, None), members, None
+    networks, cameras = source.checkpoint.networks, source.scene.cameras
+    learned = Learned(networks, members, cameras, options.seed, options.precision)
+    if options.checkpoint == "auto":
+        features, used = _better(source, (members, learned), grouping, options, journal)
+        return features, members, used
+    journal.choices["networks"] = source.checkpoint.facts()
+    return (
+        _merged_features(source.scene, members, _unchosen(grouping, options), options, journal, learned),
+        members,
+        learned,
+    )
+
+
+def _better(
+    source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, journal: Journal
+) -> tuple[FeatureGaussians, Learned | None]:
+    """Feature Gaussians with and without networks: those whose Gaussians show the views better.
+
+    Networks learn what real exports suffer from; a scene without those errors is better left as it is.
+    """
+    assert source.checkpoint is not None
+    members, learned = known
+    best: tuple[float, FeatureGaussians, Learned | None] | None = None
+    scores = {}
+    for name, used, cut in (("learned", learned, _unchosen(grouping, options)), ("analytic", None, grouping)):
+        own = Journal(journal.progress, journal.seconds)
+        features = _merged_features(source.scene, members, cut, options, own, used)
+        with own.stage("choose"):
+            scores[name] = views_psnr(_decoded(features, members, used, cut, options), source.scene)
+        if best is None or scores[name] >= best[0]:
+            best, choices = (scores[name], features, used), own.choices
+    assert best is not None
+    journal.choices |= {**choices, "start_scores": scores}
+    if best[2] is not None:
         journal.choices["networks"] = source.checkpoint.facts()
-    return _merged_features(source.scene, members, grouping, options, journal, learned), members, learned
+    return best[1], best[2]
+
+
+def _unchosen(grouping: Grouping, options: CompactOptions) -> Grouping:
+    """Without the choice among merges by the photos, which the networks stand in for, unless it is asked for."""
+    return grouping if options.robust.robust else replace(grouping, robust=False, coarse=None)
+
+
+def _decoded(
+    features: FeatureGaussians, members: Members, learned: Learned | None, grouping: Grouping, options: CompactOptions
+) -> Gaussians:
+    """The Gaussians of merged Feature Gaussians, as many as are wanted."""
+    wanted = wanted_count(features, members, grouping, options)
+    children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
+    return decode(features, members, options.decode, children, options.encode.rule, learned)
 
 
 def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Gaussians:

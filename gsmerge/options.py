@@ -41,7 +41,8 @@ class CompactOptions:
         method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
-            come with the package; ``"none"``: the analytic stages alone; ``"auto"``: see :attr:`networks`.
+            come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
+            analytic start shows the views better, see :attr:`networks`.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
             faster on processors that know it.
@@ -64,7 +65,7 @@ class CompactOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     target: TargetOptions = field(default_factory=TargetOptions)
     method: str = "gsmerge"
-    checkpoint: str = "none"
+    checkpoint: str = "auto"
     require_checkpoint: bool = False
     precision: str = "float32"
     seed: int = 0
@@ -86,7 +87,7 @@ class CompactOptions:
 
     @property
     def networks(self) -> str:
-        """The checkpoint to use: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
+        """The checkpoint to load: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
 
         That is not where time counts most (drafts, fast runs), and not where the photos choose the merge.
         """

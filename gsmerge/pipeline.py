@@ -169,10 +169,9 @@ def begin(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jou
     with journal.stage("prepare"):
         ready = make_ready(scene, settings)
         canonical, frame, options = ready.scene, ready.frame, ready.options
-        checkpoint, notes = find_checkpoint(options.networks, required=options.require_checkpoint)
+        known = isinstance(canonical, PixelScene) or options.checkpoint != "auto"  # they learnt from one per pixel
+        checkpoint, notes = find_checkpoint(options.networks if known else "none", required=options.require_checkpoint)
         journal.notes += [*ready.notes, *notes]
-        if checkpoint is not None and options.robust.robust is None:  # the networks do what the choice was for
-            options = replace(options, robust=replace(options.robust, robust=False))
         canvas = scene_canvas(canonical, options)
     members = scene_members(canonical) if isinstance(canonical, PixelScene) else None
     source = Source(canonical, members, checkpoint)
@@ -204,7 +203,9 @@ def decide(work: Work, journal: Journal) -> int | None:
     with journal.stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, canvas.usual, canvas.least, canvas.most)
         steps = SHORT if drop is None else LONG
-        points = measure_curve(work.source, canvas, work.tree, options, steps, counts, journal)
+        points = measure_curve(
+            replace(work.source, checkpoint=None), canvas, work.tree, options, steps, counts, journal
+        )
     count = curve_knee(points) if drop is None else count_within(points, drop)
     journal.choices["curve"] = [asdict(point) for point in points]
     return count

@@ -232,7 +232,7 @@ def plan_document(
     fit, robust = _fit_of(method, options, photos), False
     if method == "gsmerge":
         learned = options["checkpoint"] != "none"
-        usual_robust = fit != "full" and options["effort"] != "draft" and not learned
+        usual_robust = fit != "full" and options["effort"] != "draft"
         robust = photos and (usual_robust if options["robust"] is None else options["robust"])
         work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * robust
         work += COST_NETWORKS * learned

@@ -330,7 +330,7 @@ RobustOption = Annotated[
     typer.Option(
         "--robust/--no-robust",
         help="Choose among merges by what the photos say.",
-        show_default="unless --fit full, a draft or networks",
+        show_default="unless --fit full or a draft",
         rich_help_panel=MERGING,
     ),
 ]
@@ -364,7 +364,7 @@ CheckpointOption = Annotated[
         metavar="FILE|NAME",
         help="Trained networks that correct what the analytic stages make: a file, shipped, none, or auto: the "
         "shipped ones where they gain.",
-        show_default="none",
+        show_default="auto",
         rich_help_panel=MERGING,
     ),
 ]

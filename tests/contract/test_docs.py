@@ -105,7 +105,7 @@ def test_told_defaults_are_the_library_s() -> None:
     assert library["robust"] is None
     assert library["fit_steps"] is None
     worded = {
-        "robust": "unless --fit full, a draft or networks",
+        "robust": "unless --fit full or a draft",
         "fit_steps": "by effort",
         "match": "overlap, none for a draft",
     }
