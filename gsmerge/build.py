@@ -56,7 +56,9 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     """
     features, members, learned = merged_groups(source, grouping, options, journal)
     with journal.stage("decode"):
-        gaussians = _decoded(features, members, learned, grouping, options)
+        wanted = wanted_count(features, members, grouping, options)
+        children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
+        gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
     del features, members, learned
     if source.scene.images is None:
         return gaussians
@@ -90,9 +92,10 @@ def merged_groups(
 def _better(
     source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, journal: Journal
 ) -> tuple[FeatureGaussians, Learned | None]:
-    """Feature Gaussians with and without networks: those whose Gaussians show the views better.
+    """Feature Gaussians with and without networks: those whose Gaussians, one for each, show the views better.
 
-    Networks learn what real exports suffer from; a scene without those errors is better left as it is.
+    The choice does not hang on K, so that what is encoded once is what every K would have begun with. Networks learn
+    what real exports suffer from; a scene without those errors is better left as it is.
     """
     assert source.checkpoint is not None
     members, learned = known
@@ -102,7 +105,8 @@ def _better(
         own = Journal(journal.progress, journal.seconds)
         features = _merged_features(source.scene, members, cut, options, own, used)
         with own.stage("choose"):
-            scores[name] = views_psnr(_decoded(features, members, used, cut, options), source.scene)
+            ones = decode(features, members, replace(options.decode, k=1), None, options.encode.rule, used)
+            scores[name] = views_psnr(ones, source.scene)
         if best is None or scores[name] >= best[0]:
             best, choices = (scores[name], features, used), own.choices
     assert best is not None
@@ -115,15 +119,6 @@ def _better(
 def _unchosen(grouping: Grouping, options: CompactOptions) -> Grouping:
     """Without the choice among merges by the photos, which the networks stand in for, unless it is asked for."""
     return grouping if options.robust.robust else replace(grouping, robust=False, coarse=None)
-
-
-def _decoded(
-    features: FeatureGaussians, members: Members, learned: Learned | None, grouping: Grouping, options: CompactOptions
-) -> Gaussians:
-    """The Gaussians of merged Feature Gaussians, as many as are wanted."""
-    wanted = wanted_count(features, members, grouping, options)
-    children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
-    return decode(features, members, options.decode, children, options.encode.rule, learned)
 
 
 def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Gaussians:

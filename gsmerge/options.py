@@ -22,6 +22,8 @@ METHODS = (
     "blocks", "greedy", "splat-transform",
 )  # fmt: skip
 
+SHORT_STEPS = 60  # of a fit that a better start still matters to
+
 
 @dataclass(frozen=True)
 class CompactOptions:
@@ -42,7 +44,7 @@ class CompactOptions:
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
             come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
-            analytic start shows the views better, see :attr:`networks`.
+            analytic start shows the views better, see :meth:`networks`.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
             faster on processors that know it.
@@ -85,20 +87,19 @@ class CompactOptions:
         for name in (name for name, wanted in asked.items() if wanted):
             raise ValueError(f"method {self.method}: expected a budget, a preset or a density, got {name}")
 
-    @property
-    def networks(self) -> str:
+    def networks(self, *, photos: bool) -> str:
         """The checkpoint to load: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
 
-        That is not where time counts most (drafts, fast runs), and not where the photos choose the merge.
+        That is where no fit follows, or a short one; not where time counts most (drafts, fast runs).
+
+        Args:
+            photos: Whether there are any to fit to.
         """
         if self.checkpoint != "auto":
             return self.checkpoint
+        short = not photos or self.fit.fit == "none" or (self.fit.fit == "full" and self.fit.steps <= SHORT_STEPS)
         hasty = self.fit.effort in ("draft", "fast")
-        return (
-            "none"
-            if hasty or self.robust.robust or self.fit.fit == "color" or self.encode.rule != "depth"
-            else "shipped"
-        )
+        return "shipped" if short and not hasty and not self.robust.robust and self.encode.rule == "depth" else "none"
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""

@@ -170,7 +170,8 @@ def begin(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jou
         ready = make_ready(scene, settings)
         canonical, frame, options = ready.scene, ready.frame, ready.options
         known = isinstance(canonical, PixelScene) or options.checkpoint != "auto"  # they learnt from one per pixel
-        checkpoint, notes = find_checkpoint(options.networks if known else "none", required=options.require_checkpoint)
+        name = options.networks(photos=scene.images is not None) if known else "none"
+        checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
         journal.notes += [*ready.notes, *notes]
         canvas = scene_canvas(canonical, options)
     members = scene_members(canonical) if isinstance(canonical, PixelScene) else None

@@ -230,7 +230,7 @@ def print_plan(
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
-        settings.to_dict() | {"checkpoint": settings.networks},
+        settings.to_dict() | {"checkpoint": settings.networks(photos=scene.images is not None)},
         output_path=out,
         per_view=asked_per_view(scene, settings) if len(scene) else 0,
         photos=scene.images is not None,

@@ -136,7 +136,7 @@ def _run(
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **judged})
             losses = []
-            told = {"step": step, "loss": mean, "validation": judged, "options": options.to_dict(), **hashes}
+            told = {"step": step, "loss": mean, "figures": judged, "options": options.to_dict(), **hashes}
             if is_best(rows, options):
                 save_checkpoint(out / "best.safetensors", learner.smooth, told)
             save_checkpoint(out / "last.safetensors", learner.smooth, told)

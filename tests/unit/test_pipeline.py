@@ -45,7 +45,7 @@ def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
 
 def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     """Unless it is asked for."""
-    full = scenes.compacted(scene, checkpoint="none").report
+    full = scenes.compacted(scene).report
     assert set(USUAL) - set(full.seconds) == {"robust"}
     assert not {"merge", "merge_scores", "closed"} & set(full.choices)
     assert full.choices["fit"]["method"] == "full"
@@ -215,7 +215,8 @@ def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -
 
 
 @pytest.mark.parametrize(
-    "settings", [{"effort": "draft"}, {"effort": "fast"}, {"fit": "color"}, {"robust": True}, {"checkpoint": "none"}]
+    "settings",
+    [{"effort": "draft"}, {"effort": "fast"}, {"fit": "color"}, {}, {"robust": True}, {"checkpoint": "none"}],
 )
 def test_networks_are_left_out(scene: PixelScene, settings: dict) -> None:
     assert not {"networks", "start_scores"} & set(scenes.compacted(scene, **settings).report.choices)
