@@ -59,6 +59,9 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
         wanted = wanted_count(features, members, grouping, options)
         children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
         gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+        if grouping.exact and len(gaussians) > grouping.wanted:  # K each would be more than the fit may grow to
+            children = split_counts(features, members, max(0, grouping.wanted - len(features)))
+            gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
     del features, members, learned
     if source.scene.images is None:
         return gaussians

@@ -226,3 +226,10 @@ def test_networks_without_photos_are_judged_by_the_colours_of_the_pixels(scene: 
     found = scenes.compacted(replace(scene, images=None)).report.choices["start_scores"]
     with_photos = scenes.compacted(scene, fit="none", robust=False).report.choices["start_scores"]
     assert found == pytest.approx(with_photos, abs=0.5)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, 8])
+def test_a_budget_is_met_whatever_k_is_and_however_the_fit_grows(scene: PixelScene, k: int) -> None:
+    found = scenes.compacted(scene, k=k, budget=300, fit_steps=160)
+    assert found.report.choices["fit"]["accepted"]
+    assert len(found.gaussians) == 300
