@@ -234,7 +234,8 @@ ABLATION = {
     (): "full (K = 1)",
     (("match", "none"),): "without merging across views",
     (("fit", "color"),): "without the full fit: colours alone, merge chosen by the photos",
-    (("fit", "none"),): "without any fit: merge chosen by the photos",
+    (("checkpoint", "none"), ("fit", "none")): "without any fit: merge chosen by the photos",
+    (("checkpoint", "shipped"), ("fit", "none")): "without any fit: the trained encoder, merger, refiner and heads",
     (("density", 0.02),): "larger superpixels",
     (("density", 0.087),): "smaller superpixels",
     (("segmentation", "bass-st"),): "the paper's superpixels (BASS with Shi-Tomasi)",
@@ -256,10 +257,7 @@ def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not rows:
         return []
     head = ("variant", "kept", "PSNR (dB)", *QUALITY[1:], "seconds")
-    words = (
-        "Plain export, all views. The learned merger and refiner of the paper's table are no part of this version; the"
-        " fit stands in their place."
-    )
+    words = "Plain export, all views. What encoder, merger and refiner add each is in [networks.md](networks.md)."
     return [_section("Ablation", "ablation", words, _table(head, rows))]
 
 
@@ -363,7 +361,7 @@ def _too_many(records: Sequence[RunRecord]) -> str:
 def _without(records: Sequence[RunRecord]) -> str:
     """What is left without photos to fit to."""
     plain = [r for r in records if r.method == OURS and not r.settings]
-    bare = [r for r in records if r.method == OURS and dict(r.settings) == {"fit": "none"}]
+    bare = [r for r in records if r.method == OURS and dict(r.settings) == {"fit": "none", "checkpoint": "shipped"}]
     if not (plain and bare):
         return ""
     return (
@@ -377,5 +375,4 @@ def _missing() -> str:
     return """## Of the paper's tables, what has no counterpart yet
 
 - Online reconstruction (`tab:online`, `fig:online`): views are not yet added to a state.
-- The learned merger, refiner and decoder (`tab:ablation`): not part of this version.
 - Posed against unposed Depth Anything 3 (`tab:da3_posed_unposed`), ReSplat, VolSplat: exports that need the models."""

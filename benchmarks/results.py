@@ -47,6 +47,7 @@ class Part:
     figures: tuple[str, ...] = ()
 
 
+PLAIN = ("--fixed", "robust=false", "--fixed", "checkpoint=none")
 SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
 VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", *NO_PROXIES)
 PARTS = (
@@ -56,8 +57,9 @@ PARTS = (
         (
             ("--methods", f"gsmerge,{FAST_RIVALS}", *SIZES),
             ("--budgets", "4.4%", "--efforts", "fast,best", *NO_PROXIES),
-            ("--budgets", "4.4%", "--fit", "color,none", *NO_PROXIES),
-            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "robust=false", *NO_PROXIES),
+            ("--budgets", "4.4%", "--fit", "color", *NO_PROXIES),
+            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
+            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", *PLAIN, *NO_PROXIES),
             ("--densities", "0.005,0.01,0.02,0.044,0.2", "--efforts", "draft", *NO_PROXIES),
             ("--densities", "0.044,0.2", "--fit", "none", "--efforts", "draft", "--segmentations", "grid", *NO_PROXIES),
             ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", *NO_PROXIES),
@@ -71,7 +73,9 @@ PARTS = (
         "plain",
         (
             ("--matches", "overlap,none", *NO_PROXIES),
-            ("--fit", "color,none", *NO_PROXIES),
+            ("--fit", "color", *NO_PROXIES),
+            ("--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
+            ("--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
             ("--densities", "0.02,0.087", *NO_PROXIES),
             ("--segmentations", "bass-st,slic", *NO_PROXIES),
             ("--k", "2,4,auto", *NO_PROXIES),

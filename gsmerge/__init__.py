@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from gsmerge.io import read_ply as read_ply
     from gsmerge.io import read_scene as read_scene
     from gsmerge.io import to_cameras as to_cameras
+    from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_ply as write_ply
     from gsmerge.options import CompactOptions as CompactOptions
     from gsmerge.pipeline import CompactReport as CompactReport
@@ -37,6 +38,11 @@ if TYPE_CHECKING:
     from gsmerge.render import render as render
     from gsmerge.segment import saliency as saliency
     from gsmerge.segment import superpixels as superpixels
+    from gsmerge.stored.decode import decode_scene as decode_scene
+    from gsmerge.stored.encode import encode_scene as encode_scene
+    from gsmerge.stored.encoded import Encoded as Encoded
+    from gsmerge.stored.file import load_encoded as load_encoded
+    from gsmerge.stored.file import save_encoded as save_encoded
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import LooseScene as LooseScene
@@ -48,11 +54,15 @@ _HOMES = {
     "errors": ("GsmergeError", "SceneError"),
     "evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "inspect": ("inspect",),
-    "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_ply"),
+    "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_gaussians", "write_ply"),
     "options": ("CompactOptions",),
     "pipeline": ("CompactReport", "CompactResult", "compact"),
     "render": ("Rendering", "render"),
     "segment": ("saliency", "superpixels"),
+    "stored.decode": ("decode_scene",),
+    "stored.encode": ("encode_scene",),
+    "stored.encoded": ("Encoded",),
+    "stored.file": ("load_encoded", "save_encoded"),
     "types": ("Cameras", "Gaussians", "LooseScene", "PixelScene"),
 }
 _EXPORTS = {name: home for home, names in _HOMES.items() for name in names}

@@ -241,16 +241,23 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
         raise ValueError(f"extra: expected at least 0, got {extra}")
     if max_children < 1:
         raise ValueError(f"max_children: expected at least 1, got {max_children}")
-    counts = np.ones(len(features), np.int64)
+    if extra == 0:
+        return np.ones(len(features), np.int64)
+    return 1 + np.bincount(deal_order(features, members, max_children)[:extra], minlength=len(features))
+
+
+def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
+    """The Feature Gaussian ``[d]`` that each further Gaussian goes to, where it lowers distortion most first.
+
+    See :func:`split_counts`, which takes the first ones.
+    """
     front = np.flatnonzero(~features.backing.numpy())
-    if extra == 0 or max_children == 1 or len(front) == 0:
-        return counts
+    if max_children == 1 or len(front) == 0:
+        return np.zeros(0, np.int64)
     gains = _hull_gains(_child_errors(features, members, front, max_children))
     # Stable, group by group: of equal gains of one group the first step comes first.
     order = np.argsort(-gains.reshape(-1), kind="stable")
-    chosen = order[: min(extra, int(np.isfinite(gains).sum()))]
-    counts[front] += np.bincount(chosen // gains.shape[1], minlength=len(front))
-    return counts
+    return front[order[: int(np.isfinite(gains).sum())] // gains.shape[1]]
 
 
 def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarray, max_children: int) -> np.ndarray:

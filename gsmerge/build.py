@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 
-import numpy as np
 import torch
 
 from gsmerge.allocate import split_counts
@@ -23,6 +22,7 @@ from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_photos
 from gsmerge.refine import refine
 from gsmerge.robust import choose_merge, close_holes
+from gsmerge.starts import views_psnr
 from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
 from gsmerge.unaligned import loose_count, members_of
 
@@ -54,23 +54,74 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     Returns:
         Canonical Gaussians.
     """
-    members = source.members
-    if members is None:
-        with journal.stage("members"):
-            members = members_of(source.scene, grouping.groups, options)
-    learned = None
-    if source.checkpoint is not None:
-        learned = Learned(source.checkpoint.networks, members, source.scene.cameras, options.seed)
-        journal.choices["networks"] = source.checkpoint.facts()
-    features = _merged_features(source.scene, members, grouping, options, journal, learned)
+    features, members, learned = merged_groups(source, grouping, options, journal)
     with journal.stage("decode"):
-        children = _filled(features, members, grouping, options)
+        wanted = wanted_count(features, members, grouping, options)
+        children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
         gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+        if grouping.exact and len(gaussians) > grouping.wanted:  # K each would be more than the fit may grow to
+            children = split_counts(features, members, max(0, grouping.wanted - len(features)))
+            gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
     del features, members, learned
     if source.scene.images is None:
         return gaussians
     with journal.stage("fit"):
         return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal)
+
+
+def merged_groups(
+    source: Source, grouping: Grouping, options: CompactOptions, journal: Journal
+) -> tuple[FeatureGaussians, Members, Learned | None]:
+    """The Feature Gaussians of some superpixels, merged across views, with their members and any networks."""
+    members = source.members
+    if members is None:
+        with journal.stage("members"):
+            members = members_of(source.scene, grouping.groups, options)
+    if source.checkpoint is None:
+        return _merged_features(source.scene, members, grouping, options, journal, None), members, None
+    networks, cameras = source.checkpoint.networks, source.scene.cameras
+    learned = Learned(networks, members, cameras, options.seed, options.precision)
+    if options.checkpoint == "auto":
+        features, used = _better(source, (members, learned), grouping, options, journal)
+        return features, members, used
+    journal.choices["networks"] = source.checkpoint.facts()
+    return (
+        _merged_features(source.scene, members, _unchosen(grouping, options), options, journal, learned),
+        members,
+        learned,
+    )
+
+
+def _better(
+    source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, journal: Journal
+) -> tuple[FeatureGaussians, Learned | None]:
+    """Feature Gaussians with and without networks: those whose Gaussians, one for each, show the views better.
+
+    The choice does not hang on K, so that what is encoded once is what every K would have begun with. Networks learn
+    what real exports suffer from; a scene without those errors is better left as it is.
+    """
+    assert source.checkpoint is not None
+    members, learned = known
+    best: tuple[float, FeatureGaussians, Learned | None] | None = None
+    scores = {}
+    for name, used, cut in (("learned", learned, _unchosen(grouping, options)), ("analytic", None, grouping)):
+        own = Journal(journal.progress, journal.seconds)
+        features = _merged_features(source.scene, members, cut, options, own, used)
+        with own.stage("choose"):
+            ones = decode(features, members, replace(options.decode, k=1), None, options.encode.rule, used)
+            scores[name] = views_psnr(ones, source.scene)
+        if best is None or scores[name] >= best[0]:
+            best, choices = (scores[name], features, used), own.choices
+    assert best is not None
+    journal.choices |= {**choices, "start_scores": scores}
+    if best[2] is not None:
+        journal.choices["networks"] = source.checkpoint.facts()
+    return best[1], best[2]
+
+
+def _unchosen(grouping: Grouping, options: CompactOptions) -> Grouping:
+    """Without the choice among merges by the photos, which the networks stand in for, unless it is asked for."""
+    return grouping if options.robust.robust else replace(grouping, robust=False, coarse=None)
 
 
 def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Gaussians:
@@ -113,15 +164,13 @@ def _merged_features(
     return _matched(features, options, journal, learned, closed)
 
 
-def _filled(
+def wanted_count(
     features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
-) -> np.ndarray | None:
-    """Children of each group where a number of Gaussians is to be met and no fit grows to it; None: K everywhere."""
+) -> int | None:
+    """Gaussians that the groups are to become where a number is to be met and no fit grows to it; None: K each."""
     if grouping.exact and not options.fit.grows:
-        wanted: int | None = grouping.wanted
-    else:
-        wanted = loose_count(features, members, grouping, options)
-    return None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
+        return grouping.wanted
+    return loose_count(features, members, grouping, options)
 
 
 def _matched(

@@ -30,7 +30,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
     Args:
         pixels: Of all views together, or Gaussians where they are more.
         view_pixels: Of one view.
-        options: All settings by flat name.
+        options: All settings by flat name, but the checkpoint that is used.
         photos: Whether the scene has photos.
         fit_steps: Steps of the full fit.
     """
@@ -61,4 +61,6 @@ def is_robust(options: Mapping[str, Any], *, photos: bool) -> bool:
     """Whether merges are chosen among by the photos."""
     if options["method"] != "gsmerge" or not photos:
         return False
-    return fit_of(options, photos=photos) != "full" if options["robust"] is None else bool(options["robust"])
+    if options["robust"] is not None:
+        return bool(options["robust"])
+    return fit_of(options, photos=photos) != "full" and options["effort"] != "draft"

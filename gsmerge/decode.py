@@ -102,6 +102,21 @@ def _children(
     features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray, rule: Rule
 ) -> tuple[Gaussians, np.ndarray]:
     """Gaussians of the children of some groups, and the group of each."""
+    starts, ids, parents = halve(features, members, groups, counts)
+    return pool_children(features, members, starts, ids, parents, rule), parents
+
+
+def halve(
+    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Members of the children of some groups: ``starts [n+1]`` into the rows ``[m]``, and the group of each child.
+
+    Args:
+        features: All g Feature Gaussians.
+        members: The scene's Gaussians.
+        groups: The Feature Gaussians to divide.
+        counts: ``[g]`` most children of each.
+    """
     starts, ids = features.starts.numpy(), features.members.numpy()
     centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
 
@@ -115,7 +130,14 @@ def _children(
 
     found = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
     sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
-    moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), child_ids, rule)
+    return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
+
+
+def pool_children(
+    features: FeatureGaussians, members: Members, starts: np.ndarray, ids: np.ndarray, parents: np.ndarray, rule: Rule
+) -> Gaussians:
+    """One Gaussian for each run of members, with gain and spread of the Feature Gaussian that it is a child of."""
+    moments = pool_members(members, starts, ids, rule)
     gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
     means, sh = torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
-    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh), parents
+    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh)

@@ -8,7 +8,18 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import AUTO, Reading, SceneFiles, SceneLoad, atomic_output, kept_comments, load_files, write_ply
+from gsmerge.io import (
+    AUTO,
+    Reading,
+    SceneFiles,
+    SceneLoad,
+    atomic_output,
+    kept_comments,
+    load_files,
+    lost_harmonics,
+    output_format,
+    write_gaussians,
+)
 from gsmerge.io.ply import OpacityChoice
 from gsmerge.journal import Progress
 from gsmerge.memory import release_memory
@@ -35,7 +46,7 @@ def compact_files(
     Args:
         files: The scene.
         settings: Of all stages.
-        out: The ``.ply`` to write; its folder must exist.
+        out: What to write, in the format that its name asks for; its folder must exist.
         opacity: How opacities are stored.
         reading: What is told of the file instead of found.
         overwrite: Replace files that are there.
@@ -48,12 +59,12 @@ def compact_files(
 
     Raises:
         SceneError: If the scene cannot be read or the result cannot be written.
-        UsageError: If the settings ask for what the scene does not have.
+        UsageError: If the settings ask for what the scene does not have, or the name for no format.
     """
-    start = perf_counter()
+    start, ending = perf_counter(), output_format(out)
     with atomic_output(out, overwrite=overwrite) as temporary:
         loaded = load_files(files, opacity=opacity, reading=reading)
-        recognised, notes, scene = _recognised(loaded), loaded.notes, loaded.scene
+        recognised, notes, scene = recognised_of(loaded), loaded.notes, loaded.scene
         comments = kept_comments(loaded.ply)
         del loaded  # which knows the row of every pixel
         release_memory()
@@ -65,11 +76,12 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
-        write_ply(temporary, result.gaussians, overwrite=True, comments=comments)
+        write_gaussians(temporary, result.gaussians, overwrite=True, comments=comments, ending=ending)
+    lost = lost_harmonics(out, result.gaussians.sh_degree)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
     for path, level in coarser:
         with atomic_output(path, overwrite=overwrite) as temporary:
-            write_ply(temporary, level.gaussians, overwrite=True, comments=comments)
+            write_gaussians(temporary, level.gaussians, overwrite=True, comments=comments, ending=ending)
     return report_document(
         result.report,
         input_path=files.ply,
@@ -78,12 +90,12 @@ def compact_files(
         seconds_after={"write": perf_counter() - compacted},
         coarser=[(path, level.report) for path, level in coarser],
         recognised=recognised,
-        notes=notes,
+        notes=[*notes, *([lost] if lost else [])],
         hashed=hashed,
     )
 
 
-def _recognised(loaded: SceneLoad) -> dict[str, Any]:
+def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     """What the report says about the input."""
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
     cameras, recovery = loaded.scene.cameras, loaded.recovery
@@ -94,7 +106,10 @@ def _recognised(loaded: SceneLoad) -> dict[str, Any]:
 
 def level_output(output: Path, level: int) -> Path:
     """``out.ply`` -> ``out.level1.ply``: where a further level of detail goes, counted from 1."""
-    return output.with_name(f"{output.stem}.level{level}{output.suffix}")
+    compressed = output.name.lower().endswith(".compressed.ply")
+    length = len(".compressed.ply" if compressed else output.suffix)
+    cut = len(output.name) - length
+    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
 
 
 def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> int:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsmerge.types import Cameras
+
+MORTON_BITS = 21  # per axis: three fit into 63 bits
 
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:
@@ -24,6 +27,23 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def rotmat_to_quat(rotations: Tensor) -> Tensor:
+    """Unit quaternions ``[n,4]`` wxyz of rotation matrices ``[n,3,3]``, the largest component positive.
+
+    Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
+    ways = [
+        torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
+        torch.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
+        torch.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
+        torch.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
+    ]
+    best = torch.stack([way[..., k] for k, way in enumerate(ways)], -1).argmax(-1)
+    chosen = torch.stack(ways, -2)[torch.arange(len(best)), best]
+    return torch.nn.functional.normalize(chosen, dim=-1)
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
@@ -55,3 +75,16 @@ def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     camera = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     image = camera @ Ks.transpose(1, 2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def morton_codes(points: np.ndarray) -> np.ndarray:
+    """``[n]`` int64 places along a space-filling curve (Morton's) of points ``[n,3]``: the bits interleaved."""
+    codes = np.zeros(len(points), np.int64)
+    if len(points) == 0:
+        return codes
+    low, high = points.min(0), points.max(0)
+    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**MORTON_BITS - 1)
+    for axis, column in enumerate(steps.astype(np.int64).T):
+        for bit in range(MORTON_BITS):
+            codes |= (column >> bit & 1) << (3 * bit + axis)
+    return codes

@@ -14,6 +14,7 @@ from gsmerge.threads import use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
 Method = Literal["overlap", "aabb", "none"]
+Geometry = Literal["analytic", "decoded"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class MatchOptions:
             that cannot chain. ``"aabb"``: the paper's box IoU and connected components. ``"none"``: no merging
             across views. None: ``"overlap"``, but ``"none"`` for a draft.
         effort: Of the whole run; ``"draft"`` matters here.
+        geometry: Of what is compared where networks are loaded: ``"analytic"``, that of the moments, or ``"decoded"``,
+            that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
         overlap: Least overlap, 0 to 1.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
         neighbors: Nearest neighbours in 3D that are looked at, the own view's included.
@@ -37,6 +40,7 @@ class MatchOptions:
 
     match: Method | None = None
     effort: str = "default"
+    geometry: Geometry = "analytic"
     overlap: float = 0.7
     max_color: float = 0.12
     neighbors: int = 16
@@ -45,6 +49,8 @@ class MatchOptions:
     def __post_init__(self) -> None:
         if self.match not in (None, "overlap", "aabb", "none"):
             raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
+        if self.geometry not in ("analytic", "decoded"):
+            raise ValueError(f'geometry: expected "analytic" or "decoded", got "{self.geometry}"')
         if not 0 <= self.overlap <= 1:
             raise ValueError(f"overlap: expected 0 to 1, got {self.overlap}")
         if self.neighbors < 1:
@@ -62,10 +68,9 @@ def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | 
     """Clusters of Feature Gaussians of different views.
 
     The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
-    are taken by weight, ties by position. What is fully transparent is left alone. Where networks are loaded, the
-    geometry compared is that of their K = 1 head.
+    are taken by weight, ties by position. What is fully transparent is left alone.
     """
-    if learned is not None and options.method != "none":
+    if learned is not None and options.geometry == "decoded" and options.method != "none":
         features = match_geometry(features, learned)
     count = len(features)
     clusters = np.full(count, -1, np.int64)

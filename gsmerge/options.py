@@ -22,6 +22,9 @@ METHODS = (
     "blocks", "greedy", "splat-transform",
 )  # fmt: skip
 
+CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
+SHORT_STEPS = 60  # of a fit that a better start still matters to
+
 
 @dataclass(frozen=True)
 class CompactOptions:
@@ -40,8 +43,12 @@ class CompactOptions:
         target: What decides the number of Gaussians.
         method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
-        checkpoint: File of trained networks that correct what the analytic stages make; ``"none"``: those alone.
+        checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
+            come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
+            analytic start shows the views better, see :meth:`networks`.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
+        precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
+            faster on processors that know it.
         seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
@@ -61,14 +68,17 @@ class CompactOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     target: TargetOptions = field(default_factory=TargetOptions)
     method: str = "gsmerge"
-    checkpoint: str = "none"
+    checkpoint: str = "auto"
     require_checkpoint: bool = False
+    precision: str = "float32"
     seed: int = 0
     threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ValueError(f'precision: expected "float32" or "bfloat16", got {self.precision!r}')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
@@ -77,6 +87,20 @@ class CompactOptions:
         asked |= {"target psnr": self.target.target_psnr is not None, "max drop": self.target.max_drop is not None}
         for name in (name for name, wanted in asked.items() if wanted):
             raise ValueError(f"method {self.method}: expected a budget, a preset or a density, got {name}")
+
+    def networks(self, *, photos: bool) -> str:
+        """The checkpoint to load: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
+
+        That is where no fit follows, or a short one; not where time counts most (drafts, fast runs).
+
+        Args:
+            photos: Whether there are any to fit to.
+        """
+        if self.checkpoint != "auto":
+            return self.checkpoint
+        short = not photos or self.fit.fit == "none" or (self.fit.fit == "full" and self.fit.steps <= SHORT_STEPS)
+        hasty = self.fit.effort in ("draft", "fast")
+        return "shipped" if short and not hasty and not self.robust.robust and self.encode.rule == "depth" else "none"
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from gsmerge.threads import parallel_map
-from gsmerge.types import SH_C0, LooseScene, PixelScene
+from gsmerge.types import SH_C0, Cameras, LooseScene, PixelScene
 
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
@@ -78,12 +78,21 @@ def scene_photos(scene: PixelScene | LooseScene, level: int = 1) -> Photos:
     """
     if scene.images is None:
         raise ValueError("expected a scene with images")
-    images = scene.images.numpy()
-    viewmats, Ks = scene.cameras.viewmats.double().numpy(), scene.cameras.Ks.double().numpy()
+    images, blank = scene.images.numpy(), blank_photos(scene.cameras, level)
     if level == 1:
-        return Photos(images, viewmats, Ks, EPS2D)
-    h, w = images.shape[1:3]
-    size = max(1, round(w / level)), max(1, round(h / level))
+        return replace(blank, images=images)
+    size = blank.width, blank.height
     small = np.stack(parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images))
+    return replace(blank, images=small)
+
+
+def blank_photos(cameras: Cameras, level: int = 1) -> Photos:
+    """Black photos, which take no memory, for what only looks at cameras; each side divided by ``level``."""
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    w, h = cameras.width, cameras.height
+    size = (w, h) if level == 1 else (max(1, round(w / level)), max(1, round(h / level)))
+    black = np.broadcast_to(np.float32(0), (len(cameras), size[1], size[0], 3))
+    if level == 1:
+        return Photos(black, viewmats, Ks, EPS2D)
     sx, sy = size[0] / w, size[1] / h
-    return Photos(small, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
+    return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)

@@ -18,7 +18,7 @@ from gsmerge.canonical import NEAR, Frame
 from gsmerge.contribution import ContributionOptions
 from gsmerge.curve import LONG, SHORT, measure_curve
 from gsmerge.errors import UsageError
-from gsmerge.grouping import Canvas, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
+from gsmerge.grouping import Canvas, Grouping, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
 from gsmerge.journal import STAGES, Journal, Progress
 from gsmerge.memory import peak_memory
 from gsmerge.metrics import psnr
@@ -81,7 +81,7 @@ class CompactResult:
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
+class Work:
     """A run under way: the scene as given, what Gaussians are built from, and what is known of their number.
 
     ``kept`` are Gaussians that are in no view, merged already; ``settings`` are what was asked for, of which
@@ -125,11 +125,11 @@ def compact(
     options = _settled((options or CompactOptions()).with_settings(settings))
     journal = Journal(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = _begun(scene, options, journal)
+        work = begin(scene, options, journal)
         if options.target.target_psnr is not None:
             result = _searched(work, options.target.target_psnr, journal)
         else:
-            result = _built(work, _decided(work, journal), journal)
+            result = _built(work, decide(work, journal), journal)
         counts = level_counts(len(result.gaussians), options.target.levels, work.canvas.least)
         results = [result, *(_built(work, count, Journal(progress)) for count in counts)]
         near = NEAR * work.frame.unit
@@ -159,7 +159,7 @@ def _settled(options: CompactOptions) -> CompactOptions:
     return replace(options, fit=replace(options.fit, fit_steps=AUTO_STEPS * options.fit.steps))
 
 
-def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> _Work:
+def begin(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Work:
     """The scene in its own frame, and its superpixels if they are to be cut to a number."""
     target, baseline = settings.target, _rival(scene, settings, journal)
     if baseline is not None:  # nothing is set aside, and nothing is learned
@@ -169,18 +169,19 @@ def _begun(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
     with journal.stage("prepare"):
         ready = make_ready(scene, settings)
         canonical, frame, options = ready.scene, ready.frame, ready.options
-        journal.notes += ready.notes
+        known = isinstance(canonical, PixelScene) or options.checkpoint != "auto"  # they learnt from one per pixel
+        name = options.networks(photos=scene.images is not None) if known else "none"
+        checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
+        journal.notes += [*ready.notes, *notes]
         canvas = scene_canvas(canonical, options)
     members = scene_members(canonical) if isinstance(canonical, PixelScene) else None
-    checkpoint, notes = find_checkpoint(settings.checkpoint, required=settings.require_checkpoint)
-    journal.notes += notes
     source = Source(canonical, members, checkpoint)
     plain = not target.searches and options.decode.k != "auto" and canvas.limit is None
     tree = None
     if baseline is None and (not plain or target.levels > 1):
         with journal.stage("segment"):
             tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
-    return _Work(scene, frame, source, options, canvas, tree, ready.kept, settings, baseline)
+    return Work(scene, frame, source, options, canvas, tree, ready.kept, settings, baseline)
 
 
 def _rival(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Baseline | None:
@@ -192,7 +193,7 @@ def _rival(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jo
     return baseline
 
 
-def _decided(work: _Work, journal: Journal) -> int | None:
+def decide(work: Work, journal: Journal) -> int | None:
     """The number of Gaussians, as the options and the scene's own curve have it; None: as density and K say."""
     canvas, options, drop = work.canvas, work.options, work.options.target.max_drop
     if drop is None and options.decode.k != "auto":
@@ -203,13 +204,15 @@ def _decided(work: _Work, journal: Journal) -> int | None:
     with journal.stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, canvas.usual, canvas.least, canvas.most)
         steps = SHORT if drop is None else LONG
-        points = measure_curve(work.source, canvas, work.tree, options, steps, counts, journal)
+        points = measure_curve(
+            replace(work.source, checkpoint=None), canvas, work.tree, options, steps, counts, journal
+        )
     count = curve_knee(points) if drop is None else count_within(points, drop)
     journal.choices["curve"] = [asdict(point) for point in points]
     return count
 
 
-def _searched(work: _Work, target: float, journal: Journal) -> CompactResult:
+def _searched(work: Work, target: float, journal: Journal) -> CompactResult:
     """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do."""
     results: dict[int, CompactResult] = {}
 
@@ -236,21 +239,16 @@ def _searched(work: _Work, target: float, journal: Journal) -> CompactResult:
     return replace(result, report=replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet))
 
 
-def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
+def _built(work: Work, count: int | None, journal: Journal) -> CompactResult:
     """One result: cut to a number of Gaussians, or as density and K say, built or made by a rival method, scored."""
     options, canvas = work.options, work.canvas
     if work.baseline is not None:
         gaussians = work.baseline.run(work.source, canvas, options, canvas.usual if count is None else count, journal)
-    elif count is not None and isinstance(work.source.scene, LooseScene) and count >= len(work.source.scene.gaussians):
+    elif keeps_all(work, count):
+        assert isinstance(work.source.scene, LooseScene)
         gaussians = keep_all(work.source.scene, options, journal)
     else:
-        with journal.stage("segment"):
-            if count is None:
-                grouping = group_scene(canvas, options)
-            else:
-                assert work.tree is not None
-                grouping = cut_scene(work.source.scene, canvas, work.tree, options, count)
-        gaussians = build(work.source, grouping, options, journal)
+        gaussians = build(work.source, choose_groups(work, count, journal), options, journal)
     gaussians = work.frame.leave(gaussians if work.kept is None else Gaussians.concat([gaussians, work.kept]))
     after = None
     if work.scene.images is not None:
@@ -262,6 +260,21 @@ def _built(work: _Work, count: int | None, journal: Journal) -> CompactResult:
         *counts, journal.seconds, None, after, journal.choices, journal.notes, settings, peak_memory()
     )
     return CompactResult(gaussians, report)
+
+
+def keeps_all(work: Work, count: int | None) -> bool:
+    """Whether so many Gaussians are asked for that a scene in no order need not be grouped."""
+    scene = work.source.scene
+    return count is not None and isinstance(scene, LooseScene) and count >= len(scene.gaussians)
+
+
+def choose_groups(work: Work, count: int | None, journal: Journal) -> Grouping:
+    """Superpixels cut to a number of Gaussians, or as density and K say."""
+    with journal.stage("segment"):
+        if count is None:
+            return group_scene(work.canvas, work.options)
+        assert work.tree is not None
+        return cut_scene(work.source.scene, work.canvas, work.tree, work.options, count)
 
 
 def input_psnr(gaussians: Gaussians, photos: Photos, near: float) -> float:

@@ -195,7 +195,7 @@ def plan_document(
     Args:
         files: Paths of the ``ply``, the ``cameras`` and the ``images``.
         grid: Views, height and width of the Gaussian grid.
-        options: All settings by flat name, as of ``CompactOptions.to_dict()``.
+        options: All settings by flat name, as of ``CompactOptions.to_dict()``, but the checkpoint that is used.
         output_path: The ``.ply`` that would be written.
         per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.

@@ -16,6 +16,7 @@ from gsmerge.contribution import find_owners, owner_pixels, seen_weights
 from gsmerge.decode import DecodeOptions, decode
 from gsmerge.encode import from_moments
 from gsmerge.errors import UsageError
+from gsmerge.geometry import morton_codes
 from gsmerge.grouping import Grouping
 from gsmerge.moments import Members, loose_members, pool_members, scene_members
 from gsmerge.options import CompactOptions
@@ -24,8 +25,6 @@ from gsmerge.sampling import distinct_views, subset
 from gsmerge.targets import exact_count
 from gsmerge.types import FeatureGaussians, Gaussians, Groups, LooseScene, PixelScene
 from gsmerge.viewpoints import place_cameras
-
-MORTON_BITS = 21  # per axis: three fit into 63 bits
 
 
 @dataclass(frozen=True)
@@ -134,24 +133,13 @@ def set_aside(scene: LooseScene, options: CompactOptions) -> tuple[LooseScene, C
 
 def merge_neighbours(gaussians: Gaussians, scene: LooseScene, count: int, options: CompactOptions) -> Gaussians:
     """At most ``count`` Gaussians in place of n >= count: runs along a space-filling curve (Morton's) are merged."""
-    order = np.argsort(_morton(gaussians.means.double().numpy()), kind="stable")
+    order = np.argsort(morton_codes(gaussians.means.double().numpy()), kind="stable")
     hidden = replace(scene, gaussians=gaussians)
     members = loose_members(hidden, np.full(len(gaussians), -1, np.int64))
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
     moments = pool_members(members, starts, order, options.encode.rule)
     features = from_moments(moments, starts, order, np.full(count, -1))
     return decode(features, members, DecodeOptions(min_opacity=0.0))
-
-
-def _morton(points: np.ndarray) -> np.ndarray:
-    """``[n]`` int64: the bits of the three coordinates, interleaved."""
-    low, high = points.min(0), points.max(0)
-    steps = (points - low) / np.maximum(high - low, 1e-30) * (2**MORTON_BITS - 1)
-    codes = np.zeros(len(points), np.int64)
-    for axis, column in enumerate(steps.astype(np.int64).T):
-        for bit in range(MORTON_BITS):
-            codes |= (column >> bit & 1) << (3 * bit + axis)
-    return codes
 
 
 def members_of(scene: PixelScene | LooseScene, groups: Groups, options: CompactOptions) -> Members:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.batch import BatchOptions, Job
+from gsmerge.batch.find import output_name
 from gsmerge.batch.records import RECORDS, SUMMARY, Index
 from gsmerge.batch.task import Task, Work
 from gsmerge.options import CompactOptions
@@ -73,7 +74,7 @@ def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Tas
     out.mkdir(exist_ok=True)
     index = Index(out)
     index.read_on()
-    name = f"{scene.name}.ply"
+    name = output_name(options, scene, 0)
     return (
         Task(Job(0, str(scene), name, 0), index.known.get(name)),
         Work(out, options, index.end),

@@ -307,8 +307,8 @@ def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
 
 
 def plain(scene: PixelScene, **settings: Any) -> Gaussians:
-    """The merge alone: no choice by photos, no fit."""
-    return compacted(scene, **{"robust": False, "fit": "none", **settings}).gaussians
+    """The merge alone: no choice by photos, no networks, no fit."""
+    return compacted(scene, **{"robust": False, "fit": "none", "checkpoint": "none", **settings}).gaussians
 
 
 def identical(a: Gaussians, b: Gaussians) -> bool:

@@ -95,7 +95,8 @@ def _ply_of(scene: Path) -> Path:
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Name of a scene's result in the output folder."""
     whole = Path(os.path.abspath(scene))
-    values = {"stem": stem_of(whole), "parent": whole.parent.name, "index": index, "k": options.settings.decode.k}
+    stem = stem_of(whole).removesuffix(".compressed")  # which says how the scene is written, not its result
+    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": options.settings.decode.k}
     try:
         return os.path.normpath(options.output.format(**values))
     except ValueError as error:  # a format that fits numbers only

@@ -7,7 +7,7 @@ from string import Formatter
 from typing import Any
 
 from gsmerge.contents import digest
-from gsmerge.io import AUTO, Reading
+from gsmerge.io import AUTO, OUTPUT_FORMATS, Reading, output_format
 from gsmerge.io.ply import OpacityChoice
 from gsmerge.options import CompactOptions
 
@@ -27,7 +27,7 @@ class BatchOptions:
             found beside each.
         images: The same for the folder of photos.
         output: Name of a result in the output folder, made of ``{stem}`` (the scene's name), ``{parent}`` (name of
-            the folder it is in), ``{index}`` (its place in the list, from 0) and ``{k}``.
+            the folder it is in), ``{index}`` (its place in the list, from 0) and ``{k}``; its ending says the format.
         jobs: Scenes that are worked on at once; None: as many as processors and memory allow.
         max_memory: Bytes that they may take together; None: what is free. Ray knows that of its nodes.
         timeout: Seconds that a scene may take; None: any.
@@ -58,6 +58,8 @@ class BatchOptions:
 
     def __post_init__(self) -> None:
         check_template(self.output)
+        if self.settings.target.max_bytes is not None and output_format(self.output) != ".ply":
+            raise ValueError(f"max bytes: expected an output as .ply, got {self.output}; give a budget")
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"jobs: expected at least 1, got {self.jobs}")
         if self.max_memory is not None and self.max_memory < 1:
@@ -88,7 +90,8 @@ def check_template(template: str) -> None:
     """Refuse a name for results that is none.
 
     Raises:
-        ValueError: If it holds another field than those in ``FIELDS``, does not end in ``.ply``, or leaves the folder.
+        ValueError: If it holds another field than those in ``FIELDS``, does not end as one of the formats that
+            can be written, or leaves the folder.
     """
     try:
         names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]
@@ -98,7 +101,7 @@ def check_template(template: str) -> None:
     if any(name not in FIELDS for name in names):
         known = ", ".join(f"{{{name}}}" for name in FIELDS)
         raise ValueError(f"output: expected {known} in braces, got {template!r}")
-    if not shown.endswith(".ply"):
-        raise ValueError(f"output: expected a name that ends in .ply, got {template!r}")
+    if not shown.lower().endswith(tuple(OUTPUT_FORMATS)):
+        raise ValueError(f"output: expected a name that ends in {', '.join(OUTPUT_FORMATS)}, got {template!r}")
     if shown.startswith(("/", "~", ".")) or ".." in shown.split("/") or "\\" in shown or "\0" in shown:
         raise ValueError(f"output: expected a name inside the output folder, not hidden, got {template!r}")

@@ -24,6 +24,7 @@ from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import LOST, Index, record
 from gsmerge.batch.task import Task, Work, run_task
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.options import CHECKPOINTS
 
 SCENES = 200  # that a process works on before it makes way for a new one
 WAITING = 2  # scenes that Ray is given beyond those that it has processors for
@@ -174,7 +175,7 @@ def _limited(seconds: float | None) -> Iterator[None]:
 def with_whole_paths(options: BatchOptions) -> BatchOptions:
     """The options with paths that mean the same on every node."""
     settings = options.settings
-    if settings.checkpoint != "none":
+    if settings.checkpoint not in CHECKPOINTS:
         settings = replace(settings, checkpoint=os.path.abspath(settings.checkpoint))
     cameras, images = (
         path if path is None or path.startswith("{") else os.path.abspath(path)

@@ -30,6 +30,7 @@ from gsmerge.files import compact_files
 from gsmerge.io import SceneFiles, find_scene_files
 from gsmerge.io.atomic import remove_leftovers
 from gsmerge.lines import append_line
+from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
 
 
@@ -146,7 +147,7 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
     """What a result is known by: everything that is read, all settings, and the version."""
     told: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.told()}
     checkpoint = Path(options.settings.checkpoint)
-    if checkpoint.is_file():  # by what is in it, wherever it lies
+    if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by what is in it, wherever it lies
         told["settings"]["checkpoint"] = file_sha256(checkpoint)
     return digest({**told, "tool_version": __version__, "schema_version": SCHEMA_VERSION})
 

@@ -14,6 +14,8 @@ from gsmerge.cli.batch import batch
 from gsmerge.cli.chart import chart
 from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
+from gsmerge.cli.decode import decode
+from gsmerge.cli.encode import encode
 from gsmerge.cli.evaluate import evaluate
 from gsmerge.cli.generate import generate
 from gsmerge.cli.inspect import inspect
@@ -32,7 +34,10 @@ INTERRUPTED = 130
 app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
-for command in (compact, batch, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train):
+COMMANDS = (
+    compact, batch, encode, decode, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train,
+)  # fmt: skip
+for command in COMMANDS:
     app.command()(command)
 
 

@@ -119,6 +119,7 @@ def batch(
     levels: opt.LevelsOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
+    geometry: opt.GeometryOption = None,
     fit: opt.FitOption = None,
     device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
@@ -127,6 +128,7 @@ def batch(
     method: opt.MethodOption = None,
     checkpoint: opt.CheckpointOption = None,
     require_checkpoint: opt.RequireCheckpointOption = False,
+    precision: opt.PrecisionOption = None,
     seed: opt.SeedOption = None,
     threads: Annotated[
         int | None, _option("Threads of each scene.", min=1, show_default="processors by jobs", panel=opt.OUTPUT)

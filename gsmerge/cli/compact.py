@@ -12,7 +12,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
-from gsmerge.cli.paths import check_output, default_output, input_files
+from gsmerge.cli.paths import check_format, check_output, default_output, input_files
 from gsmerge.cli.settings import given_settings, reading_of, told_as_usage
 from gsmerge.errors import TargetError
 
@@ -46,6 +46,7 @@ def compact(
     levels: opt.LevelsOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
+    geometry: opt.GeometryOption = None,
     fit: opt.FitOption = None,
     device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
@@ -54,6 +55,7 @@ def compact(
     method: opt.MethodOption = None,
     checkpoint: opt.CheckpointOption = None,
     require_checkpoint: opt.RequireCheckpointOption = False,
+    precision: opt.PrecisionOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -64,7 +66,7 @@ def compact(
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
-    """Write a compact .ply that renders like the scene, or better, with 1 to 10 % of its Gaussians."""
+    """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
     reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
     from gsmerge.files import level_output
@@ -73,16 +75,17 @@ def compact(
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
     inputs = input_files(files)
-    if checkpoint is not None and checkpoint != "none":
+    if checkpoint not in (None, *opt.CHECKPOINTS):
         inputs = (*inputs, Path(checkpoint))
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:
         check_output(path, inputs, overwrite=overwrite)
+    check_format(out, max_bytes)
     if report is not None:
         check_output(report, (*inputs, *outputs), overwrite=overwrite)
     settings = given_settings(context.params)
     if dry_run:
-        _print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
+        print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
     document = _run(
         files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
@@ -146,9 +149,10 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
         print("\n".join(map(one_line, summary_lines(document))))
 
 
-def _print_plan(
+def print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
 ) -> None:
+    """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import check_scene, find_baseline, unused_notes
     from gsmerge.files import superpixels_per_view
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
@@ -169,7 +173,7 @@ def _print_plan(
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
-        settings.to_dict(),
+        settings.to_dict() | {"checkpoint": settings.networks(photos=scene.images is not None)},
         output_path=out,
         per_view=asked_per_view(scene, settings) if len(scene) else 0,
         photos=scene.images is not None,

@@ -74,6 +74,13 @@ class Match(str, Enum):
     none = "none"
 
 
+class Geometry(str, Enum):
+    """What is matched where networks are loaded."""
+
+    analytic = "analytic"
+    decoded = "decoded"
+
+
 class Unseen(str, Enum):
     """Choices of ``--unseen``."""
 
@@ -87,6 +94,13 @@ class Fit(str, Enum):
     full = "full"
     color = "color"
     none = "none"
+
+
+class Precision(str, Enum):
+    """Arithmetic of the networks."""
+
+    float32 = "float32"
+    bfloat16 = "bfloat16"
 
 
 class Device(str, Enum):
@@ -268,7 +282,7 @@ BudgetOption = Annotated[
     typer.Option(help='Gaussians in the result, such as 40000 or "2%"; met exactly.', rich_help_panel=COUNT),
 ]
 MaxBytesOption = Annotated[
-    str | None, typer.Option(help="Largest size of the result, such as 5MB.", rich_help_panel=COUNT)
+    str | None, typer.Option(help="Largest size of the result as a .ply, such as 5MB.", rich_help_panel=COUNT)
 ]
 PresetOption = Annotated[
     Preset | None,
@@ -324,6 +338,14 @@ MatchOption = Annotated[
     Match | None,
     typer.Option(help="Merging across views.", show_default="overlap, none for a draft", rich_help_panel=MERGING),
 ]
+GeometryOption = Annotated[
+    Geometry | None,
+    typer.Option(
+        help="What is matched where networks are loaded: moments, or what the K = 1 head makes of them.",
+        show_default="analytic",
+        rich_help_panel=MERGING,
+    ),
+]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
 ]
@@ -335,12 +357,14 @@ MethodOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
+CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
 CheckpointOption = Annotated[
     str | None,
     typer.Option(
-        metavar="FILE|none",
-        help="Trained networks that correct what the analytic stages make; none: those alone.",
-        show_default="none",
+        metavar="FILE|NAME",
+        help="Trained networks that correct what the analytic stages make: a file, shipped, none, or auto: the "
+        "shipped ones where they gain.",
+        show_default="auto",
         rich_help_panel=MERGING,
     ),
 ]
@@ -352,6 +376,11 @@ RequireCheckpointOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
+PrecisionOption = Annotated[
+    Precision | None,
+    typer.Option(help="Arithmetic of the networks.", show_default="float32", rich_help_panel=MERGING),
+]
+TrainDeviceOption = Annotated[Device, typer.Option(help="Where the networks run; windows are rendered on the CPU.")]
 UnseenOption = Annotated[
     Unseen | None,
     typer.Option(
@@ -361,7 +390,13 @@ UnseenOption = Annotated[
 ]
 OutputOption = Annotated[
     Path | None,
-    typer.Option("--output", "-o", help="The compact .ply.", show_default="SCENE.compact.ply", rich_help_panel=OUTPUT),
+    typer.Option(
+        "--output",
+        "-o",
+        help="The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.",
+        show_default="SCENE.compact.ply",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 SeedOption = Annotated[
     int | None, typer.Option(min=0, help="Seed of everything random.", show_default="0", rich_help_panel=OUTPUT)

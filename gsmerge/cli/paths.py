@@ -19,6 +19,19 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
+def check_format(output: Path, max_bytes: str | None = None) -> None:
+    """Refuse an output whose name asks for no format, or a file size for one whose size is not known beforehand.
+
+    Raises:
+        UsageError: In either case.
+    """
+    from gsmerge.io import output_format
+
+    ending = output_format(output)
+    if max_bytes is not None and ending != ".ply":
+        raise UsageError(f"--max-bytes: expected an output as .ply, got {ending}; give a --budget")
+
+
 def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Refuse an output file that is one of the inputs, that exists, or whose folder does not.
 

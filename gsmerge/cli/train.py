@@ -59,6 +59,7 @@ def train(
     cache: Cache = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
+    device: opt.TrainDeviceOption = opt.Device.cpu,
     json: opt.JsonOption = False,
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
@@ -66,7 +67,7 @@ def train(
     """Train networks on what the fit changes in scenes and on photos; interrupted, the same call goes on."""
     from gsmerge.report import document_head, to_json
     from gsmerge.threads import use_threads
-    from gsmerge.training import preset_options, read_config
+    from gsmerge.training import network_device, preset_options, read_config
     from gsmerge.training import train as train_networks
 
     options = preset_options(preset.value)
@@ -74,7 +75,7 @@ def train(
         options = read_config(config, options)
     changes: dict[str, Any] = {name: value for name, value in (("steps", steps), ("seed", seed)) if value is not None}
     with told_as_usage():
-        options = replace(options, **changes)
+        options, chosen = replace(options, **changes), network_device(device.value)
     quiet = quiet or json
     with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, use_threads(threads):
         folder = cache or out / "examples"
@@ -87,7 +88,7 @@ def train(
             if progress is not None:
                 progress(f"train: loss {loss:.4f}", step, steps)
 
-        done = train_networks(examples, held, out, options, threads=threads, progress=told)
+        done = train_networks(examples, held, out, options, threads=threads, device=chosen, progress=told)
     document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
     document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
     if json:

@@ -2,6 +2,6 @@
 
 from gsmerge.fit.options import Fit, FitOptions, Rates
 from gsmerge.fit.report import FitReport
-from gsmerge.fit.stage import fit, start_share
+from gsmerge.fit.stage import fit, shown, start_share
 
-__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit", "start_share"]
+__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit", "shown", "start_share"]

@@ -20,6 +20,7 @@ from gsmerge.threads import parallel_map
 from gsmerge.types import Gaussians
 
 CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
+ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
 
@@ -61,9 +62,9 @@ def fit(
             state = grow_to(start_state(kept), photos[1], count)
             grown = gaussians_of(state.x, state.splats.shN)
             fitted, report = fit_colors(grown, draw(grown, photos[1]), photos[1], options, seed)
-            return _better_of(kept, fitted, report, photos[0]) if report.accepted else (kept, report)
+            return _better_of(kept, fitted, report, photos[0], ALWAYS) if report.accepted else (kept, report)
     fitted, report = fit_colors(gaussians, draw(gaussians, photos[1]), photos[1], options, seed)
-    return _better_of(gaussians[keep], fitted[keep], report, photos[0])
+    return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
 
 
 def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
@@ -87,12 +88,15 @@ def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
     return torch.from_numpy(~inside | (peak >= least))
 
 
-def _better_of(before: Gaussians, after: Gaussians, report: FitReport, photos: Photos) -> tuple[Gaussians, FitReport]:
+def _better_of(
+    before: Gaussians, after: Gaussians, report: FitReport, photos: Photos, close: float = CLOSE
+) -> tuple[Gaussians, FitReport]:
     """The fitted Gaussians, but where they began if the held-out blocks hardly gained and the photos as a whole lost.
 
-    Gaussians that were fitted already are where steps of the usual size only stir.
+    Gaussians that were fitted already are where steps of the usual size only stir. A gain of ``close`` dB or more is
+    not looked at twice.
     """
-    if not report.accepted or report.holdout_after - report.holdout_before >= CLOSE:
+    if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report
     if _photos_error(after, photos) <= _photos_error(before, photos):
         return after, report

@@ -14,9 +14,11 @@ from gsmerge.io.scene import SceneLoad, align_scene, load_files, load_scene, rea
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.targets import Targets, read_targets
 from gsmerge.io.views import read_photos
+from gsmerge.io.writing import OUTPUT_FORMATS, lost_harmonics, output_format, write_gaussians
 
 __all__ = [
     "AUTO",
+    "OUTPUT_FORMATS",
     "Alignment",
     "CameraFile",
     "Placed",
@@ -34,6 +36,8 @@ __all__ = [
     "kept_comments",
     "load_files",
     "load_scene",
+    "lost_harmonics",
+    "output_format",
     "place_views",
     "ply_notes",
     "read_cameras",
@@ -45,5 +49,6 @@ __all__ = [
     "read_targets",
     "read_told",
     "to_cameras",
+    "write_gaussians",
     "write_ply",
 ]

@@ -18,12 +18,12 @@ from gsmerge.types import SH_C0
 
 CHUNK = 256  # Gaussians that share a range
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_RANGES = (
+RANGES = (
     *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
     *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"),
 )
-_COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
-_SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
+COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
+SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
 
 
 def is_compressed(data: PlyData) -> bool:
@@ -38,7 +38,7 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         SceneError: If chunks are missing or lack a column.
     """
     vertex, chunk = data["vertex"], data["chunk"]
-    for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, _RANGES, ("f4", "f8"))):
+    for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
         found = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
         odd = next((name for name in needed if found.get(name) not in types), None)
         if odd is not None:
@@ -52,9 +52,9 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
             path, f"expected {-(-count // CHUNK)} chunks for {count} Gaussians, found {chunk.count}", "export it again"
         )
     ids = np.arange(count) // CHUNK
-    colors = [p.name for p in chunk.properties if p.name in _COLORS and p.val_dtype in ("f4", "f8")]
+    colors = [p.name for p in chunk.properties if p.name in COLORS and p.val_dtype in ("f4", "f8")]
     with np.errstate(all="ignore"):  # what is not finite is set aside later
-        ranges = {name: np.asarray(chunk[name], np.float32)[ids] for name in (*_RANGES, *colors)}
+        ranges = {name: np.asarray(chunk[name], np.float32)[ids] for name in (*RANGES, *colors)}
     num_rest = _num_rest(path, data, count)
     names = [*REQUIRED, *(f"f_rest_{i}" for i in range(num_rest))]
     rows = np.empty(count, [(name, "<f4") for name in names])
@@ -66,7 +66,7 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
     for i in range(num_rest):
         stored = np.asarray(data["sh"][f"f_rest_{i}"], np.float32)
         share = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
-        rows[f"f_rest_{i}"] = (share - 0.5) * _SH_RANGE
+        rows[f"f_rest_{i}"] = (share - 0.5) * SH_RANGE
     return rows
 
 
@@ -114,7 +114,7 @@ def _fill_colors(rows: np.ndarray, words: np.ndarray, ranges: dict[str, np.ndarr
         rows["opacity"] = np.log(alpha) - np.log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
     for name, channel, shift in zip(SH0, "rgb", (24, 16, 8), strict=True):
         color = ((words >> np.uint32(shift)) & np.uint32(255)) / 255.0
-        if all(key in ranges for key in _COLORS):
+        if all(key in ranges for key in COLORS):
             low, high = ranges[f"min_{channel}"], ranges[f"max_{channel}"]
             with np.errstate(all="ignore"):
                 color = low * (1 - color) + high * color

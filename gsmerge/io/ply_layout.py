@@ -1,6 +1,6 @@
 """The columns of a Gaussian splat in a PLY file, and the ranges of what they may hold.
 
-Log scales, logits and channel-major harmonics exist only in the three ``ply`` modules.
+Log scales, logits and channel-major harmonics exist only in what reads and writes files.
 """
 
 from __future__ import annotations

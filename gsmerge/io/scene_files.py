@@ -18,7 +18,7 @@ from gsmerge.io.images import list_images
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 _NO_GAUSSIANS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # point clouds that others put there
-_RESULT = re.compile(r"\.compact(\.level\d+)?\.ply$")
+_RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 
 
 @dataclass(frozen=True)

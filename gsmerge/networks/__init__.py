@@ -2,6 +2,7 @@
 
 from gsmerge.networks.apply import (
     Learned,
+    decode_described,
     decode_gaussians,
     encode_features,
     match_geometry,
@@ -11,6 +12,7 @@ from gsmerge.networks.apply import (
 from gsmerge.networks.checkpoint import Checkpoint, find_checkpoint, load_checkpoint, save_checkpoint
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds, NetworkOptions
+from gsmerge.networks.tokens import described_by
 
 __all__ = [
     "Bounds",
@@ -18,7 +20,9 @@ __all__ = [
     "Learned",
     "NetworkOptions",
     "Networks",
+    "decode_described",
     "decode_gaussians",
+    "described_by",
     "encode_features",
     "find_checkpoint",
     "load_checkpoint",

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from gsmerge.geometry import rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
 from gsmerge.networks.residuals import HALF, RESIDUAL, bounded, move_features, move_gaussians, squashed
@@ -29,16 +30,25 @@ class Learned:
         members: The scene's Gaussians.
         cameras: Its views.
         seed: Chooses the members of groups that are too large to look at all.
+        precision: ``"float32"`` or ``"bfloat16"``, of the networks' own arithmetic.
     """
 
     networks: Networks
     members: Members
     cameras: Cameras
     seed: int = 0
+    precision: str = "float32"
 
     def describe(self, features: FeatureGaussians) -> Described:
         """The Feature Gaussians as the networks see them."""
         return describe(features, self.members, self.cameras)
+
+    def through(self, network: nn.Module, *inputs: Tensor) -> Tensor:
+        """What one of the networks says: float32 on the CPU, wherever it runs; several outputs side by side."""
+        device = next(network.parameters()).device
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            found = network(*(one.to(device) for one in inputs))
+        return (torch.cat(found, 1) if isinstance(found, tuple) else found).float().cpu()
 
 
 def by_table(sizes: np.ndarray, most: int, columns: int, work: Work) -> Tensor:
@@ -84,8 +94,7 @@ def encoder_outputs(features: FeatureGaussians, described: Described, learned: L
         own = torch.from_numpy(np.repeat(rows, width))
         tokens = member_tokens(learned.members, ids[found][picked.reshape(-1)], described, own)
         group = described.group[torch.from_numpy(rows)]
-        both = learned.networks.encoder(tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
-        return torch.cat(both, 1)
+        return learned.through(learned.networks.encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
 
     return by_table(sizes, options.members, options.latent + 3, work)
 
@@ -112,6 +121,8 @@ def with_encoding(
 
 def match_geometry(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
     """Feature Gaussians as the K = 1 head would decode them, for matching (paper section 4.3)."""
+    if learned.networks.options.outputs == "absolute":
+        return features  # a head that begins at nothing says nothing of moments
     described = learned.describe(features)
     residuals = head_residuals(described.base, np.arange(len(features)), features, described, learned)
     return move_features(features, described.base, residuals, described.frames)
@@ -155,7 +166,7 @@ def merger_outputs(
         beside = part_tokens(base[ids], described, torch.from_numpy(np.repeat(rows, width)))
         tokens = torch.cat([beside, parts.latents[ids]], 1).unflatten(0, mask.shape)
         group = described.group[torch.from_numpy(rows)]
-        return learned.networks.merger(tokens, torch.from_numpy(mask), group)
+        return learned.through(learned.networks.merger, tokens, torch.from_numpy(mask), group)
 
     return by_table(sizes, options.members, RESIDUAL + options.latent, work)
 
@@ -166,12 +177,12 @@ def refine_features(features: FeatureGaussians, learned: Learned) -> FeatureGaus
         return features
     neighbors = nearest(features, learned.networks.options.neighbors)
     described = learned.describe(features)
-    raw = refiner_outputs(features, described, neighbors, learned.networks)
+    raw = refiner_outputs(features, described, neighbors, learned)
     return with_corrections(features, described, raw, learned.networks)[0]
 
 
 def refiner_outputs(
-    features: FeatureGaussians, described: Described, neighbors: np.ndarray, networks: Networks
+    features: FeatureGaussians, described: Described, neighbors: np.ndarray, learned: Learned
 ) -> Tensor:
     """``[g,13+latent]`` raw corrections from ``neighbors [g,k]``, -1 where there are fewer."""
     count, width = len(features), neighbors.shape[1] + 1
@@ -185,9 +196,10 @@ def refiner_outputs(
         beside = part_tokens(described.base[ids], described, own)
         same = (views[ids] == views[own]).float()[:, None]
         tokens = torch.cat([beside, same, features.latents[ids]], 1).unflatten(0, (len(rows), width))
-        return networks.refiner(tokens, mask.unflatten(0, (len(rows), width)), described.group[torch.from_numpy(rows)])
+        inside, group = mask.unflatten(0, (len(rows), width)), described.group[torch.from_numpy(rows)]
+        return learned.through(learned.networks.refiner, tokens, inside, group)
 
-    columns = RESIDUAL + networks.options.latent
+    columns = RESIDUAL + learned.networks.options.latent
     return by_table(np.full(count, width), 1 << (width - 1).bit_length(), columns, work)
 
 
@@ -235,9 +247,41 @@ def decode_gaussians(
         features: The Feature Gaussians.
         learned: The networks and the scene.
     """
-    described = learned.describe(features)
+    return decode_described(children, parents, features, learned.describe(features), learned)
+
+
+def decode_described(
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+) -> Gaussians:
+    """:func:`decode_gaussians` of Feature Gaussians that are described already: no members are looked at."""
+    children = head_starts(children, parents, features, described, learned.networks)
     residuals = head_residuals(children, parents, features, described, learned)
     return move_gaussians(children, residuals, described.frames[torch.from_numpy(parents)])
+
+
+def head_starts(
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, networks: Networks
+) -> Gaussians:
+    """What the heads correct: the children; for absolute outputs a round grey Gaussian in the place of each.
+
+    It stands at its group's place, as large as the group, half transparent, with the axes of the group's frame. Those
+    of the backing layer, and five or more of one parent, stay: no head looks at them.
+    """
+    if networks.options.outputs == "residual":
+        return children
+    sizes = np.bincount(parents, minlength=len(features))[parents]
+    taken = torch.from_numpy((sizes <= SLOTS[-1]) & ~features.backing.numpy()[parents])
+    own = torch.from_numpy(parents)
+    place, size = described.base.means[own], described.sizes[own, None].expand(-1, 3)
+    axes = rotmat_to_quat(described.frames.double())[own].to(children.quats)
+    return replace(
+        children,
+        means=torch.where(taken[:, None], place, children.means),
+        quats=torch.where(taken[:, None], axes, children.quats),
+        scales=torch.where(taken[:, None], size, children.scales),
+        opacities=torch.where(taken, 0.5, children.opacities),
+        sh0=torch.where(taken[:, None, None], 0.0, children.sh0),
+    )
 
 
 def head_residuals(
@@ -255,10 +299,10 @@ def head_residuals(
         places = np.arange(slots)[None]
         mask = places < sizes[rows, None]
         ids = first[rows, None] + np.where(mask, places, 0)
-        raw = _head_outputs(slots, children, (rows, ids, mask), features, described, networks)
+        raw = _head_outputs(slots, children, (rows, ids, mask), features, described, learned)
         taken = torch.from_numpy(mask.reshape(-1))
         where = torch.from_numpy(ids.reshape(-1))[taken]
-        residuals = residuals.index_copy(0, where, bounded(raw[taken], networks.options.bounds))
+        residuals = residuals.index_copy(0, where, bounded(raw[taken], networks.options.head_bounds))
     return residuals
 
 
@@ -268,17 +312,17 @@ def _head_outputs(
     table: tuple[np.ndarray, np.ndarray, np.ndarray],
     features: FeatureGaussians,
     described: Described,
-    networks: Networks,
+    learned: Learned,
 ) -> Tensor:
     """``[r·slots,13]`` raw corrections of a table of parents' rows, children's rows and mask."""
     parents, ids, mask = table
-    head = networks.heads[str(slots)]
+    head = learned.networks.heads[str(slots)]
 
     def work(rows: np.ndarray, _: int) -> Tensor:
         own = torch.from_numpy(parents[rows])
         picked = torch.from_numpy(ids[rows].reshape(-1))
         beside = part_tokens(children[picked], described, own.repeat_interleave(slots)).unflatten(0, (len(rows), slots))
-        found = head(features.latents[own], described.group[own], beside, torch.from_numpy(mask[rows]))
-        return found.flatten(1)
+        known = features.latents[own], described.group[own]
+        return learned.through(head, *known, beside, torch.from_numpy(mask[rows])).flatten(1)
 
     return by_table(np.full(len(parents), slots), slots, slots * RESIDUAL, work).reshape(-1, RESIDUAL)

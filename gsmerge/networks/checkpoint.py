@@ -23,6 +23,7 @@ from gsmerge.networks.options import NetworkOptions
 SCHEMA = 1  # of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --checkpoint none"
+SHIPPED = Path(__file__).with_name("shipped.safetensors")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,8 @@ class Checkpoint:
     def facts(self) -> dict[str, Any]:
         """What a report says of it."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
-        head = {"checkpoint": str(self.path), "schema": SCHEMA, "gsmerge": self.version}
+        name = "shipped" if self.path == SHIPPED else str(self.path)
+        head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
         return head | sizes | {"training": dict(self.training)}
 
 
@@ -78,13 +80,34 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
         told = str(error).splitlines()[0]
         raise SceneError(path, f"expected a safetensors file, could not read it ({told})", REMEDY) from error
     options, training, version = _header(path, header)
-    networks = Networks(options)
-    _check_tensors(path, tensors, networks.state_dict())
-    networks.load_state_dict(tensors)
-    return Checkpoint(networks.eval().requires_grad_(False), path, version, training)
+    return Checkpoint(build_networks(path, options, tensors), path, version, training)
 
 
-def _header(path: Path, header: Mapping[str, str]) -> tuple[NetworkOptions, dict[str, Any], str]:
+def build_networks(
+    path: Path, options: Mapping[str, Any], tensors: Mapping[str, Tensor], remedy: str = REMEDY
+) -> Networks:
+    """Networks of some sizes and weights, ready for use.
+
+    Args:
+        path: The file that they are from.
+        options: Sizes, as ``asdict`` gave them.
+        tensors: Weights by name.
+        remedy: What to do where they do not fit.
+
+    Raises:
+        SceneError: If the sizes are out of range, or the weights others than they ask for.
+    """
+    try:
+        networks = Networks(NetworkOptions.from_dict(options))
+    except (ValueError, TypeError) as error:
+        words = str(error).splitlines()[0]
+        raise SceneError(path, f"expected a header that describes the networks ({words})", remedy) from error
+    _check_tensors(path, tensors, networks.state_dict(), remedy)
+    networks.load_state_dict(dict(tensors))
+    return networks.eval().requires_grad_(False)
+
+
+def _header(path: Path, header: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any], str]:
     """Sizes of the networks, figures of the training, and the version that wrote them."""
     if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
@@ -96,30 +119,30 @@ def _header(path: Path, header: Mapping[str, str]) -> tuple[NetworkOptions, dict
         for name, kind in (("options", dict), ("training", dict), ("gsmerge", str)):
             if not isinstance(told.get(name), kind):
                 raise ValueError(f"no {name}")
-        return NetworkOptions.from_dict(told["options"]), told["training"], told["gsmerge"]
-    except (ValueError, TypeError, RecursionError) as error:
+        return told["options"], told["training"], told["gsmerge"]
+    except (ValueError, RecursionError) as error:
         words = str(error).splitlines()[0]
         raise SceneError(path, f"expected a header that describes the networks ({words})", REMEDY) from error
 
 
-def _check_tensors(path: Path, tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+def _check_tensors(path: Path, tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor], remedy: str) -> None:
     """Whether all tensors are there, and what they should be."""
     for name in sorted(tensors.keys() ^ wanted.keys()):
         found = "a tensor too many" if name in tensors else "none"
-        raise SceneError(path, f"expected the tensors of its networks, found {found}: {name}", REMEDY)
+        raise SceneError(path, f"expected the tensors of its networks, found {found}: {name}", remedy)
     for name, tensor in tensors.items():
         if tensor.shape != wanted[name].shape or tensor.dtype != torch.float32:
             have, want = list(tensor.shape), list(wanted[name].shape)
-            raise SceneError(path, f"{name}: expected float32 {want}, found {tensor.dtype} {have}", REMEDY)
+            raise SceneError(path, f"{name}: expected float32 {want}, found {tensor.dtype} {have}", remedy)
         if not bool(torch.isfinite(tensor).all()):
-            raise SceneError(path, f"{name}: expected finite numbers, found others", REMEDY)
+            raise SceneError(path, f"{name}: expected finite numbers, found others", remedy)
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
     """The checkpoint that was asked for and what to tell the user; None where the analytic stages work alone.
 
     Args:
-        name: A file, or ``"none"``.
+        name: A file, ``"shipped"``: the one in the package, or ``"none"``.
         required: A checkpoint that cannot be used is an error; otherwise it is told, and the stages work without.
 
     Raises:
@@ -128,7 +151,7 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     if name == "none":
         return None, []
     try:
-        return load_checkpoint(name), []
+        return load_checkpoint(SHIPPED if name == "shipped" else name), []
     except SceneError as error:
         if required:
             raise

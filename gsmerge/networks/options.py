@@ -43,9 +43,13 @@ class Bounds:
             _expect_number(f.name, getattr(self, f.name), 8.0)
 
 
+WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of outputs that begin at nothing
+OUTPUTS = ("residual", "absolute")
+
+
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Sizes of the networks.
+    """Sizes of the networks, and what their heads say.
 
     Args:
         width: Width of the tokens, a multiple of ``heads``.
@@ -56,6 +60,8 @@ class NetworkOptions:
         members: Most members of a group that the encoder looks at; larger groups are sampled.
         neighbors: Neighbours that the refiner looks at.
         bounds: Largest corrections.
+        outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, the paper's: they know none,
+            and correct a round grey Gaussian at the group's place, within bounds that exclude nothing sensible.
 
     Raises:
         ValueError: If a size is out of range or they do not go together.
@@ -69,8 +75,16 @@ class NetworkOptions:
     members: int = 16
     neighbors: int = 8
     bounds: Bounds = field(default_factory=Bounds)
+    outputs: str = "residual"
+
+    @property
+    def head_bounds(self) -> Bounds:
+        """What the heads may change at most."""
+        return WIDE if self.outputs == "absolute" else self.bounds
 
     def __post_init__(self) -> None:
+        if self.outputs not in OUTPUTS:
+            raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
         most = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
         for name, limit in (most | {"neighbors": 64}).items():
             _expect_count(name, getattr(self, name), limit)

@@ -7,7 +7,7 @@ scale of the world drop out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -48,20 +48,24 @@ class Described:
 
 def describe(features: FeatureGaussians, members: Members, cameras: Cameras) -> Described:
     """Feature Gaussians for the networks."""
-    base, views = feature_to_gaussians(features), own_views(features, members, cameras)
-    frames = ray_frames(features.means, views, cameras)
-    scales = base.scales / features.spreads[:, None]
-    sizes, footprints = sizes_of(scales).clamp_min(TINY), features.footprints.clamp_min(TINY)
-    group = _group_numbers(features, base, frames, sizes, footprints)
+    views = own_views(features, members, cameras)
+    bare = described_by(features, views, torch.zeros(len(features), 0), cameras)
     places = image_places(features.means, views, cameras)
     told = evidence(features.means, features.sh0, views, members, cameras)
-    return Described(base, frames, sizes, footprints, views, torch.cat([group, places, told], 1).nan_to_num())
+    return replace(bare, group=torch.cat([_group_numbers(features, bare), places, told], 1).nan_to_num())
 
 
-def _group_numbers(
-    features: FeatureGaussians, base: Gaussians, frames: Tensor, sizes: Tensor, footprints: Tensor
-) -> Tensor:
+def described_by(features: FeatureGaussians, views: Tensor, group: Tensor, cameras: Cameras) -> Described:
+    """Feature Gaussians whose ``views [g]`` and numbers ``group [g,GROUP]`` are known: no members are looked at."""
+    base = feature_to_gaussians(features)
+    sizes = sizes_of(base.scales / features.spreads[:, None]).clamp_min(TINY)
+    frames = ray_frames(features.means, views, cameras)
+    return Described(base, frames, sizes, features.footprints.clamp_min(TINY), views, group)
+
+
+def _group_numbers(features: FeatureGaussians, bare: Described) -> Tensor:
     """``[g,17]``: scales, opacity, mass, optical depth, members, colour, covariance."""
+    base, frames, sizes, footprints = bare.base, bare.frames, bare.sizes, bare.footprints
     num_members = (features.starts[1:] - features.starts[:-1]).float()
     local = frames.transpose(1, 2) @ (features.covars / sizes[:, None, None] ** 2) @ frames
     columns = [

@@ -1,7 +1,7 @@
 """Training of the networks on what the fit itself finds out about scenes, and on renders against photos."""
 
 from gsmerge.training.examples import Example, make_example, read_examples
-from gsmerge.training.loop import Trained, train
+from gsmerge.training.loop import Trained, network_device, train
 from gsmerge.training.options import TrainOptions, read_config
 from gsmerge.training.presets import preset_options
 from gsmerge.training.subjects import Subject, make_subject
@@ -13,6 +13,7 @@ __all__ = [
     "Trained",
     "make_example",
     "make_subject",
+    "network_device",
     "preset_options",
     "read_config",
     "read_examples",

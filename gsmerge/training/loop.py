@@ -1,7 +1,7 @@
 """The training run: AdamW on random crops, validation, checkpoints; killed at any time, it goes on where it was.
 
-The first steps learn from what the fit changed. Regression to a mean overshoots what is ambiguous, so later ones
-compare renders with photos.
+The first steps, if so wanted, learn from what the fit changed alone. Regression to a mean overshoots what is ambiguous,
+so all others compare renders with photos.
 
 Every random number hangs on the seed and the step, and crops are worked on alone and added up in order. So a run that
 was interrupted ends with the same bytes as one that was not, on any number of threads.
@@ -68,6 +68,7 @@ def train(
     options: TrainOptions | None = None,
     *,
     threads: int | None = None,
+    device: str = "cpu",
     progress: Told | None = None,
 ) -> Trained:
     """Train networks, or go on with the run that the folder holds.
@@ -79,10 +80,12 @@ def train(
             of each validation scene.
         options: Settings.
         threads: Threads to use; None: all processors. The result does not depend on it.
+        device: Where the networks run: ``"cpu"``, ``"cuda"``, or ``"auto"``, CUDA where torch finds it. Windows are
+            rendered on the CPU. On CUDA a run repeats to rounding, not to the bit.
         progress: Called after every step.
 
     Raises:
-        ValueError: If there are no examples.
+        ValueError: If there are no examples, or torch finds no CUDA device and is told to use it.
         GsmergeError: If LPIPS has a weight, and its own are not installed.
         SceneError: If the folder holds another run, or cannot be written.
     """
@@ -93,13 +96,32 @@ def train(
         require_lpips("vgg")
     out.mkdir(parents=True, exist_ok=True)
     with use_threads(threads):
-        return _run(examples, validation or examples, out, options, progress)
+        return _run(examples, validation or examples, out, options, network_device(device), progress)
+
+
+def network_device(wanted: str) -> str:
+    """The device that ``"cpu"``, ``"cuda"`` or ``"auto"`` means on this machine.
+
+    Raises:
+        ValueError: If the name is unknown, or torch finds no CUDA device and it is wanted.
+    """
+    if wanted not in ("cpu", "cuda", "auto"):
+        raise ValueError(f'device: expected "cpu", "cuda" or "auto", got {wanted!r}')
+    found = wanted != "cpu" and torch.cuda.is_available()
+    if wanted == "cuda" and not found:
+        raise ValueError('device: expected a CUDA device, torch finds none; use "cpu"')
+    return "cuda" if found else "cpu"
 
 
 def _run(
-    examples: Sequence[Example], validation: Sequence[Example], out: Path, options: TrainOptions, progress: Told | None
+    examples: Sequence[Example],
+    validation: Sequence[Example],
+    out: Path,
+    options: TrainOptions,
+    device: str,
+    progress: Told | None,
 ) -> Trained:
-    learner = _fresh(options)
+    learner = _fresh(options, device)
     scales, judge = target_scales(examples), make_judge(validation, options)
     hashes = {kind: [e.sha256 for e in part] for kind, part in (("data", examples), ("validation", validation))}
     step, rows = _resumed(out, learner, {"options": options.to_dict(), **hashes})
@@ -114,7 +136,7 @@ def _run(
             mean = float(torch.stack(losses).mean())
             rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **judged})
             losses = []
-            told = {"step": step, "loss": mean, "validation": judged, "options": options.to_dict(), **hashes}
+            told = {"step": step, "loss": mean, "figures": judged, "options": options.to_dict(), **hashes}
             if is_best(rows, options):
                 save_checkpoint(out / "best.safetensors", learner.smooth, told)
             save_checkpoint(out / "last.safetensors", learner.smooth, told)
@@ -136,11 +158,11 @@ def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
     return last["validation_loss"] < min((row["validation_loss"] for row in before), default=float("inf"))
 
 
-def _fresh(options: TrainOptions) -> Learner:
+def _fresh(options: TrainOptions, device: str) -> Learner:
     """New networks that hang on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        networks = Networks(options.network)
+        networks = Networks(options.network).to(device)
     optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
     return Learner(networks, deepcopy(networks).requires_grad_(False), optimizer)
 

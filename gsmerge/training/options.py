@@ -40,7 +40,8 @@ class TrainOptions:
         crop: Merged Feature Gaussians of a crop: the nearest to one of them.
         inner: Share of a crop that is judged; the rest are neighbours.
         turn_weight: Weight of the rotation in the loss: axes of like length have none.
-        photo_start: Share of the steps after which renders are compared with photos; 1: never.
+        photo_start: Share of the steps after which renders are compared with photos; 1: never. Of two runs of
+            400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.
         novel: Share of the windows that are in novel views, where there are any.
         photo_scale: Sides of the photos are divided by it.
         window: Side of a window of a photo that is rendered, pixels.
@@ -80,7 +81,7 @@ class TrainOptions:
     crop: int = 512
     inner: float = 0.6
     turn_weight: float = 0.1
-    photo_start: float = 0.3
+    photo_start: float = 0.0
     novel: float = 0.75
     photo_scale: int = 2
     window: int = 96

@@ -13,6 +13,7 @@ from gsmerge.networks import Learned, Networks
 from gsmerge.networks.apply import (
     encoder_outputs,
     head_residuals,
+    head_starts,
     merger_outputs,
     nearest,
     refiner_outputs,
@@ -21,7 +22,7 @@ from gsmerge.networks.apply import (
 )
 from gsmerge.networks.residuals import MEAN, move_gaussians, rotated
 from gsmerge.networks.tokens import Described
-from gsmerge.training.examples import Example
+from gsmerge.training.examples import Example, differences
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 
@@ -99,18 +100,21 @@ def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
     parts, shifts = with_encoding(parts, described, encoder_outputs(parts, described, learned), networks)
     merged, corrections = _merged(parts, described, shifts, Matches(local, len(crop.rows)), learned)
     described = learned.describe(merged)
-    raw = refiner_outputs(merged, described, nearest(merged, networks.options.neighbors), networks)
+    raw = refiner_outputs(merged, described, nearest(merged, networks.options.neighbors), learned)
     refined, residuals = with_corrections(merged, described, raw, networks)
     described = learned.describe(refined)
-    if crop.k == 1:
-        heads = head_residuals(described.base, np.arange(len(refined)), refined, described, learned)
-        before = corrections + residuals
-        last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
-        return Foreseen(before + heads, move_gaussians(described.base, last, described.frames))
-    children = example.levels[crop.k].children[crop.children]
+    analytic = example.levels[crop.k].children[crop.children]
     parents = torch.searchsorted(crop.rows, example.levels[crop.k].parents[crop.children])
+    frames, single = described.frames[parents], crop.k == 1
+    children = described.base if single else analytic
+    children = head_starts(children, parents.numpy(), refined, described, networks)
     heads = head_residuals(children, parents.numpy(), refined, described, learned)
-    return Foreseen(heads, move_gaussians(children, heads, described.frames[parents]))
+    before = corrections + residuals if single else torch.zeros_like(heads)
+    last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
+    gaussians = move_gaussians(children, last, frames)
+    if networks.options.outputs == "absolute":
+        return Foreseen(differences(analytic, gaussians, frames), gaussians)
+    return Foreseen(before + heads, gaussians)
 
 
 def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:

@@ -11,6 +11,7 @@ from gsmerge.training.options import TrainOptions
 # Table of hyperparameters and section 5.1 of the paper. What it does not say is as in the default.
 PAPER: Mapping[str, Any] = MappingProxyType(
     {
+        "network": {"outputs": "absolute"},
         "views": tuple(range(1, 13)),
         "match": "aabb",
         "levels": (1, 2, 4),

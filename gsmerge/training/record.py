@@ -38,11 +38,11 @@ class Learner:
 
 def save_state(path: Path, learner: Learner, told: Mapping[str, Any]) -> None:
     """Write weights, their means, moments and what else the run knows; an existing file is replaced."""
-    tensors = {}
+    tensors: dict[str, torch.Tensor] = {}
     for name, parameter, mean in learner.pairs():
-        tensors[f"weight.{name}"], tensors[f"mean.{name}"] = parameter.detach(), mean.detach()
         moments = learner.optimizer.state[parameter]
-        tensors[f"first.{name}"], tensors[f"second.{name}"] = moments["exp_avg"], moments["exp_avg_sq"]
+        named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
+        tensors |= {f"{kind}.{name}": tensor.detach().cpu() for kind, tensor in named.items()}
     with atomic_output(path, overwrite=True) as temporary:
         save_file(tensors, temporary, {FORMAT: json.dumps(dict(told))})
 
@@ -60,7 +60,8 @@ def load_state(path: Path, learner: Learner) -> dict[str, Any]:
                 for name, parameter, mean in learner.pairs():
                     parameter.copy_(file.get_tensor(f"weight.{name}"))
                     mean.copy_(file.get_tensor(f"mean.{name}"))
-                    first, second = file.get_tensor(f"first.{name}"), file.get_tensor(f"second.{name}")
+                    kept = (file.get_tensor(f"{kind}.{name}") for kind in ("first", "second"))
+                    first, second = (tensor.to(parameter.device) for tensor in kept)
                     step = torch.tensor(float(told["step"]))
                     learner.optimizer.state[parameter] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:

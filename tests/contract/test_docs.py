@@ -14,8 +14,9 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
+from gsmerge.cli.options import CHECKPOINTS as TOLD_CHECKPOINTS
 from gsmerge.io import Reading
-from gsmerge.options import METHODS
+from gsmerge.options import CHECKPOINTS, METHODS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -33,10 +34,16 @@ def readme_commands(root: Path) -> list[str]:
     return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
 
 
+def test_names_of_checkpoints_are_the_library_s() -> None:
+    assert TOLD_CHECKPOINTS == CHECKPOINTS
+
+
 def test_commands_are_the_documented_ones() -> None:
     assert set(COMMANDS) == {
         "compact",
         "batch",
+        "encode",
+        "decode",
         "evaluate",
         "inspect",
         "segment",
@@ -99,11 +106,15 @@ def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device", "checkpoint"}
+    known |= {"levels", "device", "checkpoint", "precision", "geometry"}
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None
-    worded = {"robust": "unless --fit full or a draft", "fit_steps": "by effort", "match": "overlap, none for a draft"}
+    worded = {
+        "robust": "unless --fit full or a draft",
+        "fit_steps": "by effort",
+        "match": "overlap, none for a draft",
+    }
     real = {name: worded.get(name, str(library[name])) for name in told}
     assert told == real
 

@@ -47,17 +47,28 @@ def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pyte
     assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
 
 
-def test_failures_while_writing_leave_nothing(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("command", ["compact", "encode", "decode"])
+def test_failures_while_writing_leave_nothing(
+    command: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def half(path: Path, *_: object, **__: object) -> None:
         Path(path).write_bytes(b"ply\n")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.files.write_ply", half)
+    quick = ("--superpixels", 40, "--no-robust")
+    given: Path = scene_copy
+    if command == "decode":
+        given = scene_copy / "kept.gsm"
+        assert run("encode", scene_copy, "-o", given, *quick).code == 0
+    for place in ("gsmerge.files", "gsmerge.io"):
+        monkeypatch.setattr(f"{place}.write_gaussians", half)
+    monkeypatch.setattr("gsmerge.stored.file.save_encoded", half)
     before = listing(scene_copy)
-    outcome = run("compact", scene_copy, "--quiet", "--superpixels", 40, "--fit", "none", "--no-robust")
+    more = {"compact": (*quick, "--fit", "none"), "encode": quick, "decode": ()}[command]
+    outcome = run(command, given, "--quiet", *more)
     assert outcome.code == 3
     assert outcome.err.count("\n") == 1
-    assert "scene.compact.ply" in outcome.err
+    assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
     assert "No space left" in outcome.err
     assert listing(scene_copy) == before
 

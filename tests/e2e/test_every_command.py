@@ -17,6 +17,7 @@ from .conftest import Run, listing
 VIEWS = 5
 WRITERS: dict[str, tuple[str, ...]] = {
     "compact": ("small.ply", "--superpixels", "100", "--no-robust", "--fit", "none"),
+    "encode": ("small.gsm", "--superpixels", "100", "--no-robust"),
     "segment": ("overlays", "--superpixels", "100"),
     "render": ("renders",),
     "preview": ("sheet.png", "--views", "1"),
@@ -134,6 +135,7 @@ def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Pa
     ("command", "output"),
     [
         ("compact", "transforms.json"),
+        ("encode", "transforms.json"),
         ("preview", "transforms.json"),
         ("preview", "images/view_00.png"),
         ("render", "images"),

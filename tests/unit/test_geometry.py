@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsmerge.geometry import covariances, project, quat_to_rotmat
+from gsmerge.geometry import covariances, project, quat_to_rotmat, rotmat_to_quat
 from gsmerge.types import Cameras
 
 HALF = math.sqrt(0.5)
@@ -52,3 +52,13 @@ def test_projection_by_hand() -> None:
     assert where.dtype == depths.dtype == torch.float64
     np.testing.assert_allclose(where[0, :3], [[8, 6], [3, 6], [8, -4]])
     np.testing.assert_allclose(depths[0], [2, 2, 2, -1])
+
+
+def test_quaternions_of_rotations_and_back() -> None:
+    """Half turns about every axis too, where a quaternion's first component is zero."""
+    generator = torch.Generator().manual_seed(3)
+    quats = torch.nn.functional.normalize(torch.randn(64, 4, generator=generator, dtype=torch.float64), dim=1)
+    quats = torch.cat([quats, torch.eye(4, dtype=torch.float64)])
+    found = rotmat_to_quat(quat_to_rotmat(quats))
+    torch.testing.assert_close((found * quats).sum(1).abs(), torch.ones(68, dtype=torch.float64))
+    assert (found.gather(1, found.abs().argmax(1, keepdim=True)) > 0).all()

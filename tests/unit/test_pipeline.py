@@ -10,7 +10,7 @@ from gsmerge import CompactOptions, PixelScene, compact
 from gsmerge.journal import STAGES
 from gsmerge.segment import SEGMENTATIONS
 
-USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine")]
+USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "choose")]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     asked = scenes.compacted(scene, robust=True).report
     assert list(asked.seconds) == USUAL
     assert "merge" in asked.choices
-    assert "merge" in scenes.compacted(scene, fit="none").report.choices
+    assert "merge" in scenes.compacted(scene, fit="none", checkpoint="none").report.choices
     assert "merge" not in scenes.compacted(scene, fit="color", robust=False).report.choices
     assert "merge" not in scenes.compacted(scene, fit="none", effort="draft").report.choices
 
@@ -67,7 +67,7 @@ def test_progress_tells_every_stage(scene: PixelScene) -> None:
 
 def test_progress_tells_every_step_of_the_full_fit(scene: PixelScene) -> None:
     calls: list[tuple[str, int, int]] = []
-    compact(scene, fit_steps=12, progress=lambda *call: calls.append(call))
+    compact(scene, fit_steps=12, checkpoint="none", progress=lambda *call: calls.append(call))
     steps = [call for call in calls if call[0].startswith("fit:")]
     assert [call[1:] for call in steps] == [(step, 12) for step in range(1, 13)]
     assert all("photos" in name and "held out" in name for name, _, _ in steps)
@@ -85,7 +85,7 @@ def test_without_photos(scene: PixelScene) -> None:
 @pytest.mark.parametrize("views", [[0], [0, 1]])
 def test_few_views_choose_among_spreads(scene: PixelScene, views: list[int]) -> None:
     """Nothing can be left out, so no weighing; and no backing layer."""
-    result = scenes.compacted(scenes.take_views(scene, views), fit="none")
+    result = scenes.compacted(scenes.take_views(scene, views), fit="none", checkpoint="none")
     assert sorted(result.report.choices["merge_scores"]) == ["plain", "wide", "wider"]
 
 
@@ -197,3 +197,39 @@ def test_wrong_settings_are_refused_before_any_stage(scene: PixelScene) -> None:
     with pytest.raises(ValueError, match="k: expected 1 to 8"):
         compact(scene, k=0, progress=lambda name, *_: calls.append(name))
     assert calls == []
+
+
+def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -> None:
+    """What real exports suffer from is mended; a scene without those errors stays as the analytic stages make it."""
+    starts = set()
+    for one in (scenes.make_scene(scenes.wall(), scenes.arc(3, 32, 24), opacity=(0.99, 0.99)), scene):
+        for settings in ({"fit": "none"}, {"fit_steps": 12}):
+            found = scenes.compacted(one, **settings)
+            scores = found.report.choices["start_scores"]
+            learned = scores["learned"] > scores["analytic"]
+            assert ("networks" in found.report.choices) == learned
+            alone = scenes.compacted(one, **settings, checkpoint="shipped" if learned else "none")
+            assert scenes.identical(found.gaussians, alone.gaussians)
+            starts.add(learned)
+    assert starts == {False, True}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"effort": "draft"}, {"effort": "fast"}, {"fit": "color"}, {}, {"robust": True}, {"checkpoint": "none"}],
+)
+def test_networks_are_left_out(scene: PixelScene, settings: dict) -> None:
+    assert not {"networks", "start_scores"} & set(scenes.compacted(scene, **settings).report.choices)
+
+
+def test_networks_without_photos_are_judged_by_the_colours_of_the_pixels(scene: PixelScene) -> None:
+    found = scenes.compacted(replace(scene, images=None)).report.choices["start_scores"]
+    with_photos = scenes.compacted(scene, fit="none", robust=False).report.choices["start_scores"]
+    assert found == pytest.approx(with_photos, abs=0.5)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, 8])
+def test_a_budget_is_met_whatever_k_is_and_however_the_fit_grows(scene: PixelScene, k: int) -> None:
+    found = scenes.compacted(scene, k=k, budget=300, fit_steps=160)
+    assert found.report.choices["fit"]["accepted"]
+    assert len(found.gaussians) == 300

@@ -75,7 +75,7 @@ def plan(*, photos: bool = True, views: int = 12, wanted: int | None = None, **s
     return report.plan_document(
         {"ply": "scene.ply", "cameras": "transforms.json", "images": None},
         (views, 100, 200),
-        options.to_dict(),
+        options.to_dict() | {"checkpoint": options.networks(photos=photos)},
         output_path=Path("small.ply"),
         per_view=800,
         photos=photos,
@@ -109,6 +109,7 @@ def test_plan_says_what_will_not_run() -> None:
     assert told() == (False, "full")
     assert told(fit="color") == (True, "color")
     assert told(fit="color", robust=False) == (False, "color")
+    assert told(fit="none", effort="draft") == (False, "none")
     assert told(robust=True) == (True, "full")
     assert told(photos=False) == (False, "none")
     assert told(photos=False, robust=True) == (False, "none")

@@ -150,6 +150,8 @@ def test_names_are_filled_in(tmp_path: Path) -> None:
     assert name("{stem}.ply", "set/room.v2/scene.ply") == "scene.ply"
     assert name("{parent}-{stem}.k{k}.ply", "set/a.ply") == "set-a.k2.ply"
     assert name("{index:04d}.ply", "a.ply") == "0012.ply"
+    assert name("{stem}.ply", "a.compressed.ply") == "a.ply"
+    assert name("{stem}.compressed.ply", "a.ply") == "a.compressed.ply"
     assert name("{stem}.ply", ".") == f"{tmp_path.name}.ply"
     with pytest.raises(UsageError, match="does not fit"):
         name("{stem:d}.ply", "a.ply")

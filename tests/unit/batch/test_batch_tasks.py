@@ -105,6 +105,25 @@ def test_levels_are_part_of_a_result(scene: Path, out: Path) -> None:
     assert run(scene, out, levels)["status"] == DONE
 
 
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".splat"])
+def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
+    told = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
+    found = run(scene, out, told)
+    assert [file["path"] for file in found["files"]] == [f"room{ending}", f"room.level1{ending}"]
+    assert sorted(results(out)) == sorted(file["path"] for file in found["files"])
+    start = {".compressed.ply": b"ply\n", ".spz": b"\x1f\x8b"}.get(ending, b"")
+    assert (out / f"room{ending}").read_bytes().startswith(start)
+    assert run(scene, out, told)["status"] == SKIPPED
+    assert run(scene, out)["files"][0]["bytes"] > 2 * found["files"][0]["bytes"]
+
+
+def test_a_named_checkpoint_is_no_file(scene: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(scene, out)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "auto").write_bytes(b"something else")
+    assert run(scene, out)["status"] == SKIPPED
+
+
 def test_a_bad_scene_is_a_record(scene: Path, out: Path) -> None:
     (scene / "scene.ply").write_bytes((scene / "scene.ply").read_bytes()[:5000])
     found = run(scene, out)
@@ -177,7 +196,7 @@ def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.Monke
 
 KILLS = {
     "while it reads": ("gsmerge.batch.task.scene_key", True),
-    "while it writes": ("gsmerge.files.write_ply", False),
+    "while it writes": ("gsmerge.files.write_gaussians", False),
     "before the result is renamed": ("pathlib.Path.replace", True),
     "before the record": ("gsmerge.batch.task.append_line", True),
     "before the lock is gone": ("gsmerge.batch.locks.Lock.finish", True),
@@ -237,7 +256,7 @@ def failing(code: int, where: Path) -> Any:
 def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.files.write_ply", failing(errno.ENOSPC, out))
+    monkeypatch.setattr("gsmerge.files.write_gaussians", failing(errno.ENOSPC, out))
     found = run(scene, out)
     assert found["status"] == FAILED
     assert "room.ply: could not be written (No space left on device)" in found["error"]

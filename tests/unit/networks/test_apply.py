@@ -8,7 +8,7 @@ import pytest
 import torch
 from learned import SMALL, Made, made, noisy
 
-from gsmerge.decode import DecodeOptions, decode
+from gsmerge.decode import DecodeOptions, decode, divide
 from gsmerge.match import MatchOptions, match
 from gsmerge.merge import merge, take
 from gsmerge.moments import feature_to_gaussians
@@ -277,3 +277,61 @@ def test_sizes_are_checked() -> None:
         with pytest.raises(ValueError, match=next(iter(wrong))):
             NetworkOptions(**wrong)  # type: ignore[arg-type]
     assert 150_000 <= Networks().num_parameters <= 300_000
+
+
+def test_absolute_heads_know_no_children(scene: Made) -> None:
+    """Whatever the children are, what is decoded is the same; untrained, a round grey Gaussian at the group's place."""
+    absolute = replace(SMALL, outputs="absolute")
+    plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.learned(Networks(absolute).requires_grad_(False))
+    encoded = encode_features(scene.features, untrained)
+    analytic = decode(encoded, scene.members, plain)
+    found = decode(encoded, scene.members, plain, learned=untrained)
+    parents = torch.cdist(found.means, encoded.means).argmin(1)
+    torch.testing.assert_close(found.means, feature_to_gaussians(encoded).means[parents])
+    assert torch.equal(found.scales, found.scales[:, :1].expand(-1, 3))
+    assert torch.equal(found.opacities, torch.full((len(found),), 0.5))
+    assert not found.sh0.any()
+    assert match_geometry(encoded, untrained) is encoded
+    learned = scene.learned(noisy(absolute))
+    rows = np.repeat(np.arange(len(encoded)), 2)
+    both = analytic[: 2 * len(encoded)] if len(analytic) >= 2 * len(encoded) else None
+    for start in (feature_to_gaussians(encoded)[torch.from_numpy(rows)], both):
+        if start is not None:
+            moved = decode_gaussians(start, rows, encoded, learned)
+            assert not torch.equal(moved.means[::2], moved.means[1::2])  # slots tell siblings apart
+            assert float(moved.scales.max() / found.scales.max()) < np.exp(6.1)
+
+
+def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
+    learned = scene.learned(noisy(replace(SMALL, outputs="absolute")))
+    backing = torch.zeros(len(scene.features), dtype=torch.bool)
+    backing[0] = True
+    features = encode_features(replace(scene.features, backing=backing), learned)
+    options = DecodeOptions(k=6, min_opacity=0.0)
+    plain, found = decode(features, scene.members, options), decode(features, scene.members, options, learned=learned)
+    sizes = np.bincount(parents_of(features, scene, 6), minlength=len(features))
+    whole = torch.from_numpy(np.repeat((sizes > 4) | backing.numpy(), sizes))
+    assert bool(whole.any())
+    assert_close(found[whole], plain[whole])
+    assert not torch.equal(found.means[~whole], plain.means[~whole])
+
+
+def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:
+    """The Feature Gaussian of each child."""
+    return divide(features, scene.members, np.full(len(features), k))[1]
+
+
+def test_half_the_digits_give_nearly_the_same(scene: Made) -> None:
+    """Only the networks' own arithmetic is rounded: what they correct keeps all its digits."""
+    exact = scene.learned(noisy())
+    rough = replace(exact, precision="bfloat16")
+    options = DecodeOptions(k=2, min_opacity=0.0)
+    found = [
+        decode(encode_features(scene.features, learned), scene.members, options, learned=learned)
+        for learned in (exact, rough)
+    ]
+    assert found[1].means.dtype == torch.float32
+    assert not torch.equal(found[0].means, found[1].means)
+    sizes = found[0].scales.amax(1, keepdim=True)
+    assert float(((found[0].means - found[1].means) / sizes).abs().max()) < 0.1
+    assert float((found[0].opacities - found[1].opacities).abs().max()) < 0.1

@@ -245,8 +245,9 @@ def test_untrained_networks_render_what_the_analytic_stages_do(example: Example)
         assert window_psnr(window, None) > 10
 
 
-def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example) -> None:
-    networks = noisy(TINY)
+@pytest.mark.parametrize("outputs", ["residual", "absolute"])
+def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example, outputs: str) -> None:
+    networks = noisy(replace(TINY, outputs=outputs))
     learned = Learned(networks, example.members, example.cameras, 0)
     merged = merge(encode_features(example.features, learned), example.matches, learned)
     wanted = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), learned=learned)

@@ -19,7 +19,7 @@ from gsmerge.merge import merge
 from gsmerge.networks import Learned, NetworkOptions, Networks, load_checkpoint
 from gsmerge.networks.apply import encode_features, head_residuals, refine_features
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussians
-from gsmerge.training import Example, TrainOptions, make_example, preset_options, read_config, train
+from gsmerge.training import Example, TrainOptions, make_example, network_device, preset_options, read_config, train
 from gsmerge.training.examples import differences
 from gsmerge.training.predict import Crop, owners, predicted, random_crop
 from gsmerge.training.subjects import Subject, make_subject
@@ -265,3 +265,22 @@ def test_rate_rises_and_falls() -> None:
     assert rates[0] == pytest.approx(OPTIONS.rate / 10)
     assert rates[-1] < 0.01 * OPTIONS.rate
     assert (np.diff(rates[10:]) < 0).all()
+
+
+def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there, told in ((False, "cpu"), (True, "cuda")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert network_device("cpu") == "cpu"
+        assert network_device("auto") == told
+    assert network_device("cuda") == "cuda"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for wanted in ("cuda", "tpu"):
+        with pytest.raises(ValueError, match="device: expected"):
+            network_device(wanted)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_training_on_cuda(example: Example, tmp_path: Path) -> None:
+    on_cpu, on_cuda = (train([example], [], tmp_path / device, OPTIONS, device=device) for device in ("cpu", "cuda"))
+    assert on_cuda.loss == pytest.approx(on_cpu.loss, rel=0.05)
+    assert load_checkpoint(on_cuda.best).networks.num_parameters > 0

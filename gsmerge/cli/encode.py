@@ -1,0 +1,191 @@
+"""``gsmerge encode``: a scene as Feature Gaussians in a file, to be decoded at any K without its images."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gsmerge.cli import options as opt
+from gsmerge.cli.compact import print_plan
+from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
+from gsmerge.cli.paths import check_output, input_files
+from gsmerge.cli.settings import reading_of, settings_of
+
+if TYPE_CHECKING:
+    from gsmerge.io import Reading, SceneFiles
+    from gsmerge.io.ply import OpacityChoice
+    from gsmerge.options import CompactOptions
+    from gsmerge.stored.encoded import Encoded
+
+MaxKOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=8,
+        help="Most Gaussians per superpixel that can be decoded: more take more space.",
+        show_default="4, or 8 with a --budget",
+        rich_help_panel=opt.COUNT,
+    ),
+]
+EncodedOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="The encoded scene.", show_default="SCENE.gsm", rich_help_panel=opt.OUTPUT),
+]
+
+
+def encode(
+    scene: opt.SceneArgument,
+    cameras: opt.CamerasOption = None,
+    images: opt.ImagesOption = None,
+    opacity: opt.OpacityOption = opt.Opacity.auto,
+    dialect: opt.DialectOption = "auto",
+    quats: opt.QuatsOption = opt.Quats.auto,
+    order: opt.OrderOption = opt.Order.auto,
+    scene_scale: opt.SceneScaleOption = None,
+    max_side: opt.MaxSideOption = None,
+    superpixels: opt.SuperpixelsOption = None,
+    density: opt.DensityOption = None,
+    segmentation: opt.SegmentationOption = None,
+    effort: opt.EffortOption = None,
+    k: opt.KOption = None,
+    max_k: MaxKOption = None,
+    budget: opt.BudgetOption = None,
+    max_bytes: opt.MaxBytesOption = None,
+    preset: opt.PresetOption = None,
+    robust: opt.RobustOption = None,
+    match: opt.MatchOption = None,
+    geometry: opt.GeometryOption = None,
+    unseen: opt.UnseenOption = None,
+    checkpoint: opt.CheckpointOption = None,
+    require_checkpoint: opt.RequireCheckpointOption = False,
+    precision: opt.PrecisionOption = None,
+    output: EncodedOption = None,
+    seed: opt.SeedOption = None,
+    threads: opt.ThreadsOption = None,
+    overwrite: opt.OverwriteOption = False,
+    json: opt.JsonOption = False,
+    dry_run: opt.DryRunOption = False,
+    quiet: opt.QuietOption = False,
+    debug: opt.DebugOption = False,
+) -> None:
+    """Keep a scene as merged Feature Gaussians, of which gsmerge decode makes what compact --fit none makes."""
+    start = perf_counter()
+    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    from gsmerge.io import find_scene_files
+
+    files = find_scene_files(scene, cameras=cameras, images=images)
+    out = output or files.ply.with_suffix(".gsm")
+    named = () if checkpoint in (None, *opt.CHECKPOINTS) else (Path(str(checkpoint)),)
+    check_output(out, (*input_files(files), *named), overwrite=overwrite)
+    chosen: dict[str, Any] = {"k": k, "superpixels": superpixels, "density": density, "segmentation": segmentation}
+    chosen |= {"effort": effort, "budget": budget, "max_bytes": max_bytes, "preset": preset, "robust": robust}
+    chosen |= {
+        "match": match,
+        "geometry": geometry,
+        "unseen": unseen,
+        "checkpoint": checkpoint,
+        "fit": "none",
+        "seed": seed,
+    }
+    chosen |= {"require_checkpoint": require_checkpoint or None, "precision": precision, "threads": threads}
+    settings = settings_of(chosen)
+    if dry_run:
+        print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
+        return
+    document = _run(
+        files, settings, out, max_k, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
+        start=start,
+    )  # fmt: skip
+    say_notes(document["notes"], quiet=quiet or json)
+    if json:
+        from gsmerge.report import to_json
+
+        sys.stdout.write(to_json(document))
+    elif not quiet:
+        print(one_line(_summary(document)))
+
+
+def _run(
+    files: SceneFiles,
+    settings: CompactOptions,
+    out: Path,
+    max_k: int | None,
+    *,
+    opacity: OpacityChoice,
+    reading: Reading,
+    overwrite: bool,
+    quiet: bool,
+    start: float,
+) -> dict[str, Any]:
+    """Read, encode and write; returns the report."""
+    from gsmerge.files import recognised_of, superpixels_per_view
+    from gsmerge.io import atomic_output, kept_comments, load_files
+    from gsmerge.report import file_sha256
+    from gsmerge.stored.encode import encode_scene
+    from gsmerge.stored.file import save_encoded
+
+    imported = perf_counter()
+    with atomic_output(out, overwrite=overwrite) as temporary:
+        loaded = load_files(files, opacity=opacity, reading=reading)
+        recognised, scene = recognised_of(loaded), loaded.scene
+        comments, notes = list(kept_comments(loaded.ply)), loaded.notes
+        del loaded  # which knows the row of every pixel
+        if len(scene):
+            superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
+        read = perf_counter()
+        with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
+            encoded = encode_scene(scene, settings, max_k=max_k, progress=progress)
+        done = perf_counter()
+        source = {"name": files.ply.name, "sha256": file_sha256(files.ply), "bytes": files.ply.stat().st_size}
+        source |= {"comments": comments, "notes": list(notes)}
+        save_encoded(temporary, encoded, overwrite=True, source=source)
+    seconds = {"import": imported - start, "read": read - imported, "encode": done - read}
+    seconds["write"] = perf_counter() - done
+    return _document(files.ply, out, encoded, source | recognised, notes, seconds)
+
+
+def _document(
+    ply: Path,
+    out: Path,
+    encoded: Encoded,
+    found: Mapping[str, Any],
+    notes: Sequence[str],
+    seconds: Mapping[str, float],
+) -> dict[str, Any]:
+    """The report as plain JSON types."""
+    from gsmerge.report import document_head
+
+    settings, size = encoded.settings, out.stat().st_size
+    told = {name: value for name, value in found.items() if name not in ("name", "comments", "notes")}
+    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.num_most, "max_k": settings.most}
+    return {
+        **document_head(),
+        "input": {"path": str(ply), "num_gaussians": settings.num_input, **told},
+        "output": {"path": str(out), "bytes": size, **counts},
+        "ratio_bytes": size / found["bytes"],
+        "options": encoded.about["options"],
+        "seed": encoded.about["options"]["seed"],
+        "choices": encoded.about["choices"],
+        "seconds": {name: round(value, 4) for name, value in seconds.items()},
+        "total_seconds": round(sum(seconds.values()), 4),
+        "notes": [*notes, *encoded.about["notes"]],
+    }
+
+
+def _summary(document: Mapping[str, Any]) -> str:
+    """The line that it ends with."""
+    from gsmerge.report import human_bytes
+
+    before, after = document["input"], document["output"]
+    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
+    seconds = f"{document['total_seconds']:.1f} s ({stages})"
+    return (
+        f"{after['path']}: {before['num_gaussians']:,} Gaussians -> {after['num_groups']:,} groups,"
+        f" {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])} ({100 * document['ratio_bytes']:.0f} %);"
+        f" decodes to {after['num_gaussians_at_most']:,} Gaussians at most; {seconds}"
+    )

@@ -1,0 +1,188 @@
+"""``encode`` and ``decode`` on a scene that the project makes itself, and outputs in other formats."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import gsmerge
+
+from .conftest import Run, listing
+
+SMALL = ("--superpixels", 120)
+
+
+@pytest.fixture(scope="module")
+def encoded(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The made scene, encoded by the command line. Read only."""
+    from gsmerge.cli import main
+
+    out = tmp_path_factory.mktemp("encoded") / "scene.gsm"
+    assert main(["encode", str(made_scene), "-o", str(out), *map(str, SMALL), "--quiet"]) == 0
+    return out
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_decoded_is_compacted_byte_for_byte(k: int, encoded: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    one, other = tmp_path / "one.ply", tmp_path / "other.ply"
+    assert run("decode", encoded, "--k", k, "-o", one).code == 0
+    assert run("compact", made_scene, "--fit", "none", *SMALL, "--k", k, "-o", other).code == 0
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize("wish", [("--budget", "3%"), ("--budget", "700", "--k", "2"), ("--k", "auto")], ids=str)
+def test_what_encoding_was_asked_for_is_what_decoding_gives(
+    wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    kept, one, other = tmp_path / "scene.gsm", tmp_path / "one.ply", tmp_path / "other.ply"
+    assert run("encode", made_scene, *SMALL, *wish, "-o", kept).code == 0
+    assert run("decode", kept, "-o", one).code == 0
+    assert run("compact", made_scene, "--fit", "none", *SMALL, *wish, "-o", other).code == 0
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_no_images_are_needed(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    assert run("encode", scene_copy / "scene.ply", *SMALL).code == 0
+    kept = shutil.move(scene_copy / "scene.gsm", tmp_path / "alone.gsm")
+    shutil.rmtree(scene_copy)
+    outcome = run("decode", kept)
+    assert outcome.code == 0, outcome.err
+    assert outcome.out.count("\n") == 1
+    assert "groups ->" in outcome.out
+    assert len(gsmerge.read_ply(tmp_path / "alone.compact.ply").gaussians) > 100
+
+
+def test_encoding_twice_gives_the_same_bytes(encoded: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    again = tmp_path / "again.gsm"
+    assert run("encode", made_scene, *SMALL, "-o", again, "--threads", 1).code == 0
+    assert again.read_bytes() == encoded.read_bytes()
+
+
+def test_a_budget_at_decoding_is_met(encoded: Path, tmp_path: Path, run: Run) -> None:
+    found = gsmerge.load_encoded(encoded)
+    outcome = run("decode", encoded, "--budget", len(found) + 100, "-o", tmp_path / "a.ply", "--json")
+    document = json.loads(outcome.out)
+    assert document["budget"] == str(len(found) + 100)
+    assert len(found) <= document["output"]["num_gaussians"] <= len(found) + 100
+    few = run("decode", encoded, "--budget", 10, "-o", tmp_path / "b.ply")
+    assert (few.code, few.err.count("\n")) == (2, 1)
+    assert f"expected at least {len(found)}, one for each group, got 10" in few.err
+
+
+def test_the_reports(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    kept, out = tmp_path / "scene.gsm", tmp_path / "out.ply"
+    document = json.loads(run("encode", made_scene, *SMALL, "-o", kept, "--json").out)
+    digest = hashlib.sha256((made_scene / "scene.ply").read_bytes()).hexdigest()
+    assert document["input"]["sha256"] == digest
+    assert document["input"]["num_gaussians"] == 30_720
+    assert document["output"]["bytes"] == kept.stat().st_size
+    assert document["output"]["max_k"] == 4
+    assert document["ratio_bytes"] == pytest.approx(kept.stat().st_size / (made_scene / "scene.ply").stat().st_size)
+    assert set(document["seconds"]) == {"import", "read", "encode", "write"}
+    document = json.loads(run("decode", kept, "--k", 2, "-o", out, "--json").out)
+    assert document["input"]["encoding"]["source"]["sha256"] == digest
+    assert document["input"]["encoding"]["source"]["name"] == "scene.ply"
+    assert document["output"]["bytes"] == out.stat().st_size
+    assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
+    assert set(document["seconds"]) == {"import", "read", "decode", "write"}
+
+
+def test_no_folder_of_this_machine_is_in_the_file(encoded: Path, made_scene: Path) -> None:
+    assert str(made_scene.parent).encode() not in encoded.read_bytes()
+
+
+def test_a_dry_run_of_decode_writes_nothing(encoded: Path, tmp_path: Path, run: Run) -> None:
+    before = listing(encoded.parent)
+    outcome = run("decode", encoded, "--k", 4, "-o", tmp_path / "a.ply", "--dry-run")
+    assert outcome.code == 0
+    assert "would write" in outcome.out
+    assert listing(tmp_path) == {}
+    assert listing(encoded.parent) == before
+    assert json.loads(run("decode", encoded, "-o", tmp_path / "a.ply", "--dry-run", "--json").out)["dry_run"] is True
+
+
+def test_quiet_decoding_says_nothing(encoded: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("decode", encoded, "--k", "auto", "-o", tmp_path / "a.ply", "--quiet")
+    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+def test_decoding_replaces_nothing(encoded: Path, tmp_path: Path, run: Run) -> None:
+    kept = Path(shutil.copy(encoded, tmp_path / "scene.gsm"))
+    before = kept.read_bytes()
+    assert run("decode", kept, "-o", kept, "--overwrite").code == 2
+    (tmp_path / "there.ply").write_text("precious")
+    assert run("decode", kept, "-o", tmp_path / "there.ply").code == 2
+    assert (tmp_path / "there.ply").read_text() == "precious"
+    assert kept.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--k", "8"), "k: expected 1 to 4"),
+        (("--k", "9"), "expected 1 to 8"),
+        (("--k", "2", "--budget", "900"), "expected one of k and budget"),
+        (("--budget", "many"), "budget: expected a number"),
+    ],
+)
+def test_wrong_usage_is_one_line(
+    arguments: tuple[str, ...], words: str, encoded: Path, tmp_path: Path, run: Run
+) -> None:
+    outcome = run("decode", encoded, *arguments, "-o", tmp_path / "a.ply")
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert words in outcome.err
+    assert listing(tmp_path) == {}
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"\x10\x00\x00\x00\x00\x00\x00\x00{}"])
+def test_other_files_are_refused_in_one_line(content: bytes, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "scene.gsm").write_bytes(content)
+    outcome = run("decode", tmp_path / "scene.gsm")
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1)
+    assert list(listing(tmp_path)) == ["scene.gsm"]
+
+
+def test_half_a_file_is_refused_and_nothing_is_lost(encoded: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "scene.gsm").write_bytes(encoded.read_bytes()[:-100])
+    (tmp_path / "out.ply").write_text("precious")
+    outcome = run("decode", tmp_path / "scene.gsm", "-o", tmp_path / "out.ply", "--overwrite")
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1)
+    assert "encode the scene again" in outcome.err
+    assert (tmp_path / "out.ply").read_text() == "precious"
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".splat"])
+def test_other_formats_by_name(ending: str, encoded: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    one, other = tmp_path / f"one{ending}", tmp_path / f"other{ending}"
+    assert run("decode", encoded, "-o", one).code == 0
+    document = json.loads(run("compact", made_scene, "--fit", "none", *SMALL, "-o", other, "--json").out)
+    assert one.read_bytes() == other.read_bytes()
+    assert document["output"]["bytes"] == other.stat().st_size
+    assert not one.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\ncomment opacity")
+
+
+def test_levels_in_other_formats(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "a.compressed.ply"
+    assert run("compact", made_scene, *SMALL, "--fit", "none", "--levels", 2, "-o", out).code == 0
+    assert sorted(listing(tmp_path)) == ["a.compressed.ply", "a.level1.compressed.ply"]
+    assert len(gsmerge.read_ply(tmp_path / "a.level1.compressed.ply").gaussians) > 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("-o", "a.ksplat"), "expected a name that ends in"),
+        (("-o", "a.spz", "--max-bytes", "5MB"), "--max-bytes: expected an output as .ply, got .spz"),
+    ],
+)
+def test_formats_that_cannot_be_written(
+    arguments: tuple[str, ...], words: str, scene_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    monkeypatch.chdir(scene_copy)
+    outcome = run("compact", scene_copy, *arguments)
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert words in outcome.err
