@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
+from gsmerge.cli import network_options as net
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import duration, one_line, say, say_notes, total_progress
 from gsmerge.cli.settings import given_settings, reading_of, told_as_usage
@@ -119,16 +120,16 @@ def batch(
     levels: opt.LevelsOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
-    geometry: opt.GeometryOption = None,
+    geometry: net.GeometryOption = None,
     fit: opt.FitOption = None,
     device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
     unseen: opt.UnseenOption = None,
     method: opt.MethodOption = None,
-    checkpoint: opt.CheckpointOption = None,
-    require_checkpoint: opt.RequireCheckpointOption = False,
-    precision: opt.PrecisionOption = None,
+    checkpoint: net.CheckpointOption = None,
+    require_checkpoint: net.RequireCheckpointOption = False,
+    precision: net.PrecisionOption = None,
     seed: opt.SeedOption = None,
     threads: Annotated[
         int | None, _option("Threads of each scene.", min=1, show_default="processors by jobs", panel=opt.OUTPUT)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from gsmerge.cli import network_options as net
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.paths import check_format, check_output, default_output, input_files
@@ -46,16 +47,16 @@ def compact(
     levels: opt.LevelsOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
-    geometry: opt.GeometryOption = None,
+    geometry: net.GeometryOption = None,
     fit: opt.FitOption = None,
     device: opt.DeviceOption = None,
     fit_steps: opt.FitStepsOption = None,
     time_budget: opt.TimeBudgetOption = None,
     unseen: opt.UnseenOption = None,
     method: opt.MethodOption = None,
-    checkpoint: opt.CheckpointOption = None,
-    require_checkpoint: opt.RequireCheckpointOption = False,
-    precision: opt.PrecisionOption = None,
+    checkpoint: net.CheckpointOption = None,
+    require_checkpoint: net.RequireCheckpointOption = False,
+    precision: net.PrecisionOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -75,7 +76,7 @@ def compact(
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
     inputs = input_files(files)
-    if checkpoint not in (None, *opt.CHECKPOINTS):
+    if checkpoint not in (None, *net.CHECKPOINTS):
         inputs = (*inputs, Path(checkpoint))
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:

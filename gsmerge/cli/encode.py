@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gsmerge.cli import network_options as net
 from gsmerge.cli import options as opt
 from gsmerge.cli.compact import print_plan
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
@@ -59,11 +60,11 @@ def encode(
     preset: opt.PresetOption = None,
     robust: opt.RobustOption = None,
     match: opt.MatchOption = None,
-    geometry: opt.GeometryOption = None,
+    geometry: net.GeometryOption = None,
     unseen: opt.UnseenOption = None,
-    checkpoint: opt.CheckpointOption = None,
-    require_checkpoint: opt.RequireCheckpointOption = False,
-    precision: opt.PrecisionOption = None,
+    checkpoint: net.CheckpointOption = None,
+    require_checkpoint: net.RequireCheckpointOption = False,
+    precision: net.PrecisionOption = None,
     output: EncodedOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -80,7 +81,7 @@ def encode(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or files.ply.with_suffix(".gsm")
-    named = () if checkpoint in (None, *opt.CHECKPOINTS) else (Path(str(checkpoint)),)
+    named = () if checkpoint in (None, *net.CHECKPOINTS) else (Path(str(checkpoint)),)
     check_output(out, (*input_files(files), *named), overwrite=overwrite)
     chosen: dict[str, Any] = {"k": k, "superpixels": superpixels, "density": density, "segmentation": segmentation}
     chosen |= {"effort": effort, "budget": budget, "max_bytes": max_bytes, "preset": preset, "robust": robust}

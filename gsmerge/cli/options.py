@@ -74,13 +74,6 @@ class Match(str, Enum):
     none = "none"
 
 
-class Geometry(str, Enum):
-    """What is matched where networks are loaded."""
-
-    analytic = "analytic"
-    decoded = "decoded"
-
-
 class Unseen(str, Enum):
     """Choices of ``--unseen``."""
 
@@ -94,13 +87,6 @@ class Fit(str, Enum):
     full = "full"
     color = "color"
     none = "none"
-
-
-class Precision(str, Enum):
-    """Arithmetic of the networks."""
-
-    float32 = "float32"
-    bfloat16 = "bfloat16"
 
 
 class Device(str, Enum):
@@ -338,14 +324,6 @@ MatchOption = Annotated[
     Match | None,
     typer.Option(help="Merging across views.", show_default="overlap, none for a draft", rich_help_panel=MERGING),
 ]
-GeometryOption = Annotated[
-    Geometry | None,
-    typer.Option(
-        help="What is matched where networks are loaded: moments, or what the K = 1 head makes of them.",
-        show_default="analytic",
-        rich_help_panel=MERGING,
-    ),
-]
 FitOption = Annotated[
     Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
 ]
@@ -357,30 +335,6 @@ MethodOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
-CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
-CheckpointOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE|NAME",
-        help="Trained networks that correct what the analytic stages make: a file, shipped, none, or auto: the "
-        "shipped ones where they gain.",
-        show_default="auto",
-        rich_help_panel=MERGING,
-    ),
-]
-RequireCheckpointOption = Annotated[
-    bool,
-    typer.Option(
-        "--require-checkpoint",
-        help="A checkpoint that cannot be used is an error, instead of a note.",
-        rich_help_panel=MERGING,
-    ),
-]
-PrecisionOption = Annotated[
-    Precision | None,
-    typer.Option(help="Arithmetic of the networks.", show_default="float32", rich_help_panel=MERGING),
-]
-TrainDeviceOption = Annotated[Device, typer.Option(help="Where the networks run; windows are rendered on the CPU.")]
 UnseenOption = Annotated[
     Unseen | None,
     typer.Option(

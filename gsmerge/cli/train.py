@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gsmerge.cli import network_options as net
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.settings import told_as_usage
@@ -59,7 +60,7 @@ def train(
     cache: Cache = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
-    device: opt.TrainDeviceOption = opt.Device.cpu,
+    device: net.TrainDeviceOption = opt.Device.cpu,
     json: opt.JsonOption = False,
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,

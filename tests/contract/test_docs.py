@@ -14,7 +14,7 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.cli.options import CHECKPOINTS as TOLD_CHECKPOINTS
+from gsmerge.cli.network_options import CHECKPOINTS as TOLD_CHECKPOINTS
 from gsmerge.io import Reading
 from gsmerge.options import CHECKPOINTS, METHODS
 

@@ -1,0 +1,58 @@
+"""Options of the commands that use or train networks."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Annotated
+
+import typer
+
+from gsmerge.cli.options import MERGING, Device
+
+
+class Geometry(str, Enum):
+    """What is matched where networks are loaded."""
+
+    analytic = "analytic"
+    decoded = "decoded"
+
+
+class Precision(str, Enum):
+    """Arithmetic of the networks."""
+
+    float32 = "float32"
+    bfloat16 = "bfloat16"
+
+
+GeometryOption = Annotated[
+    Geometry | None,
+    typer.Option(
+        help="What is matched where networks are loaded: moments, or what the K = 1 head makes of them.",
+        show_default="analytic",
+        rich_help_panel=MERGING,
+    ),
+]
+CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
+CheckpointOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|NAME",
+        help="Trained networks that correct what the analytic stages make: a file, shipped, none, or auto: the "
+        "shipped ones where they gain.",
+        show_default="auto",
+        rich_help_panel=MERGING,
+    ),
+]
+RequireCheckpointOption = Annotated[
+    bool,
+    typer.Option(
+        "--require-checkpoint",
+        help="A checkpoint that cannot be used is an error, instead of a note.",
+        rich_help_panel=MERGING,
+    ),
+]
+PrecisionOption = Annotated[
+    Precision | None,
+    typer.Option(help="Arithmetic of the networks.", show_default="float32", rich_help_panel=MERGING),
+]
+TrainDeviceOption = Annotated[Device, typer.Option(help="Where the networks run; windows are rendered on the CPU.")]
