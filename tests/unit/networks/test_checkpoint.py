@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 import gsmerge
 from gsmerge.errors import SceneError
 from gsmerge.networks import find_checkpoint, load_checkpoint
+from gsmerge.networks.checkpoint import SHIPPED
 
 Spoil = Callable[[Path], None]
 
@@ -119,3 +120,15 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path: Path, damage: str)
 
 def test_none_is_nothing() -> None:
     assert find_checkpoint("none", required=False) == (None, [])
+
+
+def test_what_ships_says_what_it_is() -> None:
+    checkpoint, notes = find_checkpoint("shipped", required=True)
+    assert checkpoint is not None
+    assert notes == []
+    assert SHIPPED.stat().st_size < 8e6
+    facts = checkpoint.facts()
+    assert facts["checkpoint"] == "shipped"  # no path of the machine in a report
+    assert facts["training"]["figures"]["psnr_learned"] > facts["training"]["figures"]["psnr_analytic"] + 3
+    assert {"options", "data", "validation", "step"} <= facts["training"].keys()
+    assert "/" not in json.dumps(facts["training"])
