@@ -63,7 +63,7 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
             children = split_counts(features, members, max(0, grouping.wanted - len(features)))
             gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
     del features, members, learned
-    if source.scene.images is None:
+    if source.scene.images is None or not options.fit.looks:
         return gaussians
     with journal.stage("fit"):
         return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal)
@@ -200,10 +200,10 @@ def _fitted(
 ) -> Gaussians:
     """Gaussians that no photo shows left out, the rest fitted to the photos; ``goal``: how many, whether exactly."""
     wanted, exact = goal
-    photos = scene_photos(scene), scene_photos(scene, 2)
     journal.choices["begun_with"] = len(gaussians)
     # where nothing grows to the number asked for, nothing may fall below it either
     settings = replace(options.fit, prune=0.0) if exact and not options.fit.grows else options.fit
+    photos = scene_photos(scene), scene_photos(scene, 2)
     gaussians, report = fit(gaussians, photos, settings, wanted, options.seed, journal.fit_progress)
     if report:
         journal.choices["fit"] = asdict(report)

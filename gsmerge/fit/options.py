@@ -113,6 +113,11 @@ class FitOptions:
         return 1.0 if self.steps < HASTY_STEPS else 0.5 if self.steps >= LONG_STEPS else 0.7
 
     @property
+    def looks(self) -> bool:
+        """Whether the photos are looked at: to fit, or to leave out what none of them shows."""
+        return self.fit != "none" or (self.prune > 0 and self.effort != "draft")
+
+    @property
     def grows(self) -> bool:
         """Whether the fit begins with fewer Gaussians than are asked for, and adds the rest on the way."""
         return self.fit == "full" and self.steps >= GROW_STEPS

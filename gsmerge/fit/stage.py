@@ -47,8 +47,8 @@ def fit(
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    if options.fit == "none" and (options.prune == 0 or options.effort == "draft"):
-        return gaussians, None  # looking costs as much as all that was done before
+    if not options.looks:  # it costs as much as all that was done before
+        return gaussians, None
     keep = shown(gaussians, photos[1], options.prune)
     if options.fit == "none":
         return gaussians[keep], None
