@@ -29,7 +29,8 @@ class RobustOptions:
 
     Args:
         robust: Choose among the family by the photos; otherwise the plain merge is taken. None: unless a full fit
-            follows, which closes holes and moves surfaces itself and is better in the same time, or it is a draft.
+            follows, which closes holes and moves surfaces itself and is better in the same time, or it is a draft;
+            networks stand in for it, too.
         widen: Standard deviations of the "wide" members times this; a single layer of merged Gaussians is not
             closed at 1.
         boost: Factor on the optical depth before the other views' photos weigh it down.

@@ -209,8 +209,9 @@ def nearest(features: FeatureGaussians, count: int) -> np.ndarray:
 
     means, found = features.means.double().numpy(), np.full((len(features), count), -1, np.int64)
     with use_threads() as threads:
+        somewhere = np.isfinite(means).all(1)
         for layer in (features.backing.numpy(), ~features.backing.numpy()):
-            rows = np.flatnonzero(layer)
+            rows = np.flatnonzero(layer & somewhere)
             if len(rows) < 2:
                 continue
             near = min(count + 1, len(rows))

@@ -104,6 +104,7 @@ def move_features(features: FeatureGaussians, base: Gaussians, residuals: Tensor
     depth = wide[:, LOGIT]
     disc = wide[:, SIZE][:, 1:].sum(1)  # of the two larger axes: principal axes rise
     shift = rotated(frames, wide[:, MEAN] * sizes_of(base.scales / features.spreads[:, None]).double()[:, None])
+    shift = torch.where(shift.isfinite(), shift, 0)  # of what is as far away as numbers go
     return replace(
         features,
         means=(features.means + shift).float(),

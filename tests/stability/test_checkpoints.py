@@ -27,8 +27,11 @@ PLAIN = {"fit": "none", "match": "none", "robust": False, "superpixels": 100}
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(3))
     path = written(tmp_path / "a.safetensors", Networks())
-    chosen = {"superpixels": 80, "fit": "color", **settings}
-    plain, learned = gsmerge.compact(scene, **chosen), gsmerge.compact(scene, **chosen, checkpoint=str(path))
+    chosen = {"robust": False, "superpixels": 80, "fit": "color", **settings}
+    plain, learned = (
+        gsmerge.compact(scene, **chosen, checkpoint="none"),
+        gsmerge.compact(scene, **chosen, checkpoint=str(path)),
+    )
     assert identical(plain.gaussians, learned.gaussians)
     assert learned.report.choices["networks"]["checkpoint"] == str(path)
     assert "networks" not in plain.report.choices
@@ -37,10 +40,10 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
 
 def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(3))
-    chosen = {"fit": "none", "density": 0.1}
+    chosen = {"robust": False, "fit": "none", "density": 0.1}
     path = written(tmp_path / "a.safetensors", Networks())
     loose = shuffled(scene)
-    plain = gsmerge.compact(loose, **chosen)
+    plain = gsmerge.compact(loose, **chosen, checkpoint="none")
     assert identical(plain.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path)).gaussians)
     written(path, noisy())
     one = gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=1)
@@ -64,7 +67,7 @@ def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: d
 def test_a_checkpoint_that_cannot_be_used_is_told(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(2))
     path = tmp_path / "a.safetensors"
-    plain = gsmerge.compact(scene, **PLAIN)
+    plain = gsmerge.compact(scene, **PLAIN, checkpoint="none")
     for damage in ("missing", "truncated"):
         if damage == "truncated":
             path.write_bytes(written(path, noisy()).read_bytes()[:-100])
@@ -79,7 +82,7 @@ def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:
     with pytest.raises(gsmerge.SceneError, match=r"a\.safetensors"):
         gsmerge.compact(scene, **PLAIN, checkpoint=str(path), require_checkpoint=True)
     with pytest.raises(ValueError, match="require_checkpoint"):
-        gsmerge.compact(scene, **PLAIN, require_checkpoint=True)
+        gsmerge.compact(scene, **PLAIN, checkpoint="none", require_checkpoint=True)
     written(path, noisy())
     tensors = load_file(path)
     tensors["encoder.latent.bias"][0] = float("nan")
@@ -92,7 +95,7 @@ def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:
 def test_weights_a_hundred_times_as_large_stay_within_the_bounds(tmp_path: Path, k: int) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", scaled(noisy(), 100))
-    before = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0)
+    before = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0, checkpoint="none")
     after = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0, checkpoint=str(path))
     assert_invariants(after.gaussians, scene)
     a, b, bounds = before.gaussians, after.gaussians, Bounds()

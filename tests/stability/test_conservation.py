@@ -39,7 +39,9 @@ def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
 # 47: more children, more detail
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none", "checkpoint": "none"}], ids=str
+)
 def test_more_children_show_more(scene: PixelScene, settings: dict) -> None:
     found = [scenes.compacted(scene, density=0.044, k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in found]) > 0).all()

@@ -76,7 +76,7 @@ def test_two_sides_of_a_sheet_are_not_merged(method: str) -> None:
     footprint = 3 / cameras.width
     sides = [scenes.plane(3 - footprint, grey), scenes.plane(3 + footprint, grey)]
     scene = scenes.make_scene(sides, cameras)
-    found = scenes.compacted(scene, match=method, fit="none")
+    found = scenes.compacted(scene, match=method, fit="none", checkpoint="none")
     assert found.report.choices["clusters"] == found.report.choices["groups"]
     off = (found.gaussians.means[:, 2] - 3).abs() / footprint
     assert ((off - 1).abs() < 0.2).all()
