@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 from enum import Enum
 from pathlib import Path
@@ -36,11 +38,14 @@ Config = Annotated[
     typer.Option(help="TOML or JSON file with settings of the training; without it, the preset's."),
 ]
 Data = Annotated[
-    list[Path], typer.Option(metavar="DIR", help="A scene to learn from: a folder or .ply; may be repeated.")
+    list[Path],
+    typer.Option(metavar="DIR", help="Scenes to learn from: a folder, a folder of such, or a .ply; may be repeated."),
 ]
 Validation = Annotated[
     list[Path] | None,
-    typer.Option(metavar="DIR", help="A scene that helps to choose the best checkpoint only; may be repeated."),
+    typer.Option(
+        metavar="DIR", help="The same, of scenes that choose the best checkpoint only; not learned from if found."
+    ),
 ]
 Out = Annotated[Path, typer.Option(help="Folder of the checkpoints. A run that it holds is gone on with.")]
 Cache = Annotated[Path | None, typer.Option(help="Folder for fitted scenes.", show_default="OUT/examples")]
@@ -79,9 +84,10 @@ def train(
         options, chosen = replace(options, **changes), network_device(device.value)
     quiet = quiet or json
     with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, use_threads(threads):
-        folder = cache or out / "examples"
-        examples = [example for path in data for example in _examples(path, options, folder, progress)]
-        held = [example for path in validation or [] for example in _examples(path, options, folder, progress)]
+        folder, apart = cache or out / "examples", find_training_scenes(validation or [], out)
+        scenes = find_training_scenes(data, out, apart)
+        examples = [example for path in scenes for example in _examples(path, options, folder, progress)]
+        held = [example for path in apart for example in _examples(path, options, folder, progress)]
         notes = [] if held else ["without --validation, other crops of the same scenes choose the best checkpoint"]
         say_notes(notes, quiet=quiet)
 
@@ -100,6 +106,32 @@ def train(
                 f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"
             )
         )
+
+
+def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Path] = ()) -> list[Path]:
+    """The scenes that are named, and those in folders that are, each once.
+
+    Args:
+        given: Scenes, and folders with scenes, as ``gsmerge batch`` finds them.
+        out: Folder of the run, in which no scenes are looked for.
+        apart: Scenes for validation: left out where they are found in a folder, kept where they are named.
+
+    Raises:
+        SceneError: If something that was named does not exist or holds no scene.
+        UsageError: If nothing is left of what was named.
+    """
+    from gsmerge.batch.find import find_scenes
+    from gsmerge.errors import UsageError
+
+    kept, held = dict[str, Path](), {os.path.realpath(scene) for scene in apart}
+    for path in given:
+        for scene in find_scenes([str(path)], out):
+            real = os.path.realpath(scene)
+            if real not in held or os.path.realpath(path) == real:
+                kept.setdefault(real, scene)
+    if given and not kept:
+        raise UsageError(f"{given[0]}: expected scenes besides those of --validation, found none")
+    return list(kept.values())
 
 
 def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:

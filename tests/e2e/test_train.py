@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
+from shutil import copytree, rmtree
 
 import numpy as np
 from learned import SMALL, noisy, written
 
+from gsmerge.cli.train import find_training_scenes
 from gsmerge.networks import load_checkpoint
 from gsmerge.training import TrainOptions, read_examples
 from gsmerge.training.photometric import window_psnr
@@ -80,6 +81,29 @@ def test_settings_and_scenes_are_told_in_one_line(scene_copy: Path, run: Run, tm
         assert outcome.err.count("\n") == 1
     assert run("train", "--data", tmp_path / "nowhere", "--out", out).code == 3
     assert run("train", "--out", out).code == 2
+
+
+def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    folder, out = tmp_path / "scenes", tmp_path / "scenes" / "run"
+    for name in ("a", "deeper/b", "c"):
+        copytree(scene_copy, folder / name)
+    out.mkdir()
+    copytree(scene_copy, out / "not-a-scene-of-the-user")
+    held = find_training_scenes([folder / "c"], out)
+    assert held == [folder / "c"]
+    found = find_training_scenes([folder, folder / "a"], out, held)
+    assert found == [folder / "a", folder / "deeper/b"]
+    assert find_training_scenes([folder / "c"], out, held) == held  # it was named
+    config = tmp_path / "train.json"
+    config.write_text(json.dumps(CONFIG | {"steps": 1, "save_every": 1}))
+    call = ("train", "--data", folder, "--out", out, "--config", config)
+    done = run(*call, "--validation", folder / "c", "--json")
+    assert done.code == 0, done.err
+    training = load_checkpoint(out / "last.safetensors").training
+    assert (len(training["data"]), len(training["validation"])) == (2, 1)
+    outcome = run("train", "--data", folder / "deeper", "--validation", folder / "deeper/b", "--out", out)
+    assert outcome.code == 2
+    assert "besides those of --validation" in outcome.err
 
 
 def test_a_checkpoint_that_cannot_be_used(scene_copy: Path, run: Run) -> None:
