@@ -16,7 +16,7 @@ from gsmerge.grouping import Grouping
 from gsmerge.journal import Journal
 from gsmerge.match import match
 from gsmerge.merge import merge
-from gsmerge.moments import Members
+from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks import Checkpoint, Learned
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_photos
@@ -62,11 +62,14 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
         if grouping.exact and len(gaussians) > grouping.wanted:  # K each would be more than the fit may grow to
             children = split_counts(features, members, max(0, grouping.wanted - len(features)))
             gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
-    del features, members, learned
     if source.scene.images is None or not options.fit.looks:
         return gaussians
     with journal.stage("fit"):
-        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal)
+        rival = None
+        if learned is not None and options.fit.fit == "full":
+            rival = feature_to_gaussians(encode(source.scene, members, grouping.groups, options.encode))
+        del features, members, learned
+        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal, rival)
 
 
 def merged_groups(
@@ -197,14 +200,18 @@ def _fitted(
     goal: tuple[int, bool],
     options: CompactOptions,
     journal: Journal,
+    rival: Gaussians | None = None,
 ) -> Gaussians:
-    """Gaussians that no photo shows left out, the rest fitted to the photos; ``goal``: how many, whether exactly."""
+    """Gaussians that no photo shows left out, the rest fitted to the photos.
+
+    ``goal``: how many, whether exactly; ``rival``: the start without networks, which the fit has to beat.
+    """
     wanted, exact = goal
     journal.choices["begun_with"] = len(gaussians)
     # where nothing grows to the number asked for, nothing may fall below it either
     settings = replace(options.fit, prune=0.0) if exact and not options.fit.grows else options.fit
     photos = scene_photos(scene), scene_photos(scene, 2)
-    gaussians, report = fit(gaussians, photos, settings, wanted, options.seed, journal.fit_progress)
+    gaussians, report = fit(gaussians, photos, settings, wanted, options.seed, journal.fit_progress, rival)
     if report:
         journal.choices["fit"] = asdict(report)
         if not report.accepted:

@@ -171,6 +171,7 @@ def fit_full(
     progress: Progress | None = None,
     engine: Engine = KERNELS,
     masks: Masks | None = None,
+    rival: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
@@ -186,9 +187,13 @@ def fit_full(
         progress: Told after every step.
         engine: What it steps with.
         masks: Pixels that are looked at; None: all. Where no Gaussian is, none should be drawn to.
+        rival: Another start, whose blocks the fit has to beat where they are worse: networks have learnt to show the
+            photos whole, so that a fit of the rest takes from the blocks of what they made, and yet helps new views.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
     before, state.shares[:] = first_look(state, plan)
+    if rival is not None:
+        before = min(before, holdout_score(start_state(rival), plan))
     after = before
     queue: list[int] = []
     grows = options.grows

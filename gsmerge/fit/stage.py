@@ -31,6 +31,7 @@ def fit(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
+    rival: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
@@ -43,6 +44,7 @@ def fit(
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
         progress: Told after every step of the full fit.
+        rival: Another start that the full fit has to beat instead, see :func:`gsmerge.fit.full.fit_full`.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
@@ -54,7 +56,7 @@ def fit(
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device))
+        fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device), None, rival)
         fitted, report = _better_of(kept, fitted, report, photos[0])
         if report.accepted:
             return fitted, report

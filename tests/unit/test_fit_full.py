@@ -19,6 +19,7 @@ from gsmerge.fit.state import start_state
 from gsmerge.photos import Photos
 from gsmerge.render import plan_view, splat_adjoint
 from gsmerge.threads import use_threads
+from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
@@ -186,6 +187,19 @@ def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair)
     assert result is grey
     assert report.steps < 160  # judged before the steps that look at everything
     assert "no better" in report.stopped
+
+
+def test_a_rival_is_what_the_fit_has_to_beat(truth: Gaussians, noise: Pair) -> None:
+    """Held-out blocks that the start shows too well to be bettered do not forbid a fit; those of a rival would."""
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    _, alone = fit_full(grey, noise, LONG)
+    black = replace(truth, sh0=torch.full_like(truth.sh0, -0.5 / SH_C0))
+    _, report = fit_full(grey, noise, LONG, rival=black)
+    assert not alone.accepted
+    assert alone.holdout_before - 2 > report.holdout_before  # of black
+    assert report.accepted
+    _, better = fit_full(black, noise, LONG, rival=grey)
+    assert better == fit_full(black, noise, LONG)[1]  # its own blocks are the worse ones
 
 
 def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
