@@ -1,0 +1,75 @@
+"""State -> gaussians: decoded at any K or number, and fitted to the photos that the state has kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsmerge.canonical import Frame
+from gsmerge.errors import UsageError
+from gsmerge.fit import FitOptions, FitReport, fit, start_share
+from gsmerge.journal import Journal, Progress
+from gsmerge.online.pictures import Shots
+from gsmerge.online.state import OnlineState, as_encoded
+from gsmerge.stored.decode import decode_scene, plan_decode
+from gsmerge.threads import use_threads
+from gsmerge.types import Gaussians
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Gaussians of a state in the world frame, what the fit did (None without one), and sentences for the user."""
+
+    gaussians: Gaussians
+    fit: FitReport | None
+    notes: tuple[str, ...]
+
+
+def decode_state(
+    state: OnlineState,
+    *,
+    k: int | str | None = None,
+    budget: int | str | None = None,
+    options: FitOptions | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Decoded:
+    """The state as Gaussians in the world frame, fitted to the photos that it has kept.
+
+    Args:
+        state: Of one or more batches.
+        k: As of :func:`gsmerge.decode_scene`.
+        budget: As there. A full fit begins with fewer and grows to the number.
+        options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
+        seed: Everything random in the fit.
+        threads: Threads to use; None: all processors.
+        progress: As of :func:`gsmerge.compact`.
+
+    Raises:
+        UsageError: If a fit is asked for and the state has kept no photos, or K or the budget cannot be had.
+    """
+    replay = state.replay
+    options = options or FitOptions(fit="full" if len(replay) else "none")
+    encoded = as_encoded(state, solved=options.fit == "none")
+    if options.fit == "none":
+        notes = plan_decode(encoded, k=k, budget=budget).notes
+        return Decoded(decode_scene(encoded, k=k, budget=budget, threads=threads), None, notes)
+    if len(replay) == 0:
+        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend it with photos")
+    journal = Journal(progress)
+    plan = plan_decode(encoded, k=k, budget=budget)
+    wanted = int(plan.counts.sum())
+    begun = max(len(encoded), int(start_share(options) * wanted)) + encoded.num_kept
+    plain = replace(encoded, frame=Frame(torch.zeros(3, dtype=torch.float64), 1.0))
+    with use_threads(threads), torch.no_grad():
+        gaussians = decode_scene(plain, budget=begun, threads=threads)
+        images = replay.images.astype(np.float32) / np.float32(255)
+        shots = Shots(images, state.cameras[torch.from_numpy(replay.views)])
+        with journal.stage("fit"):
+            fitted, report = fit(
+                gaussians, (shots.photos(), shots.photos(2)), options, wanted, seed, journal.fit_progress
+            )
+    return Decoded(state.frame.leave(fitted), report, plan.notes)
