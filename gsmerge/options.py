@@ -23,6 +23,7 @@ METHODS = (
 )  # fmt: skip
 
 CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
+PRECISIONS = ("float32", "bfloat16")
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 
 
@@ -77,8 +78,8 @@ class CompactOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ValueError(f'precision: expected "float32" or "bfloat16", got {self.precision!r}')
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision: expected {' or '.join(PRECISIONS)}, got {self.precision!r}")
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":

@@ -75,9 +75,7 @@ def compact(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
-    inputs = input_files(files)
-    if checkpoint not in (None, *net.CHECKPOINTS):
-        inputs = (*inputs, Path(checkpoint))
+    inputs = (*input_files(files), *net.checkpoint_files(checkpoint))
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:
         check_output(path, inputs, overwrite=overwrite)
