@@ -30,7 +30,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
     Args:
         pixels: Of all views together, or Gaussians where they are more.
         view_pixels: Of one view.
-        options: All settings by flat name, but the checkpoint that is used.
+        options: All settings by flat name, with the checkpoint that is used.
         photos: Whether the scene has photos.
         fit_steps: Steps of the full fit.
     """

@@ -30,6 +30,8 @@ from gsmerge.report import report_document
 from gsmerge.segment import SegmentOptions, count_for
 from gsmerge.types import LooseScene, PixelScene
 
+NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
+
 
 @dataclass(frozen=True, eq=False)
 class SceneInput:
@@ -124,7 +126,9 @@ def read_input(
         UsageError: If there are fewer pixels than superpixels.
     """
     loaded = load_files(files, opacity=opacity, reading=reading)
-    given = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), loaded.notes)
+    bare = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
+    notes = (*loaded.notes, *([NO_PHOTOS] if bare else []))
+    given = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
     del loaded  # which knows the row of every pixel
     release_memory()
     if len(given.scene):

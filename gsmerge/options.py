@@ -103,6 +103,10 @@ class CompactOptions:
         hasty = self.fit.effort in ("draft", "fast")
         return "shipped" if short and not hasty and not self.robust.robust and self.encode.rule == "depth" else "none"
 
+    def resolved(self, *, photos: bool) -> dict[str, Any]:
+        """As :meth:`to_dict`, with the checkpoint and the matching that are used where nothing else was asked for."""
+        return self.to_dict() | {"checkpoint": self.networks(photos=photos), "match": self.match.method}
+
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""
         flat: dict[str, Any] = {}

@@ -195,7 +195,7 @@ def plan_document(
     Args:
         files: Paths of the ``ply``, the ``cameras`` and the ``images``.
         grid: Views, height and width of the Gaussian grid.
-        options: All settings by flat name, as of ``CompactOptions.to_dict()``, but the checkpoint that is used.
+        options: All settings by flat name, as of ``CompactOptions.resolved()``.
         output_path: The ``.ply`` that would be written.
         per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.
@@ -247,6 +247,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
         f" across views: {plan['options']['match']}",
+        f"networks     {plan['options']['checkpoint']}",
     ]
     return [
         f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",
