@@ -105,7 +105,8 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
             tensors = {name: file.get_tensor(name) for name in known}
     except (SafetensorError, OSError, ValueError) as error:
         told = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({told})", REMEDY) from error
+        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode"
+        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({told})", remedy) from error
     take = _taker(path, tensors)
     features = _features(take)
     settings = _settings(path, header["settings"])
