@@ -127,6 +127,13 @@ def test_what_asks_for_nothing_is_wrong_usage(
     assert told in outcome.err
 
 
+def test_a_preview_is_a_png(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("preview", made_scene / "scene.ply", "-o", tmp_path / "sheet.jpg")
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert "expected a name that ends in .png" in outcome.err
+    assert listing(tmp_path) == {}
+
+
 def test_a_plan_tells_what_is_used(made_scene: Path, run: Run) -> None:
     told = run("compact", made_scene, "--dry-run", "--fit", "none").out
     assert "across views: overlap" in told
