@@ -143,7 +143,7 @@ def _document(
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """The report as plain JSON types."""
-    from gsmerge.report import document_head
+    from gsmerge.report import document_head, seconds_document
 
     settings, size = encoded.settings, out.stat().st_size
     told = {name: value for name, value in found.items() if name not in ("name", "comments", "notes")}
@@ -156,21 +156,18 @@ def _document(
         "options": encoded.about["options"],
         "seed": encoded.about["options"]["seed"],
         "choices": encoded.about["choices"],
-        "seconds": {name: round(value, 4) for name, value in seconds.items()},
-        "total_seconds": round(sum(seconds.values()), 4),
+        **seconds_document(seconds),
         "notes": [*notes, *encoded.about["notes"]],
     }
 
 
 def _summary(document: Mapping[str, Any]) -> str:
     """The line that it ends with."""
-    from gsmerge.report import human_bytes
+    from gsmerge.report import human_bytes, seconds_line
 
     before, after = document["input"], document["output"]
-    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
-    seconds = f"{document['total_seconds']:.1f} s ({stages})"
     return (
         f"{after['path']}: {before['num_gaussians']:,} Gaussians -> {after['num_groups']:,} groups,"
         f" {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])} ({100 * document['ratio_bytes']:.0f} %);"
-        f" decodes to {after['num_gaussians_at_most']:,} Gaussians at most; {seconds}"
+        f" decodes to {after['num_gaussians_at_most']:,} Gaussians at most; {seconds_line(document)}"
     )
