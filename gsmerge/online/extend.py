@@ -130,7 +130,9 @@ def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: C
     for name in (name for name, wanted in asked.items() if wanted):
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
-        raise UsageError("fit full: goes with all photos together; expected color or none, and the full fit at decoding")
+        raise UsageError(
+            "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
+        )
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.parts.children.sh_degree:
         have = state.parts.children.sh_degree

@@ -139,7 +139,9 @@ def _replay(path: Path, take: Take, shape: tuple[int, int, int]) -> Replay:
     views = take("replay.views", torch.int32, None).long().numpy()
     images = take("replay.images", torch.uint8, len(views), height, width, 3).numpy()
     if len(views) and not (views[0] >= 0 and views[-1] < count and (np.diff(views) > 0).all()):
-        raise SceneError(path, "replay.views: expected views of the state, each once and in order, found others", REMEDY)
+        raise SceneError(
+            path, "replay.views: expected views of the state, each once and in order, found others", REMEDY
+        )
     return Replay(images, views)
 
 

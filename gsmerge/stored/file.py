@@ -18,6 +18,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.tokens import GROUP
+from gsmerge.options import PRECISIONS
 from gsmerge.stored.encoded import Division, Encoded, StoredHeads
 from gsmerge.stored.parts import (
     REMEDY,
@@ -39,8 +40,6 @@ from gsmerge.types import FeatureGaussians
 
 MINOR = 0  # what was added since the first files of the schema
 FORMAT = "gsmerge-encoded"
-SUFFIX = ".gsm"
-PRECISIONS = ("float32", "bfloat16")
 PREFIXES = ("features.", "division.", "kept.", "cameras.", "frame.", "heads.", "networks.")
 KINDS = {
     "settings": dict,

@@ -24,6 +24,7 @@ from gsmerge.stored.encoded import StoredSettings
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 SCHEMA = 1  # files of a larger one cannot be read
+SUFFIX = ".gsm"
 REMEDY = "copy it again, or make it again from its scene"
 MAX_COUNT = 1 << 40
 
@@ -51,7 +52,8 @@ def read_file(path: Path, prefixes: Sequence[str]) -> tuple[dict[str, str], dict
             return file.metadata() or {}, {name: file.get_tensor(name) for name in known}
     except (SafetensorError, OSError, ValueError) as error:
         told = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a .gsm file, could not read it ({told})", REMEDY) from error
+        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode or extend"
+        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({told})", remedy) from error
 
 
 def gaussian_tensors(prefix: str, gaussians: Gaussians) -> dict[str, Tensor]:
