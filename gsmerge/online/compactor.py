@@ -10,7 +10,7 @@ from gsmerge.fit import FitOptions
 from gsmerge.journal import Progress
 from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
-from gsmerge.online.fitted import decode_state
+from gsmerge.online.fitted import decode_stored
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import OnlineState
 from gsmerge.options import CompactOptions
@@ -79,7 +79,7 @@ class Compactor:
         progress: Progress | None = None,
         **fit: Any,
     ) -> Gaussians:
-        """The Gaussians so far, see :func:`gsmerge.online.fitted.decode_state`.
+        """The Gaussians so far, see :func:`gsmerge.online.fitted.decode_stored`.
 
         Args:
             k: Gaussians of each group; None: as the settings have it.
@@ -93,7 +93,7 @@ class Compactor:
         if self._state is None:
             raise ValueError("expected at least one batch of views before decoding, got none")
         options, seed, threads = FitOptions(**fit) if fit else None, self._options.seed, self._options.threads
-        return decode_state(
+        return decode_stored(
             self._state, k=k, budget=budget, options=options, seed=seed, threads=threads, progress=progress
         ).gaussians
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from gsmerge import __version__
-from gsmerge.build import merged_groups
+from gsmerge.build import Merged, merged_groups
 from gsmerge.errors import UsageError
 from gsmerge.fit import shown
 from gsmerge.journal import Journal, Progress
 from gsmerge.merge import take
-from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.colors import solve_colors
 from gsmerge.online.cover import group_errors, in_view, pixel_errors
 from gsmerge.online.join import absorb, partners
@@ -27,7 +27,7 @@ from gsmerge.photos import scene_pictures
 from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
 from gsmerge.stored.encoded import StoredSettings
 from gsmerge.threads import use_threads
-from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
+from gsmerge.types import Gaussians, LooseScene, PixelScene
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,17 @@ def extend(
         if keeps_all(work, count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
         grouping = choose_groups(work, count, journal)
-        features, members, learned = merged_groups(work.source, grouping, work.options, journal)
+        merged = merged_groups(work.source, grouping, work.options, journal)
         shots = _shots(state, work)
-        counts = {"num_new": len(features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+        counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
         if state is not None:
             with journal.stage("cover"):
-                fresh = _uncovered(state.parts, (features, members), shots, work.source.scene, online)
-                counts["num_covered"] = len(features) - len(fresh)
-                features = take(features, fresh)
+                fresh = _uncovered(state.parts, merged, shots, work.source.scene, online)
+                counts["num_covered"] -= len(fresh) - len(merged.features)
+                merged = replace(merged, features=take(merged.features, fresh))
         most = online.max_k if state is None else state.settings.most
         with journal.stage("decode"):
-            new = baked(features, members, learned, most, options.encode.rule)
+            new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
         with journal.stage("join"):
             state, found = _entered(state, new, work, shots, online)
             counts |= found
@@ -134,8 +134,8 @@ def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: C
             "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
         )
     degree = scene.gaussians.sh_degree
-    if state is not None and degree != state.parts.children.sh_degree:
-        have = state.parts.children.sh_degree
+    if state is not None and degree != state.sh_degree:
+        have = state.sh_degree
         raise UsageError(f"expected Gaussians with harmonics of degree {have} as the state's, got degree {degree}")
 
 
@@ -165,14 +165,10 @@ def _shots(state: OnlineState | None, work: Work) -> Shots:
 
 
 def _uncovered(
-    parts: Parts,
-    batch: tuple[FeatureGaussians, Members],
-    shots: Shots,
-    scene: PixelScene | LooseScene,
-    online: OnlineOptions,
+    parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | LooseScene, online: OnlineOptions
 ) -> torch.Tensor:
     """Rows of the batch's groups that show something which the state does not show as well."""
-    features, members = batch
+    features, members = batch.features, batch.members
     if online.tolerance == 0:
         return torch.arange(len(features))
     pictures, size = shots.photos(2), (scene.cameras.height, scene.cameras.width)

@@ -14,6 +14,7 @@ from gsmerge.journal import Journal, Progress
 from gsmerge.online.pictures import Shots
 from gsmerge.online.state import OnlineState, as_encoded
 from gsmerge.stored.decode import decode_scene, plan_decode
+from gsmerge.stored.encoded import Encoded
 from gsmerge.threads import use_threads
 from gsmerge.types import Gaussians
 
@@ -27,8 +28,18 @@ class Decoded:
     notes: tuple[str, ...]
 
 
-def decode_state(
-    state: OnlineState,
+def as_decoded(stored: Encoded | OnlineState, *, solved: bool = True) -> Encoded:
+    """What is decoded: an encoded scene, which a state is turned into, see :func:`gsmerge.online.state.as_encoded`."""
+    return stored if isinstance(stored, Encoded) else as_encoded(stored, solved=solved)
+
+
+def num_photos(stored: Encoded | OnlineState) -> int:
+    """Photos that a fit can look at."""
+    return 0 if isinstance(stored, Encoded) else len(stored.replay)
+
+
+def decode_stored(
+    stored: Encoded | OnlineState,
     *,
     k: int | str | None = None,
     budget: int | str | None = None,
@@ -37,10 +48,10 @@ def decode_state(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Decoded:
-    """The state as Gaussians in the world frame, fitted to the photos that it has kept.
+    """A state as Gaussians in the world frame, fitted to the photos that it has kept; or an encoded scene.
 
     Args:
-        state: Of one or more batches.
+        stored: A state of one or more batches, or an encoded scene, which has no photos.
         k: As of :func:`gsmerge.decode_scene`.
         budget: As there. A full fit begins with fewer and grows to the number.
         options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
@@ -49,16 +60,15 @@ def decode_state(
         progress: As of :func:`gsmerge.compact`.
 
     Raises:
-        UsageError: If a fit is asked for and the state has kept no photos, or K or the budget cannot be had.
+        UsageError: If a fit is asked for and no photos were kept, or K or the budget cannot be had.
     """
-    replay = state.replay
-    options = options or FitOptions(fit="full" if len(replay) else "none")
-    encoded = as_encoded(state, solved=options.fit == "none")
+    options = options or FitOptions(fit="full" if num_photos(stored) else "none")
+    encoded = as_decoded(stored, solved=options.fit == "none")
     if options.fit == "none":
         notes = plan_decode(encoded, k=k, budget=budget).notes
         return Decoded(decode_scene(encoded, k=k, budget=budget, threads=threads), None, notes)
-    if len(replay) == 0:
-        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend it with photos")
+    if isinstance(stored, Encoded) or not num_photos(stored):
+        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
     journal = Journal(progress)
     plan = plan_decode(encoded, k=k, budget=budget)
     wanted = int(plan.counts.sum())
@@ -66,10 +76,10 @@ def decode_state(
     plain = replace(encoded, frame=Frame(torch.zeros(3, dtype=torch.float64), 1.0))
     with use_threads(threads), torch.no_grad():
         gaussians = decode_scene(plain, budget=begun, threads=threads)
-        images = replay.images.astype(np.float32) / np.float32(255)
-        shots = Shots(images, state.cameras[torch.from_numpy(replay.views)])
+        images = stored.replay.images.astype(np.float32) / np.float32(255)
+        shots = Shots(images, stored.cameras[torch.from_numpy(stored.replay.views)])
         with journal.stage("fit"):
             fitted, report = fit(
                 gaussians, (shots.photos(), shots.photos(2)), options, wanted, seed, journal.fit_progress
             )
-    return Decoded(state.frame.leave(fitted), report, plan.notes)
+    return Decoded(stored.frame.leave(fitted), report, plan.notes)

@@ -89,6 +89,11 @@ class OnlineState:
     def __len__(self) -> int:
         return len(self.parts)
 
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the harmonics."""
+        return self.parts.children.sh_degree
+
 
 def baked(
     features: FeatureGaussians, members: Members, learned: Learned | None, most: int, rule: Rule = "depth"

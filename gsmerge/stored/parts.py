@@ -25,7 +25,7 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 SCHEMA = 1  # files of a larger one cannot be read
 SUFFIX = ".gsm"
-REMEDY = "copy it again, or make it again from its scene"
+REMEDY = "copy it again, or encode the scene again"
 MAX_COUNT = 1 << 40
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views", "backing"))
