@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from many_views import many_views
 from quality import score
-from shared_scenes import export, exporter, read_targets, scene_folders
+from shared_scenes import Targets, export, exporter, read_targets, scene_folders
 
 import gsmerge
 from gsmerge import Compactor
@@ -72,27 +72,30 @@ def online(args: argparse.Namespace) -> dict:
         compactor.save(Path(folder) / "state.gsm")
         size = (Path(folder) / "state.gsm").stat().st_size
     found = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
-    for fit in ("none", "color", "full"):
+    for fit, k in (("none", 1), ("none", 2), ("none", 4), ("color", 1), ("full", 1), ("full", 2), ("full", 4)):
         start = time.perf_counter()
-        gaussians = compactor.decode(fit=fit)
-        found[fit] = _scored(gaussians, targets, time.perf_counter() - start)
+        gaussians = compactor.decode(k=k, fit=fit)
+        found[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
     return found
 
 
 def whole(args: argparse.Namespace, fit: str) -> dict:
-    """All views at once."""
+    """All views at once; ``input``: as they are."""
     source = many_views(scene_folders(args.scenes)[0], args.cache / f"{args.scenes}-{args.views}", args.views)
     scene, targets = gsmerge.read_scene(export(source, args.cache)), read_targets(scene_folders(args.scenes)[0])
     start = time.perf_counter()
+    if fit == "input":
+        return _scored(scene.gaussians, targets, 0.0, args.lpips)
     result = gsmerge.compact(scene, fit=fit, checkpoint="none")
     seconds = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    return _scored(result.gaussians, targets, seconds) | {"peak_GB": round(peak, 2)}
+    return _scored(result.gaussians, targets, seconds, args.lpips) | {"peak_GB": round(peak, 2)}
 
 
-def _scored(gaussians: gsmerge.Gaussians, targets: object, seconds: float) -> dict:
-    psnr, ssim = score(gaussians, targets)[:2]
-    return {"count": len(gaussians), "psnr": round(psnr, 2), "ssim": round(ssim, 3), "seconds": round(seconds, 1)}
+def _scored(gaussians: gsmerge.Gaussians, targets: Targets, seconds: float, perceptual: bool) -> dict:
+    values = score(gaussians, targets, perceptual)
+    found = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
+    return {"count": len(gaussians), **found, "seconds": round(seconds, 1)}
 
 
 def main() -> None:
@@ -102,7 +105,10 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=12, help="views of a batch")
     parser.add_argument("--order", choices=("trajectory", "cycle"), default="trajectory")
     parser.add_argument("--replay", type=int, default=96)
-    parser.add_argument("--whole", nargs="*", default=[], choices=("none", "color", "full"), help="also in one go")
+    parser.add_argument(
+        "--whole", nargs="*", default=[], choices=("input", "none", "color", "full"), help="also in one go"
+    )
+    parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, see benchmarks/quality.py")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-online")
     parser.add_argument("--run", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -112,6 +118,7 @@ def main() -> None:
     for folder in scene_folders(args.scenes):
         for run in ("online", *args.whole):
             options = [f"--{name}={getattr(args, name)}" for name in ("views", "size", "order", "replay", "cache")]
+            options += ["--lpips"] * args.lpips
             command = [sys.executable, __file__, folder.name, *options, "--run", run]
             print(
                 folder.name, run, subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True).stdout.strip()
