@@ -17,7 +17,7 @@ from gsmerge.metrics import psnr
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.photos import Photos
 from gsmerge.render import composite, plan_view, prepare, splat_adjoint
-from gsmerge.threads import parallel_map
+from gsmerge.threads import in_turn, parallel_map
 from gsmerge.types import SH_C0, FeatureGaussians
 
 MIN_VIEWS = 3  # with two, leaving one out leaves nothing to compare
@@ -184,7 +184,9 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
             squares = np.einsum("hwc,hwc->hw", image, image)
             return splat_adjoint(plan, np.dstack([np.ones_like(squares), image, squares]))
 
-        sums = np.stack(parallel_map(testimony, range(len(photos)))).sum(0, dtype=np.float64)
+        sums = np.zeros((len(features), 5))
+        for seen_there in in_turn(testimony, range(len(photos))):
+            sums += seen_there
         mass = sums[:, 0]
         error = (colors**2).sum(1) * mass - 2 * (colors * sums[:, 1:4]).sum(1) + sums[:, 4]
         error = np.maximum(error, 0) / (3 * mass + 1e-9)

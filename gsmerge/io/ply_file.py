@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import mmap
 import re
 import warnings
 from pathlib import Path
 
+import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError
@@ -51,6 +53,17 @@ def open_ply(path: Path) -> PlyData:
         ) from error
     except (PlyParseError, ValueError, ArithmeticError, MemoryError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
+
+
+def let_go(rows: np.ndarray, block: slice) -> None:
+    """Drop a block of rows of a mapped file from the process's memory; looked at again, it is read again."""
+    mapped = getattr(rows, "_mmap", None)
+    if not isinstance(rows, np.memmap) or mapped is None or not hasattr(mmap, "MADV_DONTNEED"):
+        return
+    before = rows.offset % mmap.ALLOCATIONGRANULARITY
+    start, end = (before + row * rows.dtype.itemsize for row in (block.start, block.stop))
+    start -= start % mmap.PAGESIZE
+    mapped.madvise(mmap.MADV_DONTNEED, start, end - start)
 
 
 def count_rows(path: Path) -> int:

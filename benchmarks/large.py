@@ -1,0 +1,118 @@
+"""Seconds and memory of ``gsmerge compact`` on scenes of many views, beside what ``gsmerge inspect`` estimates.
+
+python benchmarks/large.py                                  # 84 views of a real scene, default settings
+python benchmarks/large.py --views 12 84 --degrees 0 3 4 --settings "--fit none" "--effort draft"
+
+Each run is a process of its own. Scenes are the repeated views of ``many_views`` in a plain export; higher harmonics
+are added to its rows as small noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from many_views import many_views
+from shared_scenes import export, scene_folders
+
+import gsmerge
+from gsmerge.io.ply_file import open_ply
+
+HARMONIC = 0.02  # size of the added harmonics
+ROWS = 1 << 18  # at a time
+
+
+def scene_of(name: str, views: int, degree: int, cache: Path) -> Path:
+    """The export of a scene with its views repeated, with harmonics up to a degree; written once."""
+    source = many_views(scene_folders(name)[0], cache / f"{name}-{views}", views)
+    plain = export(source, cache)
+    if degree == 0:
+        return plain
+    out = cache / f"{source.name}-degree{degree}"
+    if not (out / "done").exists():
+        out.mkdir(parents=True, exist_ok=True)
+        for part in ("images", "transforms.json"):
+            if not (out / part).exists():
+                (out / part).symlink_to((plain.parent / part).resolve())
+        write_degree(plain, out / plain.name, degree)
+        (out / "done").touch()
+    return out / plain.name
+
+
+def write_degree(plain: Path, out: Path, degree: int) -> None:
+    """A copy of a binary ``.ply`` with ``f_rest`` columns of seeded noise."""
+    rows = open_ply(plain)["vertex"].data
+    num_rest = 3 * ((degree + 1) ** 2 - 1)
+    names = list(rows.dtype.names)
+    names[names.index("opacity") : names.index("opacity")] = [f"f_rest_{i}" for i in range(num_rest)]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [*(f"property float {name}" for name in names), "end_header", ""]
+    rng = np.random.default_rng(0)
+    with out.open("wb") as file:
+        file.write("\n".join(header).encode())
+        for first in range(0, len(rows), ROWS):
+            part = rows[first : first + ROWS]
+            noise = rng.normal(0, HARMONIC, (len(part), num_rest)).astype("<f4")
+            columns = [noise[:, int(name[7:])] if name.startswith("f_rest_") else part[name] for name in names]
+            file.write(np.stack(columns, 1).astype("<f4").tobytes())
+
+
+def measure(scene: Path, settings: str, out: Path) -> dict:
+    """The report of one run."""
+    report = out / "report.json"
+    words = ["compact", str(scene), "-o", str(out / "out.ply"), "--overwrite", "--quiet", "--report", str(report)]
+    subprocess.run([sys.executable, "-m", "gsmerge", *words, *shlex.split(settings)], check=True)
+    return json.loads(report.read_text())
+
+
+def row(scene: Path, views: int, degree: int, settings: str, out: Path) -> str:
+    """One run as a row of the table."""
+    report = measure(scene, settings, out)
+    words = ["compact", str(scene), "-o", str(out / "out.ply"), "--dry-run", "--json", *shlex.split(settings)]
+    plan = subprocess.run(
+        [sys.executable, "-m", "gsmerge", *words, "--overwrite"], check=True, capture_output=True, text=True
+    )
+    guess = json.loads(plan.stdout)["estimate"]
+    count, peak = report["input"]["num_gaussians"], report["peak_memory_bytes"]
+    stages = sorted(report["seconds"].items(), key=lambda item: -item[1])
+    longest = ", ".join(f"{name} {seconds:.0f}" for name, seconds in stages if name != "total" and seconds >= 1)
+    cells = [
+        str(views), f"{count / 1e6:.1f}", str(degree), f"`{settings or 'default'}`",
+        f"{report['output']['num_gaussians']:,}", f"{sum(s for n, s in stages if n != 'total'):.0f}",
+        f"{guess['seconds']:.0f}", f"{peak / 1e9:.1f}", f"{guess['memory_bytes'] / 1e9:.1f}",
+        f"{peak / count:.0f}", longest,
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--scene", default="redkitchen", help="one of the scenes beside the repository")
+    parser.add_argument("--views", type=int, nargs="*", default=[84])
+    parser.add_argument("--degrees", type=int, nargs="*", default=[0], help="of the harmonics, 0 to 4")
+    parser.add_argument("--settings", nargs="*", default=[""], help="options of compact, one string a run")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-large", help="scenes")
+    args = parser.parse_args()
+    args.cache.mkdir(parents=True, exist_ok=True)
+    print(f"gsmerge {gsmerge.__version__}")
+    print(
+        "| views | Gaussians, million | SH degree | options | result | seconds | estimated | peak, GB | estimated |"
+        " bytes per Gaussian | seconds of |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for views in args.views:
+        for degree in args.degrees:
+            scene = scene_of(args.scene, views, degree, args.cache)
+            for settings in args.settings:
+                with tempfile.TemporaryDirectory() as folder:
+                    print(row(scene, views, degree, settings, Path(folder)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
