@@ -66,14 +66,18 @@ def let_go(rows: np.ndarray, block: slice) -> None:
     mapped.madvise(mmap.MADV_DONTNEED, start, end - start)
 
 
-def count_rows(path: Path) -> int:
-    """Gaussians that a PLY file promises, from its header alone; 0 where there is none that can be read."""
+def promised(path: Path) -> tuple[int, int]:
+    """Gaussians that a PLY file promises, and their columns of higher harmonics, from its header alone.
+
+    Zeros where there is none that can be read.
+    """
     try:
         with path.open("rb") as file:
-            found = re.search(rb"^element vertex (\d{1,12})\s*$", file.read(1 << 16), re.MULTILINE)
+            header = file.read(1 << 16).partition(b"end_header")[0]
     except OSError:
-        return 0
-    return int(found[1]) if found else 0
+        return 0, 0
+    found = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
+    return int(found[1]) if found else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
 
 
 def _weigh(path: Path, start: bytes, size: int) -> None:

@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply, write_ply
-from gsmerge.io.ply_file import let_go, open_ply
+from gsmerge.io.ply_file import let_go, open_ply, promised
 from gsmerge.threads import use_threads
 from gsmerge.types import Gaussians
 
@@ -284,3 +284,12 @@ def resident(path: str) -> int:
         elif inside and line.startswith("Rss:"):
             total += 1024 * int(line.split()[1])
     return total
+
+
+def test_what_a_header_promises(tmp_path: Path) -> None:
+    assert promised(save(tmp_path / "a.ply", columns(7))) == (7, 0)
+    assert promised(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
+    assert promised(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
+    (tmp_path / "d.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\nelement vertex 5\n")
+    assert promised(tmp_path / "d.ply") == (0, 0)
+    assert promised(tmp_path / "none.ply") == (0, 0)
