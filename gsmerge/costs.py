@@ -13,17 +13,17 @@ COST_READ = 0.7
 COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
 COST_MERGE = 0.5
 COST_NETWORKS = 2.8  # at the usual density
-COST_SCORE = 0.11  # rendering a photo from input and output, each of those that are scored
-COST_ROBUST = 0.0083  # rendering a photo: 12 times where it is scored, 4 times where it is weighed by
+COST_SCORE = 0.09  # rendering from input and output, per view that is scored
+COST_ROBUST = 1.6
 COST_COLOR_FIT = 0.9
 COST_FULL_FIT = 0.36  # per step and million pixels of one view
 COST_RIVALS = {"paper": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
 COST_RIVAL = 0.2  # of the others
 COST_RIVAL_STEP = 0.15  # per step of the full fit, for each million Gaussians of an input that was not merged
-BYTES_FIXED = 350_000_000  # interpreter, torch and numba
-BYTES_PER_GAUSSIAN = 240
-BYTES_PER_VALUE = 4  # of higher harmonics
-BYTES_PER_PIXEL = 100  # the photo as floats and what segmentation and rendering keep of it
+BYTES_FIXED = 450_000_000  # interpreter, torch and numba
+BYTES_PER_GAUSSIAN = 150
+BYTES_PER_VALUE = 4.5  # of higher harmonics: of the scene, and some of its groups
+BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering keep of it
 
 
 def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *, photos: bool, fit_steps: int) -> float:
@@ -38,9 +38,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
     """
     method, fit, views = options["method"], fit_of(options, photos=photos), pixels / max(view_pixels, 1)
     if method == "gsmerge":
-        work = (
-            COST_MERGE + COST_SEGMENT[options["segmentation"]] + robust_cost(views) * is_robust(options, photos=photos)
-        )
+        work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * is_robust(options, photos=photos)
         work += COST_NETWORKS * (options["checkpoint"] != "none")
     else:
         work = COST_RIVALS.get(method, COST_RIVAL)
@@ -55,11 +53,6 @@ def score_cost(views: float) -> float:
     return COST_SCORE * min(views, MOST_JUDGED)
 
 
-def robust_cost(views: float) -> float:
-    """The same of the merge that the photos choose."""
-    return COST_ROBUST * (12 * min(views, MOST_JUDGED) + 4 * views)
-
-
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
     """Memory that a scene takes, imports included, within a factor of about two.
 
@@ -68,7 +61,7 @@ def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
         photos: Whether the scene has photos.
         num_rest: Columns of higher harmonics.
     """
-    return BYTES_FIXED + (BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels
+    return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
 
 
 def memory_problem(needed: int, there: int | None) -> str | None:

@@ -16,8 +16,8 @@ from gsmerge.costs import (
     COST_RIVAL,
     COST_RIVAL_STEP,
     COST_RIVALS,
+    COST_ROBUST,
     COST_SEGMENT,
-    robust_cost,
     score_cost,
 )
 from gsmerge.fit.options import STEPS
@@ -73,7 +73,7 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
     else:
-        work += pixels * (robust_cost(views) + COST_COLOR_FIT * (fit == "color"))
+        work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
     return work / threads
 
 

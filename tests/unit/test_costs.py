@@ -31,7 +31,7 @@ def test_many_views_cost_more_each_as_far_as_they_are_scored() -> None:
 
 def test_higher_harmonics_are_counted_once() -> None:
     plain, degree4 = (memory_bytes(10**7, photos=True, num_rest=num) for num in (0, 72))
-    assert degree4 - plain == 4 * 72 * 10**7
+    assert 4 * 72 * 10**7 <= degree4 - plain <= 5 * 72 * 10**7
 
 
 def test_the_papers_online_setting_fits_into_24_gb() -> None:
