@@ -84,9 +84,10 @@ def loose_members(scene: LooseScene, pixels: np.ndarray) -> Members:
     footprints = np.maximum(depths, 1e-6) / focals[views]
     alone = np.flatnonzero(pixels < 0)
     if len(alone):
-        centres = cameras.centres.double().numpy()
-        distances = np.stack([np.linalg.norm(means[alone] - centre, axis=1) for centre in centres])
-        footprints[alone] = np.maximum((distances / focals[:, None]).min(0), 1e-6)
+        nearest = np.full(len(alone), np.inf)
+        for centre, focal in zip(cameras.centres.double().numpy(), focals, strict=True):
+            np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
+        footprints[alone] = np.maximum(nearest, 1e-6)
     return gaussian_members(scene.gaussians, footprints.astype(np.float32), pixels)
 
 
