@@ -32,7 +32,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
     Args:
         pixels: Of all views together, or Gaussians where they are more.
         view_pixels: Of one view.
-        options: All settings by flat name, but the checkpoint that is used.
+        options: All settings by flat name, with the checkpoint that is used.
         photos: Whether the scene has photos.
         fit_steps: Steps of the full fit.
     """
@@ -85,10 +85,12 @@ def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
     return own.get(options["method"], "none") if photos else "none"
 
 
+def photos_choose(robust: bool | None, fit: str, effort: str) -> bool:
+    """Whether photos choose the merge where there are any: as asked, or unless a full fit follows or it is a draft."""
+    return fit != "full" and effort != "draft" if robust is None else robust
+
+
 def is_robust(options: Mapping[str, Any], *, photos: bool) -> bool:
     """Whether merges are chosen among by the photos."""
-    if options["method"] != "gsmerge" or not photos:
-        return False
-    if options["robust"] is not None:
-        return bool(options["robust"])
-    return fit_of(options, photos=photos) != "full" and options["effort"] != "draft"
+    used = photos and options["method"] == "gsmerge"
+    return used and photos_choose(options["robust"], options["fit"], options["effort"])

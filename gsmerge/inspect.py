@@ -254,7 +254,7 @@ def estimate(scene: PixelScene | LooseScene) -> dict[str, float]:
     plan = plan_document(
         {},
         (len(scene), scene.cameras.height, scene.cameras.width),
-        options.to_dict() | {"checkpoint": options.networks(photos=scene.images is not None)},
+        options.resolved(photos=scene.images is not None),
         output_path=Path(),
         per_view=0,
         photos=scene.images is not None,

@@ -82,8 +82,7 @@ def report_document(
         "options": numbers["options"],
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
-        "seconds": {name: round(value, 4) for name, value in stages.items()},
-        "total_seconds": round(sum(stages.values()), 4),
+        **seconds_document(stages),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
@@ -159,12 +158,23 @@ def summary_line(document: Mapping[str, Any]) -> str:
         if psnr["before"] is not None and psnr["after"] is not None
         else ""
     )
-    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
-        f"{quality}; {document['total_seconds']:.1f} s ({stages})"
+        f"{quality}; {seconds_line(document)}"
     )
+
+
+def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
+    """Wall time by stage and in all, as every report has it."""
+    total = round(sum(seconds.values()), 4)
+    return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
+
+
+def seconds_line(document: Mapping[str, Any]) -> str:
+    """``2.3 s (read 0.70, ...)`` of a report."""
+    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
+    return f"{document['total_seconds']:.1f} s ({stages})"
 
 
 def human_bytes(count: float) -> str:
@@ -197,7 +207,7 @@ def plan_document(
     Args:
         files: Paths of the ``ply``, the ``cameras`` and the ``images``.
         grid: Views, height and width of the Gaussian grid.
-        options: All settings by flat name, as of ``CompactOptions.to_dict()``, but the checkpoint that is used.
+        options: All settings by flat name, as of ``CompactOptions.resolved()``.
         output_path: The ``.ply`` that would be written.
         per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.
@@ -257,6 +267,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
         f" across views: {plan['options']['match']}",
+        f"networks     {plan['options']['checkpoint']}",
     ]
     return [
         f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",

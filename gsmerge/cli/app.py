@@ -69,7 +69,8 @@ def _fail(message: str, code: int) -> int:
 def _usage_message(error: Any) -> str:
     context = error.ctx
     place = context.command_path if context is not None else PROGRAM
-    return f"{error.format_message().rstrip('.')}; see '{place} --help'"
+    told = error.format_message().replace("Value error, ", "", 1)  # of the checks that typer borrows
+    return f"{told.rstrip('.')}; see '{place} --help'"
 
 
 def run(args: Sequence[str] | None = None) -> int:

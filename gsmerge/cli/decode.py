@@ -92,7 +92,7 @@ def _run(
 ) -> dict[str, Any]:
     """Read, decode and write; returns the report."""
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
-    from gsmerge.report import document_head
+    from gsmerge.report import document_head, seconds_document
     from gsmerge.stored.decode import decode_scene, plan_decode
     from gsmerge.stored.file import load_encoded
 
@@ -122,8 +122,7 @@ def _run(
     return document | {
         "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(gaussians)},
         "ratio": len(gaussians) / max(encoded.settings.num_input, 1),
-        "seconds": {name: round(value, 4) for name, value in seconds.items()},
-        "total_seconds": round(sum(seconds.values()), 4),
+        **seconds_document(seconds),
     }
 
 
@@ -137,12 +136,11 @@ def _comments(encoded: Encoded) -> Sequence[str]:
 
 def _summary(document: Mapping[str, Any]) -> str:
     """The line that it ends with."""
-    from gsmerge.report import human_bytes
+    from gsmerge.report import human_bytes, seconds_line
 
     before, after = document["input"], document["output"]
-    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
     return (
         f"{after['path']}: {before['num_groups']:,} groups -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} % of the scene's), {human_bytes(before['bytes'])} ->"
-        f" {human_bytes(after['bytes'])}; {document['total_seconds']:.1f} s ({stages})"
+        f" {human_bytes(after['bytes'])}; {seconds_line(document)}"
     )

@@ -276,6 +276,8 @@ def _loose(
     notes += tuple(smaller)
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
+    if told is not None:
+        lost += f"; only those of {told.name} were looked for, as told; --dialect auto looks for all"
     all_views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
     return SceneLoad(
         scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost), all_views

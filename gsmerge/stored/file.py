@@ -26,6 +26,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_file
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.tokens import GROUP
+from gsmerge.options import PRECISIONS
 from gsmerge.stored.encoded import Division, Encoded, StoredHeads, StoredSettings
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
@@ -35,7 +36,6 @@ FORMAT = "gsmerge-encoded"
 REMEDY = "copy it again, or encode the scene again"
 SUFFIX = ".gsm"
 MAX_COUNT = 1 << 40
-PRECISIONS = ("float32", "bfloat16")
 PREFIXES = ("features.", "division.", "kept.", "cameras.", "frame.", "heads.", "networks.")
 
 COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views", "backing"))
@@ -105,7 +105,8 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
             tensors = {name: file.get_tensor(name) for name in known}
     except (SafetensorError, OSError, ValueError) as error:
         told = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({told})", REMEDY) from error
+        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode"
+        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({told})", remedy) from error
     take = _taker(path, tensors)
     features = _features(take)
     settings = _settings(path, header["settings"])
