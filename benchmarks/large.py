@@ -20,13 +20,11 @@ from pathlib import Path
 
 import numpy as np
 from many_views import many_views
-from shared_scenes import export, scene_folders
+from shared_scenes import exporter, scene_folders
 
 import gsmerge
-from gsmerge.io.ply_file import open_ply
 
 HARMONIC = 0.02  # size of the added harmonics
-ROWS = 1 << 18  # at a time
 COLUMNS = (
     *("views", "Gaussians, million", "SH degree", "options", "result", "seconds", "estimated", "processor seconds"),
     *("peak, GB", "estimated", "bytes per Gaussian", "seconds of"),
@@ -34,38 +32,45 @@ COLUMNS = (
 
 
 def scene_of(name: str, views: int, degree: int, cache: Path) -> Path:
-    """The export of a scene with its views repeated, with harmonics up to a degree; written once."""
+    """The plain export of a scene with its views repeated, with harmonics up to a degree; written once."""
     source = many_views(scene_folders(name)[0], cache / f"{name}-{views}", views)
-    plain = export(source, cache)
-    if degree == 0:
-        return plain
     out = cache / f"{source.name}-degree{degree}"
     if not (out / "done").exists():
-        out.mkdir(parents=True, exist_ok=True)
-        for part in ("images", "transforms.json"):
-            if not (out / part).exists():
-                (out / part).symlink_to((plain.parent / part).resolve())
-        write_degree(plain, out / plain.name, degree)
+        write_export(source, out, degree)
         (out / "done").touch()
-    return out / plain.name
+    return out / "scene.ply"
 
 
-def write_degree(plain: Path, out: Path, degree: int) -> None:
-    """A copy of a binary ``.ply`` with ``f_rest`` columns of seeded noise."""
-    rows = open_ply(plain)["vertex"].data
-    num_rest = 3 * ((degree + 1) ** 2 - 1)
-    names = list(rows.dtype.names)
-    names[names.index("opacity") : names.index("opacity")] = [f"f_rest_{i}" for i in range(num_rest)]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+def write_export(source: Path, out: Path, degree: int) -> None:
+    """What the exporter's style ``plain`` writes, view by view, as all at once would not fit; and harmonics."""
+    tool = exporter()
+    views = tool.read_scene(source)
+    tool.write_images(out / "images", views)
+    tool.write_transforms(out / "transforms.json", views)
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    count = sum(view["depth"].size for view in views)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [*(f"property float {name}" for name in names), "end_header", ""]
-    rng = np.random.default_rng(0)
-    with out.open("wb") as file:
+    rng, noise = np.random.default_rng(0), np.random.default_rng(1)
+    with (out / "scene.ply").open("wb") as file:
         file.write("\n".join(header).encode())
-        for first in range(0, len(rows), ROWS):
-            part = rows[first : first + ROWS]
-            noise = rng.normal(0, HARMONIC, (len(part), num_rest)).astype("<f4")
-            columns = [noise[:, int(name[7:])] if name.startswith("f_rest_") else part[name] for name in names]
-            file.write(np.stack(columns, 1).astype("<f4").tobytes())
+        for view in views:
+            g = tool.view_gaussians(view, rng)
+            opacities = g["opacities"][:, None]
+            harmonics = noise.normal(0, HARMONIC, (len(opacities), len(rest)))
+            logits = np.log(opacities / (1 - opacities))
+            columns = [
+                g["means"],
+                np.zeros_like(g["means"]),
+                g["sh0"],
+                harmonics,
+                logits,
+                np.log(g["scales"]),
+                g["quats"],
+            ]
+            file.write(np.concatenate(columns, 1).astype("<f4").tobytes())
 
 
 def measure(scene: Path, settings: str, out: Path) -> tuple[dict, float]:

@@ -74,8 +74,8 @@ def memory_problem(needed: int, there: int | None) -> str | None:
     if there is None or needed <= there:
         return None
     return (
-        f"about {needed / 1e9:.1f} GB of memory are needed and this machine has {there / 1e9:.1f} GB: use fewer views,"
-        " export without higher harmonics, or try --effort draft"
+        f"about {needed / 1e9:.1f} GB of memory are needed and this machine has {there / 1e9:.1f} GB: use fewer views"
+        " (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"
     )
 
 
