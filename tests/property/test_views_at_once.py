@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import loose
 import pytest
 import scenes
 
-from gsmerge import PixelScene
+from gsmerge import PixelScene, compact
 from gsmerge.moments import scene_members
 
 
@@ -41,3 +42,11 @@ def test_higher_harmonics_are_not_copied() -> None:
     g = scenes.make_scene(scenes.room(), scenes.arc(2, 32, 24), degree=3)
     members = scene_members(g)
     assert members.shN.__array_interface__["data"][0] == g.gaussians.shN.data_ptr()
+
+
+def test_of_many_gaussians_few_views_at_once(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for many in (0, 10**9):
+        monkeypatch.setattr("gsmerge.contribution.MANY", many)
+        found.append(compact(loose.loosened(scene), fit="none", density=0.1, unseen="keep").gaussians)
+    assert scenes.identical(found[0], found[1])
