@@ -33,7 +33,7 @@ from gsmerge.io.ply_layout import LOGIT_COMMENT
 from gsmerge.io.reading import make_reading
 from gsmerge.options import CompactOptions
 from gsmerge.report import plan_document
-from gsmerge.threads import available_threads
+from gsmerge.threads import available_threads, use_threads
 from gsmerge.types import LooseScene, PixelScene
 
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # below one step of an 8-bit image; where optical depth is capped
@@ -157,8 +157,9 @@ def inspect(
     """
     told = make_reading(reading)
     files = find_scene_files(path, cameras=cameras, images=images)
-    ply = read_told(files.ply, opacity=opacity, reading=told)
-    return Inspection(**_of_ply(ply), **_of_views(ply, files, told))
+    with use_threads():
+        ply = read_told(files.ply, opacity=opacity, reading=told)
+        return Inspection(**_of_ply(ply), **_of_views(ply, files, told))
 
 
 def _plain(value: Any) -> Any:
