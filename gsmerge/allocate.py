@@ -270,7 +270,7 @@ def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarra
         local, own = gather_groups(starts, ids, rows)
         m = members
         return split_errors(
-            local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
+            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
         )
 
     tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]

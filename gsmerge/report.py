@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.costs import COST_FIXED, fit_of, is_robust, memory_bytes, work_seconds
+from gsmerge.costs import COST_FIXED, fit_of, is_robust, memory_bytes, memory_problem, work_seconds
+from gsmerge.memory import machine_memory
 
 SCHEMA_VERSION = 1
 
@@ -199,6 +200,7 @@ def plan_document(
     wanted: int | None = None,
     notes: Sequence[str] = (),
     count: int | None = None,
+    num_rest: int = 0,
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory.
 
@@ -215,6 +217,7 @@ def plan_document(
         wanted: Gaussians that a budget, a file size or a preset asks for; None without any.
         notes: What the reader had to say.
         count: Gaussians of the file; None: one for each pixel of the grid.
+        num_rest: Columns of higher harmonics.
 
     Returns:
         ``schema_version`` 1: the plan; ``estimate`` holds within a factor of about two on a common processor once
@@ -239,11 +242,18 @@ def plan_document(
         "fit": fit_of(options, photos=photos),
         "estimate": {
             "seconds": round(COST_FIXED + seconds / max(1, min(threads, views)), 1),
-            "memory_bytes": memory_bytes(pixels, photos=photos),
+            "memory_bytes": memory_bytes(pixels, photos=photos, num_rest=num_rest),
+            "machine_memory_bytes": machine_memory(),
         },
         "options": dict(options),
         "notes": list(notes),
     }
+
+
+def memory_problems(guess: Mapping[str, Any]) -> list[str]:
+    """That an estimated run is not likely to fit into this machine's memory; nothing where it does."""
+    problem = memory_problem(guess["memory_bytes"], guess["machine_memory_bytes"])
+    return [] if problem is None else [problem]
 
 
 def plan_lines(plan: Mapping[str, Any]) -> list[str]:
@@ -265,6 +275,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         *(steps if plan["method"] == "gsmerge" else [f"method       {plan['method']}"]),
         f"fit          {plan['fit']}",
         f"estimate     about {guess['seconds']:.0f} s, {human_bytes(guess['memory_bytes'])} of memory",
+        *(f"memory       {problem}" for problem in memory_problems(guess)),
         *(f"note         {note}" for note in plan["notes"]),
     ]
 
@@ -358,7 +369,8 @@ def _estimate_lines(found: Mapping[str, Any]) -> list[str]:
     return [
         f"compact    would give about {guess['num_gaussians']:,} Gaussians ({100 * guess['ratio']:.1f} %),"
         f" {human_bytes(guess['bytes'])}, in about {guess['seconds']:.0f} s with"
-        f" {human_bytes(guess['memory_bytes'])} of memory"
+        f" {human_bytes(guess['memory_bytes'])} of memory",
+        *(f"memory     {problem}" for problem in memory_problems(guess)),
     ]
 
 

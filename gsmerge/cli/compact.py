@@ -12,7 +12,7 @@ import typer
 
 from gsmerge.cli import network_options as net
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
+from gsmerge.cli.console import announce_compilation, one_line, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_format, check_output, default_output, input_files
 from gsmerge.cli.settings import given_settings, reading_of, told_as_usage
 from gsmerge.errors import TargetError
@@ -86,6 +86,7 @@ def compact(
     if dry_run:
         print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
+    warn_of_memory(files, quiet=quiet or json)
     document = _run(
         files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
         start=start, hashed=json or report is not None,
@@ -93,6 +94,18 @@ def compact(
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
     if document["unmet"]:
         raise TargetError(document["unmet"])
+
+
+def warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
+    """Say so before anything is read if the scene is not likely to fit into this machine's memory."""
+    from gsmerge.costs import memory_bytes, memory_problem
+    from gsmerge.io.ply_file import promised
+    from gsmerge.memory import machine_memory
+
+    count, num_rest = promised(files.ply)
+    problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
+    if problem is not None:
+        say(f"gsmerge: warning: {problem}", quiet=quiet)
 
 
 def _run(
@@ -179,6 +192,7 @@ def print_plan(
         wanted=wanted,
         notes=[*given.notes, *unused],
         count=scene.num_gaussians,
+        num_rest=3 * scene.gaussians.shN.shape[1],
     )
     if as_json:
         sys.stdout.write(to_json(document))

@@ -17,7 +17,7 @@ from gsmerge.fit.options import FitOptions
 from gsmerge.fit.report import FitReport
 from gsmerge.photos import Photos
 from gsmerge.render import Splats, composite, plan_view, prepare
-from gsmerge.threads import parallel_map
+from gsmerge.threads import in_turn, parallel_map
 from gsmerge.types import SH_C0, Gaussians
 from gsmerge.weights import ViewWeights, apply, apply_transposed, view_weights
 
@@ -157,7 +157,7 @@ def _residual(system: _System, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return apply_transposed(system.drawn.views[view], np.concatenate([residual, weight], -1))
 
     mass, gradient = np.zeros_like(x), np.zeros_like(x)
-    for view, sums in enumerate(parallel_map(one_view, range(len(system.photos)))):
+    for view, sums in enumerate(in_turn(one_view, range(len(system.photos)))):
         ids, gain = system.drawn.views[view].ids, system.gains[view]
         mass[ids] += sums[:, 3:] * gain**2
         gradient[ids] += sums[:, :3] * gain
@@ -173,7 +173,7 @@ def _normal(system: _System, x: np.ndarray) -> np.ndarray:
 
     # views are added in their order, so that the threads cannot change the sum
     total = np.zeros_like(x)
-    for view, sums in enumerate(parallel_map(one_view, range(len(system.photos)))):
+    for view, sums in enumerate(in_turn(one_view, range(len(system.photos)))):
         total[system.drawn.views[view].ids] += sums * system.gains[view] ** 2
     return total
 

@@ -23,7 +23,7 @@ from gsmerge.kernels import optimise as kernels
 from gsmerge.photos import Photos
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.gradient import plan_gradients
-from gsmerge.threads import parallel_map
+from gsmerge.threads import in_turn, parallel_map
 from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -147,11 +147,15 @@ def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
         drawn = plan_view(state.splats, **photos.camera(view))
         return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0]
 
-    images, each = zip(*parallel_map(one_view, range(len(photos))), strict=True)
-    weights = np.stack(each).astype(np.float64)
-    photos_each = weights.sum(0) ** 2 / np.maximum((weights**2).sum(0), 1e-12)
+    images, sums, squares = [], np.zeros(len(state.x)), np.zeros(len(state.x))
+    for image, each in in_turn(one_view, range(len(photos))):
+        weights = each.astype(np.float64)
+        images.append(image)
+        sums += weights
+        squares += weights**2
+    photos_each = sums**2 / np.maximum(squares, 1e-12)
     shares = np.clip(photos_each - 1, plan.options.rates.reach_alone, 1).astype(np.float32)
-    return holdout_psnr(list(images), photos, plan.weights[1], plan.options.min_gain), shares
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), shares
 
 
 def holdout_score(state: State, plan: Plan) -> float:

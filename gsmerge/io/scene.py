@@ -36,6 +36,7 @@ from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.views import cameras_of, stored_photos
+from gsmerge.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 _MIN_CORRELATION = 0.5
@@ -145,7 +146,8 @@ def load_scene(
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO) -> SceneLoad:
     """:func:`load_scene` for files that are found already."""
-    return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
+    with use_threads():  # torch's own threads wait for one another, on a busy machine for longer than they work
+        return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
 
 
 def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlyScene:

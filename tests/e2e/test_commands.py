@@ -77,6 +77,22 @@ def test_quiet_says_nothing(scene_copy: Path, run: Run) -> None:
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
+def test_a_scene_too_large_for_the_machine_is_told_before_it_is_read(
+    scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = "this machine has 0.1 GB: use fewer views"
+    assert said not in run("inspect", scene_copy).out
+    for module in ("gsmerge.memory", "gsmerge.report"):
+        monkeypatch.setattr(f"{module}.machine_memory", lambda: 10**8)
+    outcome = run("compact", scene_copy, *SMALL, "--fit", "none", "--effort", "draft", "--overwrite")
+    assert outcome.code == 0
+    assert [line for line in outcome.err.splitlines() if said in line] == outcome.err.splitlines()[:1]
+    assert said in run("inspect", scene_copy).out
+    assert said in run("compact", scene_copy, "--dry-run", "--overwrite", *SMALL).out
+    quiet = run("compact", scene_copy, *SMALL, "--fit", "none", "--overwrite", "--quiet")
+    assert (quiet.out, quiet.err) == ("", "")
+
+
 def test_dry_run_writes_nothing(scene_copy: Path, run: Run) -> None:
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--dry-run", "--k", 2, *SMALL)
