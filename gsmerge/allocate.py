@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.errors import UsageError
 from gsmerge.io.ply_layout import LOGIT_COMMENT, MEANS, NORMALS, QUATS, SCALES, SH0
 from gsmerge.kernels.allocate import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.bisect import gather_groups, split_errors
@@ -269,7 +270,7 @@ def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarra
         local, own = gather_groups(starts, ids, rows)
         m = members
         return split_errors(
-            local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
+            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
         )
 
     tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
@@ -320,7 +321,8 @@ def parse_budget(budget: str | int, num_input: int) -> int:
     Never above ``num_input``.
 
     Raises:
-        ValueError: If it is neither, or not at least one Gaussian.
+        ValueError: If it is neither, or more than the input.
+        UsageError: If it is not at least one Gaussian.
 
     Example:
         >>> parse_budget("40000", 1_000_000), parse_budget("2.5%", 1_000_000)
@@ -338,7 +340,7 @@ def parse_budget(budget: str | int, num_input: int) -> int:
     else:
         count = min(int(text), num_input)
     if count < 1:
-        raise ValueError(f"budget: expected at least one Gaussian, got {text!r}")
+        raise UsageError(f"budget: expected at least one Gaussian, got {text!r}")
     return count
 
 
@@ -373,12 +375,13 @@ def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """Most Gaussians whose ``.ply`` has at most ``max_bytes``.
 
     Raises:
-        ValueError: If not even one fits, or the degree is not 0 to 4.
+        ValueError: If the degree is not 0 to 4.
+        UsageError: If not even one fits.
     """
     if not 0 <= sh_degree <= 4:
         raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
     if max_bytes < file_bytes(1, sh_degree):
-        raise ValueError(f"max bytes: expected at least {file_bytes(1, sh_degree)} for one Gaussian, got {max_bytes}")
+        raise UsageError(f"max bytes: expected at least {file_bytes(1, sh_degree)} for one Gaussian, got {max_bytes}")
     count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - file_bytes(1, sh_degree))
     while file_bytes(count, sh_degree) > max_bytes:  # the count itself stands in the header
         count -= 1

@@ -42,6 +42,23 @@ class Source:
     checkpoint: Checkpoint | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """Feature Gaussians merged across views, and what decoding them takes.
+
+    Args:
+        features: The Feature Gaussians.
+        members: The scene's Gaussians that ``features.members`` points into.
+        learned: Networks that correct; None: those are not used.
+        ones: What they become at K = 1, where that had to be known to choose them; None elsewhere.
+    """
+
+    features: FeatureGaussians
+    members: Members
+    learned: Learned | None
+    ones: Gaussians | None = None
+
+
 def build(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Gaussians:
     """The Gaussians of some superpixels: encoded, merged across views, decoded, fitted to the photos.
 
@@ -54,50 +71,41 @@ def build(source: Source, grouping: Grouping, options: CompactOptions, journal: 
     Returns:
         Canonical Gaussians.
     """
-    features, members, learned = merged_groups(source, grouping, options, journal)
+    merged = merged_groups(source, grouping, options, journal)
     with journal.stage("decode"):
-        wanted = wanted_count(features, members, grouping, options)
-        children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
-        gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+        gaussians = _decoded(merged, wanted_count(merged, grouping, options), options)
         if grouping.exact and len(gaussians) > grouping.wanted:  # K each would be more than the fit may grow to
-            children = split_counts(features, members, max(0, grouping.wanted - len(features)))
-            gaussians = decode(features, members, options.decode, children, options.encode.rule, learned)
+            gaussians = _decoded(merged, grouping.wanted, options)
     if source.scene.images is None or not options.fit.looks:
         return gaussians
     with journal.stage("fit"):
         rival = None
-        if learned is not None and options.fit.fit == "full":
-            rival = feature_to_gaussians(encode(source.scene, members, grouping.groups, options.encode))
-        del features, members, learned
+        if merged.learned is not None and options.fit.fit == "full":
+            rival = feature_to_gaussians(encode(source.scene, merged.members, grouping.groups, options.encode))
+        del merged
         return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal, rival)
 
 
-def merged_groups(
-    source: Source, grouping: Grouping, options: CompactOptions, journal: Journal
-) -> tuple[FeatureGaussians, Members, Learned | None]:
+def merged_groups(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Merged:
     """The Feature Gaussians of some superpixels, merged across views, with their members and any networks."""
     members = source.members
     if members is None:
         with journal.stage("members"):
             members = members_of(source.scene, grouping.groups, options)
     if source.checkpoint is None:
-        return _merged_features(source.scene, members, grouping, options, journal, None), members, None
+        return Merged(_merged_features(source.scene, members, grouping, options, journal, None), members, None)
     networks, cameras = source.checkpoint.networks, source.scene.cameras
     learned = Learned(networks, members, cameras, options.seed, options.precision)
     if options.checkpoint == "auto":
-        features, used = _better(source, (members, learned), grouping, options, journal)
-        return features, members, used
+        return _better(source, (members, learned), grouping, options, journal)
     journal.choices["networks"] = source.checkpoint.facts()
-    return (
-        _merged_features(source.scene, members, _unchosen(grouping, options), options, journal, learned),
-        members,
-        learned,
-    )
+    cut = _unchosen(grouping, options)
+    return Merged(_merged_features(source.scene, members, cut, options, journal, learned), members, learned)
 
 
 def _better(
     source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, journal: Journal
-) -> tuple[FeatureGaussians, Learned | None]:
+) -> Merged:
     """Feature Gaussians with and without networks: those whose Gaussians, one for each, show the views better.
 
     The choice does not hang on K, so that what is encoded once is what every K would have begun with. Networks learn
@@ -105,21 +113,21 @@ def _better(
     """
     assert source.checkpoint is not None
     members, learned = known
-    best: tuple[float, FeatureGaussians, Learned | None] | None = None
-    scores = {}
+    best: Merged | None = None
+    scores: dict[str, float] = {}
     for name, used, cut in (("learned", learned, _unchosen(grouping, options)), ("analytic", None, grouping)):
         own = Journal(journal.progress, journal.seconds)
         features = _merged_features(source.scene, members, cut, options, own, used)
         with own.stage("choose"):
             ones = decode(features, members, replace(options.decode, k=1), None, options.encode.rule, used)
             scores[name] = views_psnr(ones, source.scene)
-        if best is None or scores[name] >= best[0]:
-            best, choices = (scores[name], features, used), own.choices
+        if best is None or scores[name] >= scores["learned"]:
+            best, choices = Merged(features, members, used, ones), own.choices
     assert best is not None
     journal.choices |= {**choices, "start_scores": scores}
-    if best[2] is not None:
+    if best.learned is not None:
         journal.choices["networks"] = source.checkpoint.facts()
-    return best[1], best[2]
+    return best
 
 
 def _unchosen(grouping: Grouping, options: CompactOptions) -> Grouping:
@@ -167,13 +175,20 @@ def _merged_features(
     return _matched(features, options, journal, learned, closed)
 
 
-def wanted_count(
-    features: FeatureGaussians, members: Members, grouping: Grouping, options: CompactOptions
-) -> int | None:
+def wanted_count(merged: Merged, grouping: Grouping, options: CompactOptions) -> int | None:
     """Gaussians that the groups are to become where a number is to be met and no fit grows to it; None: K each."""
     if grouping.exact and not options.fit.grows:
         return grouping.wanted
-    return loose_count(features, members, grouping, options)
+    return loose_count(merged.features, merged.members, grouping, options)
+
+
+def _decoded(merged: Merged, wanted: int | None, options: CompactOptions) -> Gaussians:
+    """The Gaussians of the groups: as many as are wanted, or K each."""
+    if wanted is None and options.decode.count == 1 and merged.ones is not None:
+        return merged.ones
+    features, members = merged.features, merged.members
+    children = None if wanted is None else split_counts(features, members, max(0, wanted - len(features)))
+    return decode(features, members, options.decode, children, options.encode.rule, merged.learned)
 
 
 def _matched(

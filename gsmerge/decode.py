@@ -124,7 +124,7 @@ def halve(
         local, own = gather_groups(starts, ids, rows)
         m = members
         child_starts, child_ids, parents = bisect(
-            local, own, m.means, m.sh, m.opacities, centres[rows], footprints[rows], counts[rows]
+            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], counts[rows]
         )
         return np.diff(child_starts), child_ids, rows[parents]
 

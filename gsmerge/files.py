@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -27,6 +28,26 @@ from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.report import report_document
 from gsmerge.segment import SegmentOptions, count_for
+from gsmerge.types import LooseScene, PixelScene
+
+NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneInput:
+    """A scene as it is worked on, without what only its reading needs.
+
+    Args:
+        scene: The scene.
+        recognised: What the report says about the input.
+        comments: Of its header, those that are passed on.
+        notes: What the reader had to say.
+    """
+
+    scene: PixelScene | LooseScene
+    recognised: dict[str, Any]
+    comments: Sequence[str]
+    notes: Sequence[str]
 
 
 def compact_files(
@@ -63,25 +84,19 @@ def compact_files(
     """
     start, ending = perf_counter(), output_format(out)
     with atomic_output(out, overwrite=overwrite) as temporary:
-        loaded = load_files(files, opacity=opacity, reading=reading)
-        recognised, notes, scene = recognised_of(loaded), loaded.notes, loaded.scene
-        comments = kept_comments(loaded.ply)
-        del loaded  # which knows the row of every pixel
-        release_memory()
-        if len(scene):
-            superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
+        given = read_input(files, settings.segment, opacity=opacity, reading=reading)
         read = perf_counter()
-        result = compact(scene, settings, progress=progress)
+        result = compact(given.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
-        write_gaussians(temporary, result.gaussians, overwrite=True, comments=comments, ending=ending)
+        write_gaussians(temporary, result.gaussians, overwrite=True, comments=given.comments, ending=ending)
     lost = lost_harmonics(out, result.gaussians.sh_degree)
     coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
     for path, level in coarser:
         with atomic_output(path, overwrite=overwrite) as temporary:
-            write_gaussians(temporary, level.gaussians, overwrite=True, comments=comments, ending=ending)
+            write_gaussians(temporary, level.gaussians, overwrite=True, comments=given.comments, ending=ending)
     return report_document(
         result.report,
         input_path=files.ply,
@@ -89,10 +104,36 @@ def compact_files(
         seconds_before={**(seconds_before or {}), "read": read - start},
         seconds_after={"write": perf_counter() - compacted},
         coarser=[(path, level.report) for path, level in coarser],
-        recognised=recognised,
-        notes=[*notes, *([lost] if lost else [])],
+        recognised=given.recognised,
+        notes=[*given.notes, *([lost] if lost else [])],
         hashed=hashed,
     )
+
+
+def read_input(
+    files: SceneFiles, segment: SegmentOptions, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO
+) -> SceneInput:
+    """Read a scene that is to be cut into superpixels.
+
+    Args:
+        files: The scene.
+        segment: How; not more superpixels than pixels.
+        opacity: How opacities are stored.
+        reading: What is told of the file instead of found.
+
+    Raises:
+        SceneError: If the scene cannot be read.
+        UsageError: If there are fewer pixels than superpixels.
+    """
+    loaded = load_files(files, opacity=opacity, reading=reading)
+    bare = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
+    notes = (*loaded.notes, *([NO_PHOTOS] if bare else []))
+    given = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
+    del loaded  # which knows the row of every pixel
+    release_memory()
+    if len(given.scene):
+        superpixels_per_view(segment, given.scene.cameras.width, given.scene.cameras.height)
+    return given
 
 
 def recognised_of(loaded: SceneLoad) -> dict[str, Any]:

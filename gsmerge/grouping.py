@@ -8,6 +8,7 @@ from torch import Tensor
 
 from gsmerge.allocate import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.contribution import seen_depths
+from gsmerge.costs import photos_choose
 from gsmerge.errors import UsageError
 from gsmerge.fit import start_share
 from gsmerge.options import CompactOptions
@@ -80,8 +81,10 @@ def scene_canvas(scene: PixelScene | LooseScene, options: CompactOptions) -> Can
     if asked > pixels:
         raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {asked}")
     usual, most, exact = _counts(scene, options)
-    share = start_share(options.fit) if scene.images is not None else 1.0
-    return Canvas(scene_pictures(scene), uses_robust(scene, options), share, asked, usual, most, exact)
+    photos, fit = scene.images is not None, options.fit
+    share = start_share(fit) if photos else 1.0
+    robust = photos and photos_choose(options.robust.robust, fit.fit, fit.effort)
+    return Canvas(scene_pictures(scene), robust, share, asked, usual, most, exact)
 
 
 def usual_count(scene: PixelScene | LooseScene, options: CompactOptions) -> int:
@@ -165,12 +168,6 @@ def asked_per_view(scene: PixelScene | LooseScene, options: CompactOptions) -> i
     if isinstance(scene, PixelScene) or options.segment.superpixels is not None:
         return asked
     return max(1, min(asked, int(options.segment.density * len(scene.gaussians) / len(cameras))))
-
-
-def uses_robust(scene: PixelScene | LooseScene, options: CompactOptions) -> bool:
-    """Whether the photos choose the merge: as asked, otherwise unless a full fit follows or it is a draft."""
-    asked, fit = options.robust.robust, options.fit
-    return scene.images is not None and (fit.fit != "full" and fit.effort != "draft" if asked is None else asked)
 
 
 def _behind(canvas: Canvas, options: CompactOptions) -> float:

@@ -33,7 +33,7 @@ from gsmerge.io.ply_layout import LOGIT_COMMENT
 from gsmerge.io.reading import make_reading
 from gsmerge.options import CompactOptions
 from gsmerge.report import plan_document
-from gsmerge.threads import available_threads
+from gsmerge.threads import available_threads, use_threads
 from gsmerge.types import LooseScene, PixelScene
 
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # below one step of an 8-bit image; where optical depth is capped
@@ -82,8 +82,9 @@ class Inspection:
         sight: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
             cameras that fit.
         coverage: What every view shows.
-        estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``
-            and ``memory_bytes``; right within a factor of about two. None where it would refuse the scene.
+        estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
+            ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would
+            refuse the scene.
         notes: What was adapted or looks odd, one sentence each.
     """
 
@@ -156,8 +157,9 @@ def inspect(
     """
     told = make_reading(reading)
     files = find_scene_files(path, cameras=cameras, images=images)
-    ply = read_told(files.ply, opacity=opacity, reading=told)
-    return Inspection(**_of_ply(ply), **_of_views(ply, files, told))
+    with use_threads():
+        ply = read_told(files.ply, opacity=opacity, reading=told)
+        return Inspection(**_of_ply(ply), **_of_views(ply, files, told))
 
 
 def _plain(value: Any) -> Any:
@@ -245,12 +247,15 @@ def _sight(load: SceneLoad) -> Sight | None:
 
 
 def estimate(scene: PixelScene | LooseScene) -> dict[str, float]:
-    """What ``compact`` would make of a scene by default: Gaussians, their share, bytes, seconds and bytes of memory."""
+    """What ``compact`` would make of a scene by default: Gaussians, their share, bytes, seconds and bytes of memory.
+
+    And the bytes of memory that this machine has; None where the system does not tell.
+    """
     options = CompactOptions()
     plan = plan_document(
         {},
         (len(scene), scene.cameras.height, scene.cameras.width),
-        options.to_dict() | {"checkpoint": options.networks(photos=scene.images is not None)},
+        options.resolved(photos=scene.images is not None),
         output_path=Path(),
         per_view=0,
         photos=scene.images is not None,
@@ -258,6 +263,7 @@ def estimate(scene: PixelScene | LooseScene) -> dict[str, float]:
         fit_steps=options.fit.steps,
         usual=usual_count(scene, options),
         count=scene.num_gaussians,
+        num_rest=3 * scene.gaussians.shN.shape[1],
     )
     count = plan["output"]["num_gaussians_at_most"]
     return {

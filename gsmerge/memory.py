@@ -1,9 +1,14 @@
-"""The process's memory: how much it took, and handing back what is no longer used."""
+"""Memory: how much there is, how much the process took, and handing back what is no longer used."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+from contextlib import suppress
+from pathlib import Path
+
+LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # of versions 2 and 1
 
 
 def peak_memory() -> int:
@@ -13,6 +18,17 @@ def peak_memory() -> int:
     except ImportError:
         return 0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def machine_memory() -> int | None:
+    """Bytes that this machine has, or that its control group may take; None where the system does not tell."""
+    limits = []
+    with suppress(AttributeError, OSError, ValueError):
+        limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for path in LIMITS:
+        with suppress(OSError, ValueError):  # "max": there is none
+            limits.append(int(Path(path).read_text(encoding="ascii")))
+    return min((limit for limit in limits if limit > 0), default=None)
 
 
 def release_memory() -> None:

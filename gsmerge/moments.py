@@ -29,7 +29,8 @@ class Members:
         quats: ``[n,4]`` wxyz.
         scales: ``[n,3]``.
         opacities: ``[n]``.
-        sh: ``[n,k,3]``.
+        sh0: ``[n,1,3]``.
+        shN: ``[n,k-1,3]``, apart from the others: of degree 4 it is most of a scene, and only pooling looks at it.
         footprints: ``[n]`` size of one pixel of the own view at the member's depth, world units.
         pixels: ``[n]`` int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for none;
             None: one member per pixel, in order.
@@ -39,7 +40,8 @@ class Members:
     quats: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
-    sh: np.ndarray
+    sh0: np.ndarray
+    shN: np.ndarray
     footprints: np.ndarray
     pixels: np.ndarray | None = None
 
@@ -82,18 +84,17 @@ def loose_members(scene: LooseScene, pixels: np.ndarray) -> Members:
     footprints = np.maximum(depths, 1e-6) / focals[views]
     alone = np.flatnonzero(pixels < 0)
     if len(alone):
-        centres = cameras.centres.double().numpy()
-        distances = np.stack([np.linalg.norm(means[alone] - centre, axis=1) for centre in centres])
-        footprints[alone] = np.maximum((distances / focals[:, None]).min(0), 1e-6)
+        nearest = np.full(len(alone), np.inf)
+        for centre, focal in zip(cameras.centres.double().numpy(), focals, strict=True):
+            np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
+        footprints[alone] = np.maximum(nearest, 1e-6)
     return gaussian_members(scene.gaussians, footprints.astype(np.float32), pixels)
 
 
 def gaussian_members(g: Gaussians, footprints: np.ndarray, pixels: np.ndarray | None = None) -> Members:
     """Gaussians as arrays, with their footprints and pixels."""
-    sh = _array(g.sh0) if g.sh_degree == 0 else np.concatenate([_array(g.sh0), _array(g.shN)], 1)
-    return Members(
-        _array(g.means), _array(g.quats), _array(g.scales), _array(g.opacities), sh, footprints, pixels
-    )  # fmt: skip
+    means, quats, scales, opacities, sh0, shN = map(_array, (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN))
+    return Members(means, quats, scales, opacities, sh0, shN, footprints, pixels)
 
 
 @dataclass(frozen=True)
@@ -124,13 +125,13 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
     """
     num_groups = len(starts) - 1
     geometry = np.zeros((num_groups, 13))
-    sh = np.zeros((num_groups, members.sh.shape[1], 3), np.float32)
+    sh = np.zeros((num_groups, 1 + members.shN.shape[1], 3), np.float32)
 
     def run(first: int) -> None:
         last = min(first + ROWS_PER_TASK, num_groups)
         m = members
         pool(
-            starts[first : last + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh, m.footprints,
+            starts[first : last + 1], ids, m.means, m.quats, m.scales, m.opacities, m.sh0, m.shN, m.footprints,
             rule == "depth", geometry[first:last], sh[first:last],
         )  # fmt: skip
 

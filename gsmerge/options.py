@@ -23,6 +23,7 @@ METHODS = (
 )  # fmt: skip
 
 CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
+PRECISIONS = ("float32", "bfloat16")
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 
 
@@ -77,8 +78,8 @@ class CompactOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ValueError(f'precision: expected "float32" or "bfloat16", got {self.precision!r}')
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision: expected {' or '.join(PRECISIONS)}, got {self.precision!r}")
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
@@ -101,6 +102,10 @@ class CompactOptions:
         short = not photos or self.fit.fit == "none" or (self.fit.fit == "full" and self.fit.steps <= SHORT_STEPS)
         hasty = self.fit.effort in ("draft", "fast")
         return "shipped" if short and not hasty and not self.robust.robust and self.encode.rule == "depth" else "none"
+
+    def resolved(self, *, photos: bool) -> dict[str, Any]:
+        """As :meth:`to_dict`, with the checkpoint and the matching that are used where nothing else was asked for."""
+        return self.to_dict() | {"checkpoint": self.networks(photos=photos), "match": self.match.method}
 
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""

@@ -27,6 +27,7 @@ from gsmerge.networks import find_checkpoint
 from gsmerge.options import CompactOptions
 from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
+from gsmerge.sampling import judged_views
 from gsmerge.targets import AUTO_RUNGS, MOST, RUNGS, count_within, curve_knee, level_counts, rungs, search_count
 from gsmerge.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians, LooseScene, PixelScene
@@ -44,7 +45,7 @@ class CompactReport:
         num_input: Gaussians in the scene.
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views rendered from the input; None without photos.
+        psnr_before: Mean PSNR (dB) of the input views, of many some, rendered from the input; None without photos.
         psnr_after: The same from the result.
         choices: What the stages decided (count, curve, merge, scores, clusters, fit).
         notes: Things worth telling, one sentence each.
@@ -159,20 +160,22 @@ def _settled(options: CompactOptions) -> CompactOptions:
     return replace(options, fit=replace(options.fit, fit_steps=AUTO_STEPS * options.fit.steps))
 
 
-def begin(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Work:
-    """The scene in its own frame, and its superpixels if they are to be cut to a number."""
+def begin(
+    scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal, frame: Frame | None = None
+) -> Work:
+    """The scene in its own frame, or a given one, and its superpixels if they are to be cut to a number."""
     target, baseline = settings.target, _rival(scene, settings, journal)
     if baseline is not None:  # nothing is set aside, and nothing is learned
         settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     with journal.stage("prepare"):
-        ready = make_ready(scene, settings)
+        ready = make_ready(scene, settings, frame)
         canonical, frame, options = ready.scene, ready.frame, ready.options
         known = isinstance(canonical, PixelScene) or options.checkpoint != "auto"  # they learnt from one per pixel
         name = options.networks(photos=scene.images is not None) if known else "none"
         checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
-        journal.notes += [*ready.notes, *notes]
+        journal.notes += [*ready.notes, *notes, *_judged_note(scene)]
         canvas = scene_canvas(canonical, options)
     members = scene_members(canonical) if isinstance(canonical, PixelScene) else None
     source = Source(canonical, members, checkpoint)
@@ -182,6 +185,13 @@ def begin(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Jou
         with journal.stage("segment"):
             tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
     return Work(scene, frame, source, options, canvas, tree, ready.kept, settings, baseline)
+
+
+def _judged_note(scene: PixelScene | LooseScene) -> list[str]:
+    """A note where not all views are scored."""
+    if scene.images is None or len(judged_views(len(scene))) == len(scene):
+        return []
+    return [f"the input views are scored on {len(judged_views(len(scene)))} of {len(scene)}"]
 
 
 def _rival(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Baseline | None:
@@ -278,16 +288,16 @@ def choose_groups(work: Work, count: int | None, journal: Journal) -> Grouping:
 
 
 def input_psnr(gaussians: Gaussians, photos: Photos, near: float) -> float:
-    """Mean PSNR (dB) of the photos rendered from some Gaussians beyond the near plane."""
-    splats = prepare(gaussians)
+    """Mean PSNR (dB) of the photos, of many some, rendered from some Gaussians beyond the near plane."""
+    splats, views = prepare(gaussians), judged_views(len(photos))
 
     def one_view(view: int) -> float:
         plan = plan_view(splats, **photos.camera(view), near=near)
         return psnr(np.clip(composite(plan)[0], 0, 1), photos.images[view])
 
     if len(gaussians) > ONE_AT_A_TIME:
-        return float(np.mean([one_view(view) for view in range(len(photos))]))
-    return float(np.mean(parallel_map(one_view, range(len(photos)))))
+        return float(np.mean([one_view(view) for view in views]))
+    return float(np.mean(parallel_map(one_view, views)))
 
 
 __all__ = ["CompactOptions", "CompactReport", "CompactResult", "compact"]

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.costs import COST_FIXED, fit_of, is_robust, memory_bytes, work_seconds
+from gsmerge.costs import COST_FIXED, fit_of, is_robust, memory_bytes, memory_problem, work_seconds
+from gsmerge.memory import machine_memory
 
 SCHEMA_VERSION = 1
 
@@ -81,8 +82,7 @@ def report_document(
         "options": numbers["options"],
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
-        "seconds": {name: round(value, 4) for name, value in stages.items()},
-        "total_seconds": round(sum(stages.values()), 4),
+        **seconds_document(stages),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
@@ -158,12 +158,23 @@ def summary_line(document: Mapping[str, Any]) -> str:
         if psnr["before"] is not None and psnr["after"] is not None
         else ""
     )
-    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
-        f"{quality}; {document['total_seconds']:.1f} s ({stages})"
+        f"{quality}; {seconds_line(document)}"
     )
+
+
+def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
+    """Wall time by stage and in all, as every report has it."""
+    total = round(sum(seconds.values()), 4)
+    return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
+
+
+def seconds_line(document: Mapping[str, Any]) -> str:
+    """``2.3 s (read 0.70, ...)`` of a report."""
+    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
+    return f"{document['total_seconds']:.1f} s ({stages})"
 
 
 def human_bytes(count: float) -> str:
@@ -189,13 +200,14 @@ def plan_document(
     wanted: int | None = None,
     notes: Sequence[str] = (),
     count: int | None = None,
+    num_rest: int = 0,
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory.
 
     Args:
         files: Paths of the ``ply``, the ``cameras`` and the ``images``.
         grid: Views, height and width of the Gaussian grid.
-        options: All settings by flat name, as of ``CompactOptions.to_dict()``, but the checkpoint that is used.
+        options: All settings by flat name, as of ``CompactOptions.resolved()``.
         output_path: The ``.ply`` that would be written.
         per_view: Superpixels per view, before a budget deals them out.
         photos: Whether the scene has photos; robust merging and the fit need them.
@@ -205,6 +217,7 @@ def plan_document(
         wanted: Gaussians that a budget, a file size or a preset asks for; None without any.
         notes: What the reader had to say.
         count: Gaussians of the file; None: one for each pixel of the grid.
+        num_rest: Columns of higher harmonics.
 
     Returns:
         ``schema_version`` 1: the plan; ``estimate`` holds within a factor of about two on a common processor once
@@ -229,11 +242,18 @@ def plan_document(
         "fit": fit_of(options, photos=photos),
         "estimate": {
             "seconds": round(COST_FIXED + seconds / max(1, min(threads, views)), 1),
-            "memory_bytes": memory_bytes(pixels, photos=photos),
+            "memory_bytes": memory_bytes(pixels, photos=photos, num_rest=num_rest),
+            "machine_memory_bytes": machine_memory(),
         },
         "options": dict(options),
         "notes": list(notes),
     }
+
+
+def memory_problems(guess: Mapping[str, Any]) -> list[str]:
+    """That an estimated run is not likely to fit into this machine's memory; nothing where it does."""
+    problem = memory_problem(guess["memory_bytes"], guess["machine_memory_bytes"])
+    return [] if problem is None else [problem]
 
 
 def plan_lines(plan: Mapping[str, Any]) -> list[str]:
@@ -247,6 +267,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
         f" across views: {plan['options']['match']}",
+        f"networks     {plan['options']['checkpoint']}",
     ]
     return [
         f"would read   {found['ply']}: {found['num_views']} views of {found['width']} x {found['height']}",
@@ -254,6 +275,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         *(steps if plan["method"] == "gsmerge" else [f"method       {plan['method']}"]),
         f"fit          {plan['fit']}",
         f"estimate     about {guess['seconds']:.0f} s, {human_bytes(guess['memory_bytes'])} of memory",
+        *(f"memory       {problem}" for problem in memory_problems(guess)),
         *(f"note         {note}" for note in plan["notes"]),
     ]
 
@@ -347,7 +369,8 @@ def _estimate_lines(found: Mapping[str, Any]) -> list[str]:
     return [
         f"compact    would give about {guess['num_gaussians']:,} Gaussians ({100 * guess['ratio']:.1f} %),"
         f" {human_bytes(guess['bytes'])}, in about {guess['seconds']:.0f} s with"
-        f" {human_bytes(guess['memory_bytes'])} of memory"
+        f" {human_bytes(guess['memory_bytes'])} of memory",
+        *(f"memory     {problem}" for problem in memory_problems(guess)),
     ]
 
 

@@ -17,7 +17,8 @@ from gsmerge.metrics import psnr
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.photos import Photos
 from gsmerge.render import composite, plan_view, prepare, splat_adjoint
-from gsmerge.threads import parallel_map
+from gsmerge.sampling import judged_views
+from gsmerge.threads import in_turn, parallel_map
 from gsmerge.types import SH_C0, FeatureGaussians
 
 MIN_VIEWS = 3  # with two, leaving one out leaves nothing to compare
@@ -153,7 +154,7 @@ def _spreads(features: FeatureGaussians, options: RobustOptions) -> Iterator[tup
 
 
 def photo_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) -> float:
-    """Mean PSNR (dB) of every photo rendered from all Gaussians, or from those of the other views only."""
+    """Mean PSNR (dB) of the photos, of many some, rendered from all Gaussians, or those of the other views only."""
     splats, views = prepare(feature_to_gaussians(features)), features.views.numpy()
 
     def score(view: int) -> float:
@@ -161,7 +162,7 @@ def photo_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) ->
         image, _ = composite(plan)
         return psnr(np.clip(image, 0, 1), photos.images[view])
 
-    return float(np.mean(parallel_map(score, range(len(photos)))))
+    return float(np.mean(parallel_map(score, judged_views(len(photos)))))
 
 
 def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) -> torch.Tensor:
@@ -184,7 +185,9 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
             squares = np.einsum("hwc,hwc->hw", image, image)
             return splat_adjoint(plan, np.dstack([np.ones_like(squares), image, squares]))
 
-        sums = np.stack(parallel_map(testimony, range(len(photos)))).sum(0, dtype=np.float64)
+        sums = np.zeros((len(features), 5))
+        for seen_there in in_turn(testimony, range(len(photos))):
+            sums += seen_there
         mass = sums[:, 0]
         error = (colors**2).sum(1) * mass - 2 * (colors * sums[:, 1:4]).sum(1) + sums[:, 4]
         error = np.maximum(error, 0) / (3 * mass + 1e-9)

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from gsmerge.costs import MOST_JUDGED
 from gsmerge.types import LooseScene, PixelScene
 
 
@@ -23,6 +24,14 @@ def even_views(num_views: int, count: int) -> list[int]:
     if count == 1:
         return [(num_views - 1) // 2]
     return [round(i * (num_views - 1) / (count - 1)) for i in range(count)]
+
+
+def judged_views(num_views: int) -> list[int]:
+    """The views that whole scenes are judged by: all, of many evenly spread ones.
+
+    Rendering the unmerged input costs as many views as Gaussians, so with all of many views it would be most of a run.
+    """
+    return even_views(num_views, min(num_views, MOST_JUDGED))
 
 
 def pick_views(num_views: int, most: int) -> list[int]:

@@ -21,6 +21,7 @@ import torch
 
 T = TypeVar("T")
 R = TypeVar("R")
+AT_ONCE = 12  # results of in_turn that are in memory together
 
 
 class _Local(threading.local):
@@ -108,6 +109,16 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
         if count == 1 or len(items) < 2 or _local.pool is None or _local.inside:
             return [function(item) for item in items]
         return _share(_local.pool, function, items, min(count, len(items)) - 1)
+
+
+def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """The results of :func:`parallel_map` one by one, of which few are in memory together.
+
+    For what is as large as all Gaussians for every view, and only added up: memory does not go with the views.
+    """
+    items = list(items)
+    for first in range(0, len(items), AT_ONCE):
+        yield from parallel_map(function, items[first : first + AT_ONCE])
 
 
 def _share(pool: ThreadPoolExecutor, function: Callable[[T], R], items: list[T], helpers: int) -> list[R]:

@@ -16,6 +16,7 @@ from gsmerge.batch.records import RECORDS, SUMMARY, Index
 from gsmerge.batch.task import Task, Work
 from gsmerge.options import CompactOptions
 
+NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
 FAST = ("--effort", "draft", "--fit", "none")
 QUICK = BatchOptions(CompactOptions().with_settings({"effort": "draft", "fit": "none", "threads": 1}))
 

@@ -14,7 +14,7 @@ from gsmerge.costs import memory_bytes
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.files import level_output
 from gsmerge.io.bounds import read_text
-from gsmerge.io.ply_file import count_rows
+from gsmerge.io.ply_file import promised
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
 
 SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *IMAGE_PLACES}
@@ -29,17 +29,19 @@ class Job:
         scene: A ``.ply``, or the folder of one.
         output: Name of the result in the output folder.
         num_gaussians: That its file promises; 0 where it cannot be read.
+        num_rest: Columns of higher harmonics, likewise.
     """
 
     index: int
     scene: str
     output: str
     num_gaussians: int
+    num_rest: int = 0
 
     @property
     def memory(self) -> int:
         """Bytes that it may take, within a factor of about two."""
-        return memory_bytes(self.num_gaussians, photos=True)
+        return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
 
 
 def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
@@ -64,7 +66,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
         if real in inputs or real in own:
             continue
         inputs.add(real)
-        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), count_rows(ply))
+        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *promised(ply))
         for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
             if name in owners:
                 raise UsageError(

@@ -17,8 +17,8 @@ from gsmerge.costs import (
     COST_RIVAL_STEP,
     COST_RIVALS,
     COST_ROBUST,
-    COST_SCORE,
     COST_SEGMENT,
+    score_cost,
 )
 from gsmerge.fit.options import STEPS
 
@@ -68,7 +68,7 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     settings = experiment.settings
     if experiment.method != OURS:
         return _rival_seconds(experiment.method, STEPS[settings.get("effort", "default")], pixels, views, threads)
-    work = pixels * (COST_MERGE + COST_SCORE + COST_SEGMENT[settings.get("segmentation", "rdseg")])
+    work = pixels * (COST_MERGE + score_cost(views) + COST_SEGMENT[settings.get("segmentation", "rdseg")])
     fit = settings.get("fit", "full")
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
@@ -79,7 +79,8 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
 
 def _rival_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
     """The same of another method than ours."""
-    work = pixels * (COST_RIVALS.get(method, COST_RIVAL) + COST_SCORE + COST_COLOR_FIT * (method == "unmerged-color"))
+    work = COST_RIVALS.get(method, COST_RIVAL) + score_cost(views) + COST_COLOR_FIT * (method == "unmerged-color")
+    work *= pixels
     if method == "unmerged-fit":
         work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_RIVAL_STEP)
     return work / threads

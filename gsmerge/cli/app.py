@@ -17,6 +17,7 @@ from gsmerge.cli.console import one_line, plain_warnings
 from gsmerge.cli.decode import decode
 from gsmerge.cli.encode import encode
 from gsmerge.cli.evaluate import evaluate
+from gsmerge.cli.extend import extend
 from gsmerge.cli.generate import generate
 from gsmerge.cli.inspect import inspect
 from gsmerge.cli.options import debug_wanted, set_debug
@@ -35,7 +36,8 @@ app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
 COMMANDS = (
-    compact, batch, encode, decode, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train,
+    compact, batch, encode, decode, extend, evaluate, inspect, segment, render, preview, report, stress, chart,
+    generate, train,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)
@@ -69,7 +71,8 @@ def _fail(message: str, code: int) -> int:
 def _usage_message(error: Any) -> str:
     context = error.ctx
     place = context.command_path if context is not None else PROGRAM
-    return f"{error.format_message().rstrip('.')}; see '{place} --help'"
+    told = error.format_message().replace("Value error, ", "", 1)  # of the checks that typer borrows
+    return f"{told.rstrip('.')}; see '{place} --help'"
 
 
 def run(args: Sequence[str] | None = None) -> int:

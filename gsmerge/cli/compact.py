@@ -12,7 +12,7 @@ import typer
 
 from gsmerge.cli import network_options as net
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
+from gsmerge.cli.console import announce_compilation, one_line, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_format, check_output, default_output, input_files
 from gsmerge.cli.settings import given_settings, reading_of, told_as_usage
 from gsmerge.errors import TargetError
@@ -75,9 +75,7 @@ def compact(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or default_output(files.ply)
-    inputs = input_files(files)
-    if checkpoint not in (None, *net.CHECKPOINTS):
-        inputs = (*inputs, Path(checkpoint))
+    inputs = (*input_files(files), *net.checkpoint_files(checkpoint))
     outputs = [out, *(level_output(out, level) for level in range(1, levels or 1))]
     for path in outputs:
         check_output(path, inputs, overwrite=overwrite)
@@ -88,6 +86,7 @@ def compact(
     if dry_run:
         print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
+    warn_of_memory(files, quiet=quiet or json)
     document = _run(
         files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
         start=start, hashed=json or report is not None,
@@ -95,6 +94,18 @@ def compact(
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
     if document["unmet"]:
         raise TargetError(document["unmet"])
+
+
+def warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
+    """Say so before anything is read if the scene is not likely to fit into this machine's memory."""
+    from gsmerge.costs import memory_bytes, memory_problem
+    from gsmerge.io.ply_file import promised
+    from gsmerge.memory import machine_memory
+
+    count, num_rest = promised(files.ply)
+    problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
+    if problem is not None:
+        say(f"gsmerge: warning: {problem}", quiet=quiet)
 
 
 def _run(
@@ -155,16 +166,13 @@ def print_plan(
 ) -> None:
     """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import check_scene, find_baseline, unused_notes
-    from gsmerge.files import superpixels_per_view
+    from gsmerge.files import read_input
     from gsmerge.grouping import asked_per_view, limit_of, usual_count
-    from gsmerge.io import load_files
     from gsmerge.report import plan_document, plan_lines, to_json
     from gsmerge.threads import available_threads
 
-    loaded = load_files(files, opacity=opacity, reading=reading)
-    scene, cameras = loaded.scene, loaded.scene.cameras
-    if len(scene):
-        superpixels_per_view(settings.segment, cameras.width, cameras.height)
+    given = read_input(files, settings.segment, opacity=opacity, reading=reading)
+    scene, cameras = given.scene, given.scene.cameras
     baseline, unused = find_baseline(settings.method), []
     with told_as_usage():
         wanted = limit_of(scene, settings)
@@ -174,7 +182,7 @@ def print_plan(
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
-        settings.to_dict() | {"checkpoint": settings.networks(photos=scene.images is not None)},
+        settings.resolved(photos=scene.images is not None),
         output_path=out,
         per_view=asked_per_view(scene, settings) if len(scene) else 0,
         photos=scene.images is not None,
@@ -182,8 +190,9 @@ def print_plan(
         fit_steps=settings.fit.steps,
         usual=usual_count(scene, settings),
         wanted=wanted,
-        notes=[*loaded.notes, *unused],
+        notes=[*given.notes, *unused],
         count=scene.num_gaussians,
+        num_rest=3 * scene.gaussians.shN.shape[1],
     )
     if as_json:
         sys.stdout.write(to_json(document))

@@ -62,7 +62,7 @@ def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callab
     second: list[subprocess.Popen[bytes]] = []
 
     def begin() -> None:
-        say("compiling kernels, once after installation, up to 25 s", quiet=quiet)
+        say("compiling kernels for their first use, up to 30 s", quiet=quiet)
         if share and (os.cpu_count() or 1) > 1:
             silent = subprocess.DEVNULL
             command = [sys.executable, "-m", "gsmerge.warm"]

@@ -15,7 +15,7 @@ from gsmerge.cli import options as opt
 from gsmerge.cli.compact import print_plan
 from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.paths import check_output, input_files
-from gsmerge.cli.settings import reading_of, settings_of
+from gsmerge.cli.settings import given_settings, reading_of
 
 if TYPE_CHECKING:
     from gsmerge.io import Reading, SceneFiles
@@ -40,6 +40,7 @@ EncodedOption = Annotated[
 
 
 def encode(
+    context: typer.Context,
     scene: opt.SceneArgument,
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
@@ -81,20 +82,8 @@ def encode(
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     out = output or files.ply.with_suffix(".gsm")
-    named = () if checkpoint in (None, *net.CHECKPOINTS) else (Path(str(checkpoint)),)
-    check_output(out, (*input_files(files), *named), overwrite=overwrite)
-    chosen: dict[str, Any] = {"k": k, "superpixels": superpixels, "density": density, "segmentation": segmentation}
-    chosen |= {"effort": effort, "budget": budget, "max_bytes": max_bytes, "preset": preset, "robust": robust}
-    chosen |= {
-        "match": match,
-        "geometry": geometry,
-        "unseen": unseen,
-        "checkpoint": checkpoint,
-        "fit": "none",
-        "seed": seed,
-    }
-    chosen |= {"require_checkpoint": require_checkpoint or None, "precision": precision, "threads": threads}
-    settings = settings_of(chosen)
+    check_output(out, (*input_files(files), *net.checkpoint_files(checkpoint)), overwrite=overwrite)
+    settings = given_settings({**context.params, "fit": "none"})
     if dry_run:
         print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
         return
@@ -124,30 +113,25 @@ def _run(
     start: float,
 ) -> dict[str, Any]:
     """Read, encode and write; returns the report."""
-    from gsmerge.files import recognised_of, superpixels_per_view
-    from gsmerge.io import atomic_output, kept_comments, load_files
+    from gsmerge.files import read_input
+    from gsmerge.io import atomic_output
     from gsmerge.report import file_sha256
     from gsmerge.stored.encode import encode_scene
     from gsmerge.stored.file import save_encoded
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        loaded = load_files(files, opacity=opacity, reading=reading)
-        recognised, scene = recognised_of(loaded), loaded.scene
-        comments, notes = list(kept_comments(loaded.ply)), loaded.notes
-        del loaded  # which knows the row of every pixel
-        if len(scene):
-            superpixels_per_view(settings.segment, scene.cameras.width, scene.cameras.height)
+        given = read_input(files, settings.segment, opacity=opacity, reading=reading)
         read = perf_counter()
         with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
-            encoded = encode_scene(scene, settings, max_k=max_k, progress=progress)
+            encoded = encode_scene(given.scene, settings, max_k=max_k, progress=progress)
         done = perf_counter()
         source = {"name": files.ply.name, "sha256": file_sha256(files.ply), "bytes": files.ply.stat().st_size}
-        source |= {"comments": comments, "notes": list(notes)}
+        source |= {"comments": list(given.comments), "notes": list(given.notes)}
         save_encoded(temporary, encoded, overwrite=True, source=source)
     seconds = {"import": imported - start, "read": read - imported, "encode": done - read}
     seconds["write"] = perf_counter() - done
-    return _document(files.ply, out, encoded, source | recognised, notes, seconds)
+    return _document(files.ply, out, encoded, source | given.recognised, given.notes, seconds)
 
 
 def _document(
@@ -159,7 +143,7 @@ def _document(
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """The report as plain JSON types."""
-    from gsmerge.report import document_head
+    from gsmerge.report import document_head, seconds_document
 
     settings, size = encoded.settings, out.stat().st_size
     told = {name: value for name, value in found.items() if name not in ("name", "comments", "notes")}
@@ -172,21 +156,18 @@ def _document(
         "options": encoded.about["options"],
         "seed": encoded.about["options"]["seed"],
         "choices": encoded.about["choices"],
-        "seconds": {name: round(value, 4) for name, value in seconds.items()},
-        "total_seconds": round(sum(seconds.values()), 4),
+        **seconds_document(seconds),
         "notes": [*notes, *encoded.about["notes"]],
     }
 
 
 def _summary(document: Mapping[str, Any]) -> str:
     """The line that it ends with."""
-    from gsmerge.report import human_bytes
+    from gsmerge.report import human_bytes, seconds_line
 
     before, after = document["input"], document["output"]
-    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
-    seconds = f"{document['total_seconds']:.1f} s ({stages})"
     return (
         f"{after['path']}: {before['num_gaussians']:,} Gaussians -> {after['num_groups']:,} groups,"
         f" {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])} ({100 * document['ratio_bytes']:.0f} %);"
-        f" decodes to {after['num_gaussians_at_most']:,} Gaussians at most; {seconds}"
+        f" decodes to {after['num_gaussians_at_most']:,} Gaussians at most; {seconds_line(document)}"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -32,7 +33,6 @@ GeometryOption = Annotated[
         rich_help_panel=MERGING,
     ),
 ]
-CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
 CheckpointOption = Annotated[
     str | None,
     typer.Option(
@@ -56,3 +56,10 @@ PrecisionOption = Annotated[
     typer.Option(help="Arithmetic of the networks.", show_default="float32", rich_help_panel=MERGING),
 ]
 TrainDeviceOption = Annotated[Device, typer.Option(help="Where the networks run; windows are rendered on the CPU.")]
+
+
+def checkpoint_files(checkpoint: str | None) -> tuple[Path, ...]:
+    """The file that ``--checkpoint`` names; none where it is a name of the package's own."""
+    from gsmerge.options import CHECKPOINTS
+
+    return () if checkpoint is None or checkpoint in CHECKPOINTS else (Path(checkpoint),)

@@ -32,6 +32,16 @@ def check_format(output: Path, max_bytes: str | None = None) -> None:
         raise UsageError(f"--max-bytes: expected an output as .ply, got {ending}; give a --budget")
 
 
+def check_picture(output: Path) -> None:
+    """Refuse a name that promises another format than the one that pictures are written in.
+
+    Raises:
+        UsageError: If it does not end in .png.
+    """
+    if output.suffix.lower() != ".png":
+        raise UsageError(f"{output}: expected a name that ends in .png")
+
+
 def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Refuse an output file that is one of the inputs, that exists, or whose folder does not.
 

@@ -9,7 +9,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import check_cameras, check_output, input_files
+from gsmerge.cli.paths import check_cameras, check_output, check_picture, input_files
 from gsmerge.cli.pictures import tell_pictures, write_picture
 from gsmerge.cli.settings import reading_of
 
@@ -40,6 +40,7 @@ def preview(
     from gsmerge.sampling import pick_views
     from gsmerge.threads import use_threads
 
+    check_picture(output)
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     check_output(output, (*scenes, *input_files(files)), overwrite=overwrite)
     check_cameras(files)

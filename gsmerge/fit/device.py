@@ -109,7 +109,7 @@ def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rn
     level = 1 if progress < plan.options.coarse_share else 0
     photos = plan.photos[level]
     photo = torch.from_numpy(photos.images[view]).to(held.x)
-    weight = torch.from_numpy(plan.weight(level, view)).to(held.x)
+    weight = torch.from_numpy(plan.step_weights[level][view]).to(held.x)
     background = rng.random(3, dtype=np.float32)
     means, quats, scales, opacities = shape_of(held.x)
     drawn = opacities

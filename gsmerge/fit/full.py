@@ -23,7 +23,7 @@ from gsmerge.kernels import optimise as kernels
 from gsmerge.photos import Photos
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.gradient import plan_gradients
-from gsmerge.threads import parallel_map
+from gsmerge.threads import in_turn, parallel_map
 from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -40,20 +40,22 @@ Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a run goes: photos at full and half size with their training weights, steps, and what a step does.
+    """How a run goes.
 
-    The weights are 0 on held-out blocks, ``HIDDEN`` on pixels that neither steps nor scores look at, 1 elsewhere.
+    Args:
+        photos: At full and at half size.
+        weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
+            neither steps nor scores look at, 1 elsewhere.
+        step_weights: The same as a step looks at them: 0 on hidden pixels, and full size looks at held-out blocks, too.
+        options: What a step does.
+        dropout: Share of the Gaussians that a step leaves out.
     """
 
     photos: tuple[Photos, Photos]
     weights: tuple[list[np.ndarray], list[np.ndarray]]
+    step_weights: tuple[list[np.ndarray], list[np.ndarray]]
     options: FitOptions
     dropout: float
-
-    def weight(self, level: int, view: int) -> np.ndarray:
-        """``[h,w]`` float32 weights of the pixels of a photo in a step: full size looks at held-out blocks, too."""
-        weight = self.weights[level][view]
-        return np.where(weight == HIDDEN, np.float32(0), weight if level == 1 else np.float32(1))
 
 
 def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
@@ -65,7 +67,9 @@ def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, mask
     weights = full, reduced(full, photos[1])
     if masks is not None:
         weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
-    return Plan(photos, weights, options, dropout)
+    everywhere = [np.where(weight == HIDDEN, np.float32(0), np.float32(1)) for weight in weights[0]]
+    trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
+    return Plan(photos, weights, (everywhere, trained), options, dropout)
 
 
 def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
@@ -77,7 +81,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     """One Adam step on one view -> mean squared error of its training pixels."""
     level = 1 if progress < plan.options.coarse_share else 0
     photos = plan.photos[level]
-    weight = plan.weight(level, view)
+    weight = plan.step_weights[level][view]
     background, opacities = rng.random(3, dtype=np.float32), None
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
@@ -143,11 +147,15 @@ def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
         drawn = plan_view(state.splats, **photos.camera(view))
         return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0]
 
-    images, each = zip(*parallel_map(one_view, range(len(photos))), strict=True)
-    weights = np.stack(each).astype(np.float64)
-    photos_each = weights.sum(0) ** 2 / np.maximum((weights**2).sum(0), 1e-12)
+    images, sums, squares = [], np.zeros(len(state.x)), np.zeros(len(state.x))
+    for image, each in in_turn(one_view, range(len(photos))):
+        weights = each.astype(np.float64)
+        images.append(image)
+        sums += weights
+        squares += weights**2
+    photos_each = sums**2 / np.maximum(squares, 1e-12)
     shares = np.clip(photos_each - 1, plan.options.rates.reach_alone, 1).astype(np.float32)
-    return holdout_psnr(list(images), photos, plan.weights[1], plan.options.min_gain), shares
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), shares
 
 
 def holdout_score(state: State, plan: Plan) -> float:

@@ -10,7 +10,7 @@ from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.optimise import LOGIT, QUAT, SIZE
 from gsmerge.photos import Photos
 from gsmerge.render import composite, plan_view, splat_adjoint
-from gsmerge.threads import parallel_map
+from gsmerge.threads import in_turn
 
 OFFSET = 0.7  # of the halves from the middle, in standard deviations; their own shrinks so that the sum keeps its own
 DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would cover the same, a little more closes gaps
@@ -24,7 +24,10 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
         image, _ = composite(plan, state.view_colors())
         return splat_adjoint(plan, np.abs(image - photos.images[view]).mean(-1, keepdims=True))[:, 0]
 
-    return np.stack(parallel_map(one_view, range(len(photos)))).sum(0, dtype=np.float64)
+    masses = np.zeros(len(state.x))
+    for of_view in in_turn(one_view, range(len(photos))):
+        masses += of_view
+    return masses
 
 
 def grow_to(state: State, photos: Photos, count: int) -> State:

@@ -16,7 +16,7 @@ from gsmerge.fit.report import FitReport
 from gsmerge.fit.state import gaussians_of, start_state
 from gsmerge.photos import Photos
 from gsmerge.render import composite, contributions, plan_view, prepare
-from gsmerge.threads import parallel_map
+from gsmerge.threads import in_turn, parallel_map
 from gsmerge.types import Gaussians
 
 CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
@@ -84,7 +84,7 @@ def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
         return plan.ids, contributions(plan)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
-    for ids, peaks in parallel_map(one_view, range(len(photos))):
+    for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
     return torch.from_numpy(~inside | (peak >= least))

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io.compressed import is_compressed, unpack
-from gsmerge.io.ply_file import open_ply
+from gsmerge.io.ply_file import let_go, open_ply
 from gsmerge.io.ply_layout import (
     BLOCK_BYTES,
     LOGIT_COMMENT,
@@ -137,14 +137,20 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     path = Path(path)
     data = open_ply(path)
     compressed = is_compressed(data)
-    rows = unpack(path, data) if compressed else np.asarray(_vertex(path, data).data)
+    stored = unpack(path, data) if compressed else _vertex(path, data).data
+    rows = np.asarray(stored)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
     size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
     blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
-    done = parallel_map(lambda block: _convert(rows[block], {k: v[block] for k, v in out.items()}), blocks)
 
+    def convert(block: slice) -> _Converted:
+        found = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        let_go(stored, block)
+        return found
+
+    done = parallel_map(convert, blocks)
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     named = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
     encoding = named or _likely_encoding(done)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import mmap
 import re
 import warnings
 from pathlib import Path
 
+import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError
@@ -53,14 +55,29 @@ def open_ply(path: Path) -> PlyData:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
 
-def count_rows(path: Path) -> int:
-    """Gaussians that a PLY file promises, from its header alone; 0 where there is none that can be read."""
+def let_go(rows: np.ndarray, block: slice) -> None:
+    """Drop a block of rows of a mapped file from the process's memory; looked at again, it is read again."""
+    mapped = getattr(rows, "_mmap", None)
+    if not isinstance(rows, np.memmap) or mapped is None or not hasattr(mmap, "MADV_DONTNEED"):
+        return
+    before = rows.offset % mmap.ALLOCATIONGRANULARITY
+    start, end = (before + row * rows.dtype.itemsize for row in (block.start, block.stop))
+    start -= start % mmap.PAGESIZE
+    mapped.madvise(mmap.MADV_DONTNEED, start, end - start)
+
+
+def promised(path: Path) -> tuple[int, int]:
+    """Gaussians that a PLY file promises, and their columns of higher harmonics, from its header alone.
+
+    Zeros where there is none that can be read.
+    """
     try:
         with path.open("rb") as file:
-            found = re.search(rb"^element vertex (\d{1,12})\s*$", file.read(1 << 16), re.MULTILINE)
+            header = file.read(1 << 16).partition(b"end_header")[0]
     except OSError:
-        return 0
-    return int(found[1]) if found else 0
+        return 0, 0
+    found = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
+    return int(found[1]) if found else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
 
 
 def _weigh(path: Path, start: bytes, size: int) -> None:

@@ -36,6 +36,7 @@ from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
 from gsmerge.io.scatter import to_grid
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.views import cameras_of, stored_photos
+from gsmerge.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
 
 _MIN_CORRELATION = 0.5
@@ -145,7 +146,8 @@ def load_scene(
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO) -> SceneLoad:
     """:func:`load_scene` for files that are found already."""
-    return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
+    with use_threads():  # torch's own threads wait for one another, on a busy machine for longer than they work
+        return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
 
 
 def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlyScene:
@@ -276,6 +278,8 @@ def _loose(
     notes += tuple(smaller)
     scene = LooseScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
+    if told is not None:
+        lost += f"; only those of {told.name} were looked for, as told; --dialect auto looks for all"
     all_views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
     return SceneLoad(
         scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost), all_views

@@ -137,7 +137,7 @@ def _split(order, count, features, weights, cuts, errors, plane_weight):
 
 
 @kernel
-def _fill_features(own, means, sh, opacities, centre, footprint, features, weights, order):
+def _fill_features(own, means, sh0, opacities, centre, footprint, features, weights, order):
     """Features and weights of the members of one group, and their places in it."""
     scale = PIXEL / footprint
     for j in range(own.shape[0]):
@@ -145,12 +145,12 @@ def _fill_features(own, means, sh, opacities, centre, footprint, features, weigh
         order[j] = j
         weights[j] = max(opacities[i], 1e-3)
         for c in range(3):
-            features[j, c] = COLOR * sh[i, 0, c]
+            features[j, c] = COLOR * sh0[i, 0, c]
             features[j, 3 + c] = scale * (means[i, c] - centre[c])
 
 
 @kernel
-def _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, errors, plane_weight):
+def _bisect(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
     """Children of every group, at most ``counts [g]`` of them, and their ``errors [g, any]``."""
     num_groups = starts.shape[0] - 1
     first, longest, most = starts[0], 0, 1
@@ -165,7 +165,7 @@ def _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, erro
     for g in range(num_groups):
         own = ids[starts[g] : starts[g + 1]]
         n = own.shape[0]
-        _fill_features(own, means, sh, opacities, centres[g], footprints[g], features, weights, order)
+        _fill_features(own, means, sh0, opacities, centres[g], footprints[g], features, weights, order)
         runs = _split(order[:n], counts[g], features, weights, cuts, errors[g], plane_weight)
         for j in range(n):
             child_ids[starts[g] - first + j] = own[order[j]]
@@ -184,7 +184,7 @@ def gather_groups(starts, ids, rows):
     return local, ids[np.repeat(starts[rows] - local[:-1], sizes) + np.arange(local[-1])]
 
 
-def bisect(starts, ids, means, sh, opacities, centres, footprints, num_children):
+def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
     """Children of every group: the run of members with the largest spread is halved until there are ``num_children``.
 
     A member's features are its colour and its position about ``centres [g,3]`` in units of ``footprints [g]``.
@@ -195,10 +195,10 @@ def bisect(starts, ids, means, sh, opacities, centres, footprints, num_children)
     """
     num_groups = len(starts) - 1
     counts = np.array(np.broadcast_to(num_children, num_groups), np.int64)
-    return _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0)
+    return _bisect(starts, ids, means, sh0, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0)
 
 
-def split_errors(starts, ids, means, sh, opacities, centres, footprints, max_children, plane_weight):
+def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
     """``[g,max_children]`` squared error of every group with 1, 2, ... children, NaN beyond what its members give.
 
     Children as in :func:`bisect`. A member's error is its squared distance from the child's mean colour, plus that
@@ -207,5 +207,5 @@ def split_errors(starts, ids, means, sh, opacities, centres, footprints, max_chi
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
-    _bisect(starts, ids, means, sh, opacities, centres, footprints, counts, errors, plane_weight)
+    _bisect(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
     return errors

@@ -13,7 +13,7 @@ COLUMNS = 6
 
 @kernel
 def look_around(
-    points, colors, own, viewmats, Ks, width, height, means, opacities, sh, color_scale, near, far, least,
+    points, colors, own, viewmats, Ks, width, height, means, opacities, sh0, color_scale, near, far, least,
     first, last, out,
 ):  # fmt: skip
     """Sums over the views that see each point.
@@ -28,7 +28,7 @@ def look_around(
         height: The same.
         means: ``[v h w,3]`` float32 Gaussians, one per pixel.
         opacities: ``[v h w]`` float32.
-        sh: ``[v h w,k,3]`` float32.
+        sh0: ``[v h w,1,3]`` float32.
         color_scale: Of the first harmonic.
         near: Largest difference of the logarithms of two depths of one surface.
         far: Differences count for no more.
@@ -62,7 +62,7 @@ def look_around(
             if abs(ratio) < near:
                 out[i, 1] += 1
                 for c in range(3):
-                    out[i, 4] += abs(np.float64(colors[i, c]) - color_scale * sh[j, 0, c]) / 3
+                    out[i, 4] += abs(np.float64(colors[i, c]) - color_scale * sh0[j, 0, c]) / 3
             elif ratio < 0:
                 out[i, 2] += 1
             else:

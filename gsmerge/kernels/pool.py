@@ -69,7 +69,7 @@ def _rotation(q):
 
 
 @kernel
-def pool(starts, ids, means, quats, scales, opacities, sh, footprints, own_covariance, out_geometry, out_sh):
+def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own_covariance, out_geometry, out_sh):
     """Moments of every group, in float64 about the group's own mean.
 
     ``out_geometry [g,13]``: mean 3, covariance xx xy xz yy yz zz, sum of opacities, mass (paper eq. mass),
@@ -87,12 +87,23 @@ def pool(starts, ids, means, quats, scales, opacities, sh, footprints, own_covar
         if own_covariance:
             _member_caps(members, scales, footprints, caps, scratch)
         _pool_group(
-            members, caps, means, quats, scales, opacities, sh, footprints, own_covariance, out_geometry[g], out_sh[g]
+            members,
+            caps,
+            means,
+            quats,
+            scales,
+            opacities,
+            sh0,
+            shN,
+            footprints,
+            own_covariance,
+            out_geometry[g],
+            out_sh[g],
         )
 
 
 @kernel
-def _pool_group(members, caps, means, quats, scales, opacities, sh, footprints, own, out, out_sh):
+def _pool_group(members, caps, means, quats, scales, opacities, sh0, shN, footprints, own, out, out_sh):
     total = 0.0
     for i in members:
         total += min(opacities[i], MAX_OPACITY)
@@ -130,9 +141,11 @@ def _pool_group(members, caps, means, quats, scales, opacities, sh, footprints, 
             czz += v0 * r20 * r20 + v1 * r21 * r21 + v2 * r22 * r22
         mass += a * s0 * s1 * s2
         extinction -= np.log(1.0 - a) * _two_largest_product(s0, s1, s2)
-        for k in range(sh.shape[1]):
+        for c in range(3):
+            out_sh[0, c] += w * sh0[i, 0, c]
+        for k in range(shN.shape[1]):
             for c in range(3):
-                out_sh[k, c] += w * sh[i, k, c]
+                out_sh[k + 1, c] += w * shN[i, k, c]
     floor = (FLOOR * footprint) ** 2
     out[0], out[1], out[2] = mx, my, mz
     out[3], out[4], out[5], out[6], out[7], out[8] = cxx + floor, cxy, cxz, cyy + floor, cyz, czz + floor

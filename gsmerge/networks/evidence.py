@@ -45,7 +45,7 @@ def evidence(means: Tensor, sh0: Tensor, views: Tensor, members: Members, camera
     def some(first: int) -> None:
         last = min(first + ROWS, len(points))
         look_around(
-            points, colors, views.numpy(), viewmats, Ks, *size, m.means, m.opacities, m.sh, *limits, first, last, sums
+            points, colors, views.numpy(), viewmats, Ks, *size, m.means, m.opacities, m.sh0, *limits, first, last, sums
         )  # fmt: skip
 
     parallel_map(some, range(0, len(points), ROWS))

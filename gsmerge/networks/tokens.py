@@ -154,7 +154,7 @@ def member_tokens(members: Members, ids: np.ndarray, described: Described, owner
         described: The Feature Gaussians.
         owners: ``[n]`` the group of each.
     """
-    columns = (members.means, members.quats, members.scales, members.opacities, members.sh[:, :1], members.sh[:, :0])
+    columns = (members.means, members.quats, members.scales, members.opacities, members.sh0, members.shN[:, :0])
     picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
     tokens = part_tokens(picked, described, owners)
     places = described.sizes[owners, None] / described.footprints[owners, None] * torch.sinh(tokens[:, :3])

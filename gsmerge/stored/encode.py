@@ -9,19 +9,17 @@ from typing import Any
 import torch
 
 from gsmerge import __version__
-from gsmerge.build import merged_groups, wanted_count
+from gsmerge.build import Merged, merged_groups, wanted_count
 from gsmerge.decode import MAX_CHILDREN
 from gsmerge.errors import UsageError
 from gsmerge.grouping import Grouping, knee_count, scene_tree
 from gsmerge.journal import Journal, Progress
-from gsmerge.moments import Members
-from gsmerge.networks import Learned
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
 from gsmerge.stored.divide import divide_all
 from gsmerge.stored.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.threads import use_threads
-from gsmerge.types import FeatureGaussians, LooseScene, PixelScene
+from gsmerge.types import LooseScene, PixelScene
 
 USUAL_MOST = 4  # children that are kept of a group, unless a number of Gaussians is to be dealt out
 
@@ -63,9 +61,9 @@ def encode_scene(
         if keeps_all(work, count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
         grouping = choose_groups(work, count, journal)
-        features, members, learned = merged_groups(work.source, grouping, work.options, journal)
+        merged = merged_groups(work.source, grouping, work.options, journal)
         with journal.stage("decode"):
-            return _kept(work, grouping, (features, members, learned), max_k, journal)
+            return _kept(work, grouping, merged, max_k, journal)
 
 
 def _unfitted(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
@@ -83,17 +81,11 @@ def _unfitted(options: CompactOptions, settings: dict[str, Any]) -> CompactOptio
     return replace(options, fit=replace(options.fit, fit="none"))
 
 
-def _kept(
-    work: Work,
-    grouping: Grouping,
-    merged: tuple[FeatureGaussians, Members, Learned | None],
-    max_k: int | None,
-    journal: Journal,
-) -> Encoded:
+def _kept(work: Work, grouping: Grouping, merged: Merged, max_k: int | None, journal: Journal) -> Encoded:
     """Everything that decoding needs of the merged Feature Gaussians."""
-    features, members, learned = merged
+    features, learned = merged.features, merged.learned
     options, scene = work.options, work.source.scene
-    wanted = wanted_count(features, members, grouping, options)
+    wanted = wanted_count(merged, grouping, options)
     dealt = wanted is not None or options.decode.count > USUAL_MOST
     most = max_k or (MAX_CHILDREN if dealt else USUAL_MOST)
     tree = work.tree or scene_tree(scene, work.canvas, options, work.canvas.usual)
@@ -114,7 +106,7 @@ def _kept(
         heads = StoredHeads(learned.networks, learned.precision, described.views, described.group)
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, members, most, options.encode.rule),
+        division=divide_all(features, merged.members, most, options.encode.rule),
         kept=work.kept,
         frame=work.frame,
         cameras=scene.cameras,

@@ -14,9 +14,9 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.cli.network_options import CHECKPOINTS as TOLD_CHECKPOINTS
+from gsmerge.cli.network_options import Precision
 from gsmerge.io import Reading
-from gsmerge.options import CHECKPOINTS, METHODS
+from gsmerge.options import METHODS, PRECISIONS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -34,8 +34,8 @@ def readme_commands(root: Path) -> list[str]:
     return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
 
 
-def test_names_of_checkpoints_are_the_library_s() -> None:
-    assert TOLD_CHECKPOINTS == CHECKPOINTS
+def test_precisions_are_the_library_s() -> None:
+    assert tuple(choice.value for choice in Precision) == PRECISIONS
 
 
 def test_commands_are_the_documented_ones() -> None:
@@ -45,6 +45,7 @@ def test_commands_are_the_documented_ones() -> None:
         "encode",
         "decode",
         "evaluate",
+        "extend",
         "inspect",
         "segment",
         "render",

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+from batches import FAST, NAMES, finish, results
 
 from gsmerge.cli import main
 
@@ -34,6 +36,24 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
         return Outcome(code, captured.out, captured.err)
 
     return call
+
+
+@pytest.fixture(scope="session")
+def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four folders with small scenes. Read only."""
+    folder = tmp_path_factory.mktemp("batch") / "rooms"
+    for name in NAMES:
+        make_scene(folder / Path(name).stem, num_views=3, width=96, height=64, seed=NAMES.index(name))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def undisturbed(rooms: Path) -> dict[str, str]:
+    """What a batch that nothing happens to makes of them."""
+    out = rooms.parent / "undisturbed"
+    assert finish(rooms, "--out", out, *FAST, "--jobs", 2, "-q") == 0
+    assert sorted(results(out)) == NAMES
+    return results(out)
 
 
 def listing(folder: Path) -> dict[str, int]:

@@ -15,29 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from batches import FAST, finish, holders, records, results, start, statuses
+from batches import FAST, NAMES, finish, holders, records, results, start, statuses
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to see processes")
-NAMES = [f"room{number}.ply" for number in range(4)]
 PATIENCE = 120  # seconds, on a machine that is busy with other things
-
-
-@pytest.fixture(scope="module")
-def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four folders with small scenes. Read only."""
-    folder = tmp_path_factory.mktemp("faults") / "rooms"
-    for number in range(4):
-        make_scene(folder / f"room{number}", num_views=3, width=96, height=64, seed=number)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def undisturbed(rooms: Path) -> dict[str, str]:
-    """What a run that nothing happens to makes of them."""
-    out = rooms.parent / "undisturbed"
-    assert finish(rooms, "--out", out, *FAST, "--jobs", 2, "-q") == 0
-    assert sorted(results(out)) == NAMES
-    return results(out)
 
 
 def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:

@@ -9,31 +9,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
-from batches import FAST, finish, holders, records, results, start, statuses
+from batches import FAST, NAMES, holders, records, results, start, statuses
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
-NAMES = [f"room{number}.ply" for number in range(4)]
 PATIENCE = 180  # seconds, on a machine that is busy with other things
-
-
-@pytest.fixture(scope="module")
-def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four folders with small scenes. Read only."""
-    folder = tmp_path_factory.mktemp("ray") / "rooms"
-    for number in range(4):
-        make_scene(folder / f"room{number}", num_views=3, width=96, height=64, seed=number)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def undisturbed(rooms: Path) -> dict[str, str]:
-    """What a run without Ray makes of them."""
-    out = rooms.parent / "undisturbed"
-    assert finish(rooms, "--out", out, *FAST, "-q") == 0
-    return results(out)
 
 
 @needs_ray

@@ -12,6 +12,7 @@ import pytest
 
 import gsmerge
 from gsmerge.cli import main
+from gsmerge.files import NO_PHOTOS
 
 from .conftest import Run, listing
 
@@ -76,6 +77,22 @@ def test_quiet_says_nothing(scene_copy: Path, run: Run) -> None:
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
+def test_a_scene_too_large_for_the_machine_is_told_before_it_is_read(
+    scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = "this machine has 0.1 GB: use fewer views"
+    assert said not in run("inspect", scene_copy).out
+    for module in ("gsmerge.memory", "gsmerge.report"):
+        monkeypatch.setattr(f"{module}.machine_memory", lambda: 10**8)
+    outcome = run("compact", scene_copy, *SMALL, "--fit", "none", "--effort", "draft", "--overwrite")
+    assert outcome.code == 0
+    assert [line for line in outcome.err.splitlines() if said in line] == outcome.err.splitlines()[:1]
+    assert said in run("inspect", scene_copy).out
+    assert said in run("compact", scene_copy, "--dry-run", "--overwrite", *SMALL).out
+    quiet = run("compact", scene_copy, *SMALL, "--fit", "none", "--overwrite", "--quiet")
+    assert (quiet.out, quiet.err) == ("", "")
+
+
 def test_dry_run_writes_nothing(scene_copy: Path, run: Run) -> None:
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--dry-run", "--k", 2, *SMALL)
@@ -105,7 +122,39 @@ def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
         path.unlink()
     outcome = run("compact", scene_copy, *SMALL, "--json")
     assert outcome.code == 0, outcome.err
-    assert json.loads(outcome.out)["psnr_input_views"] == {"before": None, "after": None}
+    document = json.loads(outcome.out)
+    assert document["psnr_input_views"] == {"before": None, "after": None}
+    assert [note for note in document["notes"] if note.startswith("no photos found")] == [NO_PHOTOS]
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        (("--max-bytes", "5"), "max bytes: expected at least 502 for one Gaussian, got 5"),
+        (("--budget", "0.001%"), "budget: expected at least one Gaussian, got '0.001%'"),
+        (("--effort", "slow"), "'--effort': 'slow' is not one of 'draft', 'fast', 'default', 'best'"),
+    ],
+)
+def test_what_asks_for_nothing_is_wrong_usage(
+    option: tuple[str, str], told: str, made_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    outcome = run("compact", made_scene, "-o", tmp_path / "small.ply", *option)
+    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (2, "", 1)
+    assert told in outcome.err
+
+
+def test_a_preview_is_a_png(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("preview", made_scene / "scene.ply", "-o", tmp_path / "sheet.jpg")
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert "expected a name that ends in .png" in outcome.err
+    assert listing(tmp_path) == {}
+
+
+def test_a_plan_tells_what_is_used(made_scene: Path, run: Run) -> None:
+    told = run("compact", made_scene, "--dry-run", "--fit", "none").out
+    assert "across views: overlap" in told
+    assert "networks     shipped" in told
+    assert "across views: none" in run("compact", made_scene, "--dry-run", "--effort", "draft").out
 
 
 def test_threads_and_repetition_do_not_change_the_file(scene_copy: Path, run: Run) -> None:

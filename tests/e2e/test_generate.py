@@ -9,7 +9,7 @@ import pytest
 
 from .conftest import Run, listing
 
-COMPILING = "compiling kernels, once after installation, up to 25 s\n"
+COMPILING = "compiling kernels for their first use, up to 30 s\n"
 SMALL = ("--scenes", 2, "--views", "3", "--size", "48x36")
 
 

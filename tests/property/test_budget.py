@@ -87,7 +87,8 @@ def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
     n, g = int(sizes.sum()), len(sizes)
     colours = rng.integers(0, 3, (n, 1, 3)) if seed % 2 else rng.normal(size=(n, 1, 3))
     columns = (rng.normal(size=(n, 3)) * 0.01, np.eye(4)[np.zeros(n, int)], np.full((n, 3), 0.01), rng.random(n))
-    members = Members(*(np.ascontiguousarray(c, np.float32) for c in (*columns, colours, np.full(n, 0.01))))
+    harmonics = colours, np.zeros((n, 0, 3))
+    members = Members(*(np.ascontiguousarray(c, np.float32) for c in (*columns, *harmonics, np.full(n, 0.01))))
     features = make_features(rng.normal(size=(g, 3)) * 0.01)
     starts = torch.from_numpy(np.concatenate([[0], np.cumsum(sizes)]))
     return replace(

@@ -23,7 +23,8 @@ def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians
     """One group of ``count`` members."""
     columns = (
         rng.normal(size=(count, 3)) * 0.1, rng.normal(size=(count, 4)), np.exp(0.3 * rng.normal(size=(count, 3)) - 4),
-        rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)) * 0.3, np.full(count, 0.02),
+        rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)) * 0.3, np.zeros((count, 0, 3)),
+        np.full(count, 0.02),
     )  # fmt: skip
     members = Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
     feature = make_features(members.means.mean(0, keepdims=True), sizes=0.02)

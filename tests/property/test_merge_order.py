@@ -22,7 +22,8 @@ seeds = st.integers(0, 2**32 - 1)
 def random_members(rng: np.random.Generator, count: int) -> Members:
     columns = (
         rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), np.exp(rng.normal(size=(count, 3)) - 3),
-        rng.uniform(0, 1, count), rng.normal(size=(count, 4, 3)), rng.uniform(0.01, 0.03, count),
+        rng.uniform(0, 1, count), rng.normal(size=(count, 1, 3)), rng.normal(size=(count, 3, 3)),
+        rng.uniform(0.01, 0.03, count),
     )  # fmt: skip
     return Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
 

@@ -34,7 +34,7 @@ def slowly(
             ratio, seen = float(torch.log(depths[v, i] / there)), seen + 1
             kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
             if abs(ratio) < NEAR:
-                color += float(np.abs(SH_C0 * (sh0[i, 0].numpy() - members.sh[j, 0])).mean())
+                color += float(np.abs(SH_C0 * (sh0[i, 0].numpy() - members.sh0[j, 0])).mean())
             ratios += float(np.clip(ratio, -FAR, FAR))
         shares = [kind / max(seen, 1) for kind in kinds]
         found[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]

@@ -37,8 +37,12 @@ def pool_reference(members: dict[str, np.ndarray], rows: list[int], own: bool) -
     upper = covar[np.triu_indices(3)]
     return (
         np.concatenate([mean, upper, [opacities.sum(), mass, extinction, footprint]]),
-        np.average(members["sh"][rows].astype(float), axis=0, weights=weights),
+        np.average(harmonics(members)[rows].astype(float), axis=0, weights=weights),
     )
+
+
+def harmonics(members: dict[str, np.ndarray]) -> np.ndarray:
+    return np.concatenate([members["sh0"], members["shN"]], 1)
 
 
 def random_members(count: int, seed: int, coefficients: int = 4) -> dict[str, np.ndarray]:
@@ -48,7 +52,8 @@ def random_members(count: int, seed: int, coefficients: int = 4) -> dict[str, np
         "quats": rng.normal(size=(count, 4)) * rng.uniform(0.1, 5, (count, 1)),
         "scales": np.exp(rng.normal(size=(count, 3)) - 3),
         "opacities": rng.uniform(0, 1, count),
-        "sh": rng.normal(size=(count, coefficients, 3)),
+        "sh0": rng.normal(size=(count, 1, 3)),
+        "shN": rng.normal(size=(count, coefficients - 1, 3)),
         "footprints": rng.uniform(0.01, 0.03, count),
     }
     return {name: values.astype(np.float32) for name, values in columns.items()}
@@ -58,7 +63,7 @@ def pooled(members: dict[str, np.ndarray], groups: list[list[int]], own: bool = 
     starts = np.concatenate([[0], np.cumsum([len(g) for g in groups])])
     ids = np.array([i for g in groups for i in g], np.int64)
     geometry = np.zeros((len(groups), 13))
-    sh = np.zeros((len(groups), members["sh"].shape[1], 3), np.float32)
+    sh = np.zeros((len(groups), harmonics(members).shape[1], 3), np.float32)
     pool(starts, ids, *members.values(), own, geometry, sh)
     return geometry, sh
 
@@ -101,7 +106,7 @@ def test_transparent_group_takes_the_plain_mean() -> None:
     members["opacities"][:] = 0
     geometry, sh = pooled(members, [list(range(6))])
     np.testing.assert_allclose(geometry[0, :3], members["means"].mean(0, dtype=float), rtol=1e-6)
-    np.testing.assert_allclose(sh[0], members["sh"].mean(0), atol=1e-6)
+    np.testing.assert_allclose(sh[0], harmonics(members).mean(0), atol=1e-6)
     assert geometry[0, 9] == geometry[0, 10] == geometry[0, 11] == 0
     assert np.isfinite(geometry).all()
 

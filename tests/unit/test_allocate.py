@@ -252,11 +252,11 @@ def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, memb
 
 def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
     """Group 5 gets many colours, all others one each, on a plane."""
-    sh, own = np.zeros_like(members.sh), features.members[features.starts[5] : features.starts[6]].numpy()
-    sh[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
+    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]].numpy()
+    sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
     means = members.means.copy()
     means[:, 2] = 0
-    counts = split_counts(features, replace(members, sh=sh, means=means), 6)
+    counts = split_counts(features, replace(members, sh0=sh0, means=means), 6)
     assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
 
 
@@ -325,7 +325,7 @@ def test_colours_of_sh_and_of_photos_weigh_the_same() -> None:
     same = Members(
         np.zeros((4, 3), np.float32), np.zeros((4, 4), np.float32), np.ones((4, 3), np.float32),
         np.ones(4, np.float32), np.array([0, 0, 1, 1], np.float32)[:, None, None] * np.full(3, 0.2 / SH_C0, np.float32),
-        np.ones(4, np.float32),
+        np.zeros((4, 0, 3), np.float32), np.ones(4, np.float32),
     )  # fmt: skip
     one = replace(scenes.make_features(np.zeros((1, 3))), starts=torch.tensor([0, 4]), members=torch.arange(4))
     np.testing.assert_allclose(_child_errors(one, same, np.array([0]), 3), [[0.12, 0, np.nan]], atol=1e-7)

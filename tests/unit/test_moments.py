@@ -14,8 +14,8 @@ def members(count: int, seed: int = 0, coefficients: int = 1, opacity: float | N
     rng = np.random.default_rng(seed)
     columns = (
         rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), 0.05 * np.exp(0.3 * rng.normal(size=(count, 3))),
-        np.full(count, opacity) if opacity else rng.uniform(0.2, 0.9, count), rng.normal(size=(count, coefficients, 3)),
-        np.full(count, 0.05),
+        np.full(count, opacity) if opacity else rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3)),
+        rng.normal(size=(count, coefficients - 1, 3)), np.full(count, 0.05),
     )  # fmt: skip
     return Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
 
@@ -42,8 +42,8 @@ def test_one_member_is_itself_but_for_the_floor(seed: int) -> None:
     np.testing.assert_allclose(result.means.numpy(), one.means, rtol=1e-6)
     floor = (0.1 * 0.05) ** 2 * torch.eye(3)
     np.testing.assert_allclose(covar, own_covariance(one) + floor, rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(result.sh0.numpy(), one.sh[:, :1], rtol=1e-6)
-    np.testing.assert_allclose(result.shN.numpy(), one.sh[:, 1:], rtol=1e-6)
+    np.testing.assert_allclose(result.sh0.numpy(), one.sh0, rtol=1e-6)
+    np.testing.assert_allclose(result.shN.numpy(), one.shN, rtol=1e-6)
     # the floor makes the disc larger, and the conserved optical depth thinner by as much
     before, after = np.sort(one.scales[0].astype(float)), np.sort(result.scales[0].double().numpy())
     depth = -np.log1p(-one.opacities[0]) * before[1:].prod() / after[1:].prod()
@@ -75,7 +75,7 @@ def test_two_members_by_hand() -> None:
     two.quats[:] = [1, 0, 0, 0]
     two.scales[:] = 1
     two.footprints[:] = 1e-6
-    two.sh[:, 0] = [[0, 0, 0], [1, 2, 4]]
+    two.sh0[:, 0] = [[0, 0, 0], [1, 2, 4]]
     result = merged(two)
     np.testing.assert_allclose(result.means[0], [1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(result.scales[0].sort().values, [1, 1, 2], rtol=1e-6)
@@ -172,9 +172,10 @@ def test_scales_have_a_floor() -> None:
 def test_footprints_are_depth_over_focal_length() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=1)
     found = scene_members(scene)
-    assert found.sh.shape == (3 * 24 * 32, 4, 3)
+    assert found.sh0.shape == (3 * 24 * 32, 1, 3)
+    assert found.shN.shape == (3 * 24 * 32, 3, 3)
     _, depths, _ = scenes.trace(scenes.room(), scene.cameras)
     np.testing.assert_allclose(found.footprints, depths.ravel() / 32, rtol=1e-5)
-    for values in (found.means, found.quats, found.scales, found.opacities, found.sh):
+    for values in (found.means, found.quats, found.scales, found.opacities, found.sh0, found.shN):
         assert values.dtype == np.float32
         assert values.flags.c_contiguous

@@ -43,6 +43,17 @@ def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
     assert before.psnr_after > before.psnr_before
 
 
+def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of both the same ones, and it is said."""
+    monkeypatch.setattr("gsmerge.sampling.MOST_JUDGED", 2)
+    result = scenes.compacted(scene, fit="none")
+    some = scenes.take_views(scene, [0, 2])
+    assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)
+    assert result.report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, some), abs=0.1)
+    assert result.report.notes == ["the input views are scored on 2 of 3"]
+    assert scenes.compacted(replace(scene, images=None)).report.notes == []
+
+
 def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     """Unless it is asked for."""
     full = scenes.compacted(scene).report

@@ -75,7 +75,7 @@ def plan(*, photos: bool = True, views: int = 12, wanted: int | None = None, **s
     return report.plan_document(
         {"ply": "scene.ply", "cameras": "transforms.json", "images": None},
         (views, 100, 200),
-        options.to_dict() | {"checkpoint": options.networks(photos=photos)},
+        options.resolved(photos=photos),
         output_path=Path("small.ply"),
         per_view=800,
         photos=photos,

@@ -66,6 +66,17 @@ def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos:
     assert photo_psnr(features, photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
 
 
+def test_many_views_are_judged_by_some(
+    features: FeatureGaussians, photos: Photos, scene: PixelScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each still without its own Gaussians."""
+    monkeypatch.setattr("gsmerge.sampling.MOST_JUDGED", 1)
+    others = feature_to_gaussians(features)[features.views != 1]
+    image = scenes.images_of(others, scene.cameras[1:2])[0][0]
+    expected = psnr(np.clip(image, 0, 1), photos.images[1])
+    assert photo_psnr(features, photos, left_out=True) == pytest.approx(expected, abs=0.01)
+
+
 def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
     options = RobustOptions()
     wrong = torch.arange(len(features)) % 10 == 0

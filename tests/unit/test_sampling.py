@@ -9,7 +9,7 @@ import pytest
 import scenes
 import torch
 
-from gsmerge.sampling import distinct_views, even_views, midpoint_views, subset
+from gsmerge.sampling import MOST_JUDGED, distinct_views, even_views, judged_views, midpoint_views, subset
 from gsmerge.types import LooseScene, PixelScene
 
 
@@ -33,6 +33,12 @@ def test_even_views_are_distinct_and_keep_the_ends() -> None:
             ids = even_views(num_views, count)
             assert ids == sorted(set(ids))
             assert (ids[0], ids[-1], len(ids)) == (0, num_views - 1, count)
+
+
+def test_few_views_are_all_judged_by_and_many_by_some() -> None:
+    assert [judged_views(count) for count in (1, 2, 24)] == [[0], [0, 1], list(range(24))]
+    assert len(judged_views(84)) == MOST_JUDGED
+    assert (judged_views(84)[0], judged_views(84)[-1]) == (0, 83)
 
 
 def test_targets_lie_midway() -> None:

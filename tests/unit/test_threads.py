@@ -7,7 +7,7 @@ import cv2
 import pytest
 import torch
 
-from gsmerge.threads import available_threads, parallel_map, use_threads
+from gsmerge.threads import available_threads, in_turn, parallel_map, use_threads
 
 
 @pytest.fixture(autouse=True)
@@ -122,3 +122,19 @@ def test_no_threads_are_refused(count: int) -> None:
 
 def test_available_threads() -> None:
     assert available_threads() >= 1
+
+
+@pytest.mark.parametrize("at_once", [1, 4, 100])
+def test_in_turn_gives_all_results_in_order_and_holds_few(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+    begun: list[int] = []
+
+    def work(i: int) -> int:
+        begun.append(i)
+        return i * i
+
+    monkeypatch.setattr("gsmerge.threads.AT_ONCE", at_once)
+    with use_threads(2):
+        for i, square in enumerate(in_turn(work, range(10))):
+            assert square == i * i
+            assert len(begun) <= at_once * (i // at_once + 1)
+    assert sorted(begun) == list(range(10))

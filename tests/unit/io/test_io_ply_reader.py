@@ -9,6 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply, write_ply
+from gsmerge.io.ply_file import let_go, open_ply, promised
 from gsmerge.threads import use_threads
 from gsmerge.types import Gaussians
 
@@ -249,3 +250,46 @@ def test_harmonics_with_a_gap_are_refused(tmp_path: Path) -> None:
     names = (*NAMES, *(f"f_rest_{i}" for i in range(8)), "f_rest_9")
     with pytest.raises(SceneError, match="found 9 f_rest columns"):
         read_ply(save(tmp_path / "a.ply", columns(names=names)))
+
+
+def test_rows_that_were_let_go_are_still_there(tmp_path: Path) -> None:
+    """Only the process's pages are dropped; other rows of the same page are read again, and so are these."""
+    rows = columns(20_000)
+    stored = open_ply(save(tmp_path / "a.ply", rows))["vertex"].data
+    assert isinstance(stored, np.memmap)
+    for block in (slice(0, 7), slice(7, 12_345), slice(12_345, 20_000)):
+        let_go(stored, block)
+    assert np.array_equal(np.asarray(stored), rows)
+    let_go(rows, slice(0, 5))  # of no file: nothing to do
+    assert (rows["x"] != 0).any()
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux")
+def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
+    stored = open_ply(save(tmp_path / "large.ply", columns(100_000)))["vertex"].data
+    assert float(np.asarray(stored)["x"].sum()) != 0
+    before = resident(stored.filename)
+    for first in range(0, len(stored), 9000):
+        let_go(stored, slice(first, min(first + 9000, len(stored))))
+    assert before > 0.9 * stored.nbytes
+    assert resident(stored.filename) < 0.1 * stored.nbytes
+
+
+def resident(path: str) -> int:
+    """Bytes of a mapped file that are in this process's memory."""
+    total, inside = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if not line.split(":")[0].isalpha() and "-" in line.split()[0]:
+            inside = line.endswith(str(path))
+        elif inside and line.startswith("Rss:"):
+            total += 1024 * int(line.split()[1])
+    return total
+
+
+def test_what_a_header_promises(tmp_path: Path) -> None:
+    assert promised(save(tmp_path / "a.ply", columns(7))) == (7, 0)
+    assert promised(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
+    assert promised(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
+    (tmp_path / "d.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\nelement vertex 5\n")
+    assert promised(tmp_path / "d.ply") == (0, 0)
+    assert promised(tmp_path / "none.ply") == (0, 0)

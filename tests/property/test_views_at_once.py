@@ -1,0 +1,52 @@
+"""How many views' results are in memory together is a matter of memory alone: the same to the last bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import loose
+import pytest
+import scenes
+
+from gsmerge import PixelScene, compact
+from gsmerge.moments import scene_members
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(5, 32, 24), noise=0.01)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"fit": "none", "checkpoint": "none", "robust": True},
+        {"fit": "color"},
+        {"budget": "8%", "fit_steps": 30, "effort": "best"},  # grows
+    ],
+    ids=str,
+)
+def test_one_view_at_a_time_or_all(
+    scene: PixelScene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]
+) -> None:
+    found = []
+    for at_once in (1, 2, 100):
+        monkeypatch.setattr("gsmerge.threads.AT_ONCE", at_once)
+        found.append(scenes.compacted(scene, **settings).gaussians)
+    assert scenes.identical(found[0], found[1])
+    assert scenes.identical(found[0], found[2])
+
+
+def test_higher_harmonics_are_not_copied() -> None:
+    """Of degree 4 they are most of a scene."""
+    g = scenes.make_scene(scenes.room(), scenes.arc(2, 32, 24), degree=3)
+    members = scene_members(g)
+    assert members.shN.__array_interface__["data"][0] == g.gaussians.shN.data_ptr()
+
+
+def test_of_many_gaussians_few_views_at_once(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for many in (0, 10**9):
+        monkeypatch.setattr("gsmerge.contribution.MANY", many)
+        found.append(compact(loose.loosened(scene), fit="none", density=0.1, unseen="keep").gaussians)
+    assert scenes.identical(found[0], found[1])
