@@ -170,6 +170,15 @@ def holdout_score(state: State, plan: Plan) -> float:
     return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain)
 
 
+def score_to_beat(own: float, rival: Gaussians | None, plan: Plan) -> float:
+    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a rival that shows them worse.
+
+    Networks have learnt to show the photos whole. A fit of the rest takes from the blocks of what they made, and yet
+    helps new views; the start without networks is then what it is compared with.
+    """
+    return own if rival is None else min(own, holdout_score(start_state(rival), plan))
+
+
 def fit_full(
     gaussians: Gaussians,
     photos: tuple[Photos, Photos],
@@ -195,14 +204,11 @@ def fit_full(
         progress: Told after every step.
         engine: What it steps with.
         masks: Pixels that are looked at; None: all. Where no Gaussian is, none should be drawn to.
-        rival: Another start, whose blocks the fit has to beat where they are worse: networks have learnt to show the
-            photos whole, so that a fit of the rest takes from the blocks of what they made, and yet helps new views.
+        rival: Another start that the fit may beat instead, see :func:`score_to_beat`.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
-    before, state.shares[:] = first_look(state, plan)
-    if rival is not None:
-        before = min(before, holdout_score(start_state(rival), plan))
-    after = before
+    own, state.shares[:] = first_look(state, plan)
+    after = before = score_to_beat(own, rival, plan)
     queue: list[int] = []
     grows = options.grows
     step, steps, started, error, judged = 0, options.steps, time.perf_counter(), 0.0, False

@@ -44,7 +44,7 @@ def fit(
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
         progress: Told after every step of the full fit.
-        rival: Another start that the full fit has to beat instead, see :func:`gsmerge.fit.full.fit_full`.
+        rival: Another start that the full fit has to beat instead, see :func:`gsmerge.fit.full.score_to_beat`.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
