@@ -43,9 +43,8 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
         work += COST_NETWORKS * (options["checkpoint"] != "none")
     else:
         work = COST_RIVALS.get(method, COST_RIVAL)
-    work += (
-        COST_READ + score_cost(views) * photos + COST_COLOR_FIT * (fit == "color") + COST_FIT_LOOKS * (fit == "full")
-    )
+    work += COST_READ + score_cost(views) * photos
+    work += COST_COLOR_FIT * (fit == "color") + COST_FIT_LOOKS * (fit == "full")
     steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + view_pixels / 1e6 * COST_FULL_FIT * steps
     return seconds + pixels / 1e6 * COST_RIVAL_STEP * steps * (method == "unmerged-fit")
