@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from gsmerge.io import to_cameras as to_cameras
     from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_ply as write_ply
+    from gsmerge.online.compactor import Compactor as Compactor
     from gsmerge.options import CompactOptions as CompactOptions
     from gsmerge.pipeline import CompactReport as CompactReport
     from gsmerge.pipeline import CompactResult as CompactResult
@@ -55,6 +56,7 @@ _HOMES = {
     "evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "inspect": ("inspect",),
     "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_gaussians", "write_ply"),
+    "online.compactor": ("Compactor",),
     "options": ("CompactOptions",),
     "pipeline": ("CompactReport", "CompactResult", "compact"),
     "render": ("Rendering", "render"),

@@ -108,7 +108,7 @@ def scene_frame(scene: PixelScene | LooseScene) -> Frame:
     return find_frame(scene) if isinstance(scene, PixelScene) else find_loose_frame(scene)
 
 
-def canonicalise(scene: Scene) -> tuple[Scene, Frame]:
-    """The scene in its canonical frame, and the frame."""
-    frame = scene_frame(scene)
+def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:
+    """The scene in its canonical frame, or in a given one, and the frame."""
+    frame = frame or scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame

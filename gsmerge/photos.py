@@ -78,7 +78,12 @@ def scene_photos(scene: PixelScene | LooseScene, level: int = 1) -> Photos:
     """
     if scene.images is None:
         raise ValueError("expected a scene with images")
-    images, blank = scene.images.numpy(), blank_photos(scene.cameras, level)
+    return photos_of(scene.images.numpy(), scene.cameras, level)
+
+
+def photos_of(images: np.ndarray, cameras: Cameras, level: int = 1) -> Photos:
+    """Photos ``[v,h,w,3]`` of the cameras' size, each side divided by ``level`` (area averages)."""
+    blank = blank_photos(cameras, level)
     if level == 1:
         return replace(blank, images=images)
     size = blank.width, blank.height

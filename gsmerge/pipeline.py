@@ -160,15 +160,17 @@ def _settled(options: CompactOptions) -> CompactOptions:
     return replace(options, fit=replace(options.fit, fit_steps=AUTO_STEPS * options.fit.steps))
 
 
-def begin(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Work:
-    """The scene in its own frame, and its superpixels if they are to be cut to a number."""
+def begin(
+    scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal, frame: Frame | None = None
+) -> Work:
+    """The scene in its own frame, or a given one, and its superpixels if they are to be cut to a number."""
     target, baseline = settings.target, _rival(scene, settings, journal)
     if baseline is not None:  # nothing is set aside, and nothing is learned
         settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     with journal.stage("prepare"):
-        ready = make_ready(scene, settings)
+        ready = make_ready(scene, settings, frame)
         canonical, frame, options = ready.scene, ready.frame, ready.options
         known = isinstance(canonical, PixelScene) or options.checkpoint != "auto"  # they learnt from one per pixel
         name = options.networks(photos=scene.images is not None) if known else "none"

@@ -46,19 +46,19 @@ class ReadyScene:
     notes: tuple[str, ...]
 
 
-def make_ready(scene: PixelScene | LooseScene, options: CompactOptions) -> ReadyScene:
-    """The scene in its canonical frame, with everything that it lacked.
+def make_ready(scene: PixelScene | LooseScene, options: CompactOptions, frame: Frame | None = None) -> ReadyScene:
+    """The scene in its canonical frame, or in a given one, with everything that it lacked.
 
     Raises:
         ValueError: If there is no finite Gaussian, or there are images without cameras.
     """
     scene, options, repeats = without_repeats(scene, options)
     if isinstance(scene, PixelScene):
-        canonical, frame = canonicalise(scene)
+        canonical, frame = canonicalise(scene, frame)
         return ReadyScene(canonical, frame, options, None, tuple(repeats))
     whole, notes = with_cameras(scene)
     notes = [*repeats, *notes]
-    loose, frame = canonicalise(whole)
+    loose, frame = canonicalise(whole, frame)
     kept = None
     if options.contribution.unseen == "keep":
         loose, options, kept = set_aside(loose, options)

@@ -17,6 +17,7 @@ from gsmerge.cli.console import one_line, plain_warnings
 from gsmerge.cli.decode import decode
 from gsmerge.cli.encode import encode
 from gsmerge.cli.evaluate import evaluate
+from gsmerge.cli.extend import extend
 from gsmerge.cli.generate import generate
 from gsmerge.cli.inspect import inspect
 from gsmerge.cli.options import debug_wanted, set_debug
@@ -35,7 +36,8 @@ app = typer.Typer(
     name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
 )
 COMMANDS = (
-    compact, batch, encode, decode, evaluate, inspect, segment, render, preview, report, stress, chart, generate, train,
+    compact, batch, encode, decode, extend, evaluate, inspect, segment, render, preview, report, stress, chart,
+    generate, train,
 )  # fmt: skip
 for command in COMMANDS:
     app.command()(command)

@@ -1,9 +1,10 @@
-"""``gsmerge decode``: a compact scene from an encoded one."""
+"""``gsmerge decode``: a compact scene from an encoded one, or from a state of views."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,14 +12,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, one_line, say_notes
+from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage_progress
 from gsmerge.cli.paths import check_format, check_output, default_output
+from gsmerge.cli.settings import given_settings
 from gsmerge.errors import SceneError
 
 if TYPE_CHECKING:
-    from gsmerge.stored.encoded import Encoded
+    from gsmerge.options import CompactOptions
 
-EncodedArgument = Annotated[Path, typer.Argument(metavar="ENCODED", help="A .gsm file of gsmerge encode.")]
+EncodedArgument = Annotated[Path, typer.Argument(metavar="ENCODED", help="A .gsm file of gsmerge encode or extend.")]
+DecodedFitOption = Annotated[
+    opt.Fit | None,
+    typer.Option(
+        help="What to fit to the photos that a state has kept.",
+        show_default="full where there are photos",
+        rich_help_panel=opt.MERGING,
+    ),
+]
 DecodedKOption = Annotated[
     str | None,
     typer.Option(
@@ -50,10 +60,17 @@ DecodedOption = Annotated[
 
 
 def decode(
+    context: typer.Context,
     encoded: EncodedArgument,
     k: DecodedKOption = None,
     budget: DecodedBudgetOption = None,
+    fit: DecodedFitOption = None,
+    effort: opt.EffortOption = None,
+    fit_steps: opt.FitStepsOption = None,
+    time_budget: opt.TimeBudgetOption = None,
+    device: opt.DeviceOption = None,
     output: DecodedOption = None,
+    seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
     overwrite: opt.OverwriteOption = False,
     json: opt.JsonOption = False,
@@ -61,12 +78,13 @@ def decode(
     quiet: opt.QuietOption = False,
     debug: opt.DebugOption = False,
 ) -> None:
-    """Write a compact scene from an encoded one, without its images: what compact --fit none gives, and no fit."""
+    """Write a compact scene from an encoded one, as compact --fit none, or from a state, fitted to its photos."""
     start = perf_counter()
     out = output or default_output(encoded)
     check_output(out, (encoded,), overwrite=overwrite)
     check_format(out)
-    document = _run(encoded, out, {"k": k, "budget": budget}, threads, overwrite, dry_run, start, quiet=quiet or json)
+    settings = given_settings(context.params)
+    document = _run(encoded, out, settings, context.params, start, quiet=quiet or json)
     say_notes(document["notes"], quiet=quiet or json)
     if json:
         from gsmerge.report import to_json
@@ -80,55 +98,55 @@ def decode(
 
 
 def _run(
-    path: Path,
-    out: Path,
-    wish: Mapping[str, Any],
-    threads: int | None,
-    overwrite: bool,
-    dry_run: bool,
-    start: float,
-    *,
-    quiet: bool,
+    path: Path, out: Path, settings: CompactOptions, params: Mapping[str, Any], start: float, *, quiet: bool
 ) -> dict[str, Any]:
     """Read, decode and write; returns the report."""
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
+    from gsmerge.online.file import load_stored
+    from gsmerge.online.fitted import as_decoded, decode_stored, num_photos
     from gsmerge.report import document_head, seconds_document
-    from gsmerge.stored.decode import decode_scene, plan_decode
-    from gsmerge.stored.file import load_encoded
+    from gsmerge.stored.decode import plan_decode
 
-    imported = perf_counter()
-    encoded = load_encoded(path)
-    plan, read = plan_decode(encoded, **wish), perf_counter()
-    lost = lost_harmonics(out, encoded.division.children.sh_degree)
-    found = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(encoded)}
+    imported, wish = perf_counter(), {"k": params["k"], "budget": params["budget"]}
+    stored = load_stored(path)
+    lost, read = lost_harmonics(out, stored.sh_degree), perf_counter()
+    found = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(stored)}
     document = {
         **document_head(),
-        "input": found | {"num_gaussians_encoded": encoded.settings.num_input, "encoding": dict(encoded.about)},
+        "input": found | {"num_gaussians_encoded": stored.settings.num_input, "encoding": dict(stored.about)},
         **wish,
-        "notes": [*plan.notes, *([lost] if lost else [])],
     }
-    if dry_run:
+    notes = [lost] if lost else []
+    if params["dry_run"]:
+        encoded = as_decoded(stored)
+        plan = plan_decode(encoded, **wish)
         most = int(plan.counts.sum()) + encoded.num_kept
-        return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
-    with atomic_output(out, overwrite=overwrite) as temporary:
-        with announce_compilation(quiet=quiet):
-            gaussians = decode_scene(encoded, **wish, threads=threads)
-        if len(gaussians) == 0:
+        told = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
+        return document | told | {"notes": [*plan.notes, *notes]}
+    fit = settings.fit if params["fit"] is not None or num_photos(stored) else None
+    with atomic_output(out, overwrite=params["overwrite"]) as temporary:
+        with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
+            decoded = decode_stored(
+                stored, **wish, options=fit, seed=settings.seed, threads=settings.threads, progress=progress
+            )
+        if len(decoded.gaussians) == 0:
             raise SceneError(path, "expected Gaussians that show something, found none", "encode the scene again")
-        decoded, ending = perf_counter(), output_format(out)
-        write_gaussians(temporary, gaussians, overwrite=True, comments=_comments(encoded), ending=ending)
-    seconds = {"import": imported - start, "read": read - imported, "decode": decoded - read}
-    seconds["write"] = perf_counter() - decoded
+        done, ending = perf_counter(), output_format(out)
+        write_gaussians(temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending)
+    seconds = {"import": imported - start, "read": read - imported, "decode": done - read}
+    seconds["write"] = perf_counter() - done
     return document | {
-        "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(gaussians)},
-        "ratio": len(gaussians) / max(encoded.settings.num_input, 1),
+        "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(decoded.gaussians)},
+        "ratio": len(decoded.gaussians) / max(stored.settings.num_input, 1),
+        "fit": decoded.fit and asdict(decoded.fit),
         **seconds_document(seconds),
+        "notes": [*decoded.notes, *notes],
     }
 
 
-def _comments(encoded: Encoded) -> Sequence[str]:
+def _comments(about: Mapping[str, Any]) -> Sequence[str]:
     """Comments of the source's header that compact passes on."""
-    source = encoded.about.get("source")
+    source = about.get("source")
     told = source.get("comments") if isinstance(source, dict) else None
     lines = [line for line in told if isinstance(line, str)] if isinstance(told, list) else []
     return [line for line in lines if line.isascii() and line.isprintable()]

@@ -42,12 +42,16 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``."""
+    """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``.
+
+    ``held [n,1]`` is the diagonal of the normal equations of photos that are gone, which the colours solve as they are.
+    """
 
     drawn: Drawn
     photos: np.ndarray
     weights: list[np.ndarray]
     gains: np.ndarray
+    held: np.ndarray
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
@@ -63,7 +67,12 @@ def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
 
 
 def fit_colors(
-    gaussians: Gaussians, drawn: Drawn, photos: Photos, options: FitOptions, seed: int = 0
+    gaussians: Gaussians,
+    drawn: Drawn,
+    photos: Photos,
+    options: FitOptions,
+    seed: int = 0,
+    held: np.ndarray | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
 
@@ -73,12 +82,14 @@ def fit_colors(
         photos: The input views.
         options: The solver's settings.
         seed: Chooses the held-out blocks.
+        held: ``[n]`` pixels of photos that are gone which each colour was fitted to; None: of none.
 
     Returns:
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
-    plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)))
+    before_these = np.zeros((drawn.count, 1)) if held is None else held[:, None].astype(np.float64)
+    plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)), before_these)
     before = holdout_psnr(drawn.images, photos, train, options.min_gain)
     pull = options.pull
     for _ in range(1 + MAX_RETRIES):
@@ -114,14 +125,15 @@ def _finish(system: _System, offsets: np.ndarray, options: FitOptions, pull: flo
 
 
 def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, pull: float) -> np.ndarray:
-    """Jacobi-preconditioned CG on sum |gain (prior + W x) - photo|^2 + pull mass |x|^2, started at ``x``."""
+    """Jacobi-preconditioned CG on sum |gain (prior + W x) - photo|^2 + (pull mass + held) |x|^2, from ``x`` on."""
     mass, r = _residual(system, x)
-    r -= pull * mass * x
-    inverse = 1 / (mass * (1 + pull) + 1e-6)
+    back = pull * mass + system.held
+    r -= back * x
+    inverse = 1 / (mass * (1 + pull) + system.held + 1e-6)
     z = inverse * r
     p, rz = z, (r * z).sum(0)
     for _ in range(iterations):
-        ap = _normal(system, p) + pull * mass * p
+        ap = _normal(system, p) + back * p
         step = rz / ((p * ap).sum(0) + 1e-12)
         x, r = x + step * p, r - step * ap
         z = inverse * r

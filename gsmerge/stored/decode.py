@@ -108,21 +108,26 @@ def decode_scene(
     Raises:
         UsageError: If K is more than was encoded, the budget below the number of groups, or both are given.
     """
-    plan = plan_decode(encoded, k=k, budget=budget)
-    features, s = encoded.features, encoded.settings
+    plan, s = plan_decode(encoded, k=k, budget=budget), encoded.settings
     with use_threads(threads), torch.no_grad():
-        rows, parents = pick_children(encoded.division, plan.counts)
-        every = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])
-        gaussians = every[torch.from_numpy(rows)]
-        if encoded.heads is not None:
-            heads = encoded.heads
-            described = described_by(features, heads.views, heads.group, encoded.cameras)
-            nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-            learned = Learned(heads.networks, nothing, encoded.cameras, precision=heads.precision)
-            gaussians = decode_described(gaussians, parents, features, described, learned)
+        gaussians, _ = children_of(encoded, plan.counts)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
         if plan.prune > 0:
             gaussians = gaussians[shown(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]
         if encoded.kept is not None:
             gaussians = Gaussians.concat([gaussians, encoded.kept])
         return encoded.frame.leave(gaussians)
+
+
+def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """At most ``counts [g]`` canonical Gaussians of each group, however faint, and the group of each, rising."""
+    features, heads = encoded.features, encoded.heads
+    rows, parents = pick_children(encoded.division, counts)
+    every = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])
+    gaussians = every[torch.from_numpy(rows)]
+    if heads is not None:
+        described = described_by(features, heads.views, heads.group, encoded.cameras)
+        nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
+        learned = Learned(heads.networks, nothing, encoded.cameras, precision=heads.precision)
+        gaussians = decode_described(gaussians, parents, features, described, learned)
+    return gaussians, parents

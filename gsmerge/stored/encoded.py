@@ -107,6 +107,11 @@ class Encoded:
         return len(self.features)
 
     @property
+    def sh_degree(self) -> int:
+        """Degree of the harmonics."""
+        return self.division.children.sh_degree
+
+    @property
     def num_kept(self) -> int:
         """Gaussians that no view sees."""
         return 0 if self.kept is None else len(self.kept)

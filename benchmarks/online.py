@@ -1,0 +1,129 @@
+"""Views that arrive in batches against all of them at once: growth, seconds per step, memory, quality.
+
+python benchmarks/online.py desk,carton                          # 84 views of each, in steps of 12
+python benchmarks/online.py eval --order cycle --whole color full  # every batch sees the whole scene; and in one go
+
+Scenes have fewer views: they are repeated from jittered poses (benchmarks/many_views.py). Every run is a process of
+its own. Quality is that of held-out views, visible pixels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from many_views import many_views
+from quality import score
+from shared_scenes import Targets, export, exporter, read_targets, scene_folders
+
+import gsmerge
+from gsmerge import Compactor
+from gsmerge.io import find_scene_files
+
+
+def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[Path]:
+    """A scene's views in batches, each the export of a scene of its own; made once."""
+    source = many_views(scene_folders(name)[0], cache / f"{name}-{views}", views)
+    document = json.loads((source / "transforms.json").read_text())
+    context = [f for f in document["frames"] if f["role"] == "context"]
+    ids = np.arange(len(context))
+    if order == "cycle":  # every batch goes once through the scene
+        ids = np.concatenate([ids[i :: -(-views // size)] for i in range(-(-views // size))])
+    found = []
+    for number, first in enumerate(range(0, len(ids), size)):
+        folder = cache / f"{name}-{views}-{order}-{size}" / f"{number:03d}"
+        ply = folder / "plain" / "scene.ply"
+        if not (folder / "done").exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            for part in ("images", "depth"):
+                if not (folder / part).exists():
+                    (folder / part).symlink_to((source / part).resolve())
+            frames = [context[i] for i in ids[first : first + size]]
+            (folder / "transforms.json").write_text(json.dumps(document | {"frames": frames}))
+            ply = Path(exporter().export(folder, folder / "plain", "plain"))
+            (folder / "done").touch()
+        found.append(ply)
+    return found
+
+
+def online(args: argparse.Namespace) -> dict:
+    """One batch after the other, and what is decoded in the end."""
+    targets = read_targets(scene_folders(args.scenes)[0])
+    compactor, steps = Compactor(replay=args.replay), []
+    for ply in batches(args.scenes, args.views, args.size, args.order, args.cache):
+        scene = gsmerge.read_scene(find_scene_files(ply).ply)
+        start = time.perf_counter(), time.process_time()
+        report = compactor.extend(scene)
+        seconds = time.perf_counter() - start[0], time.process_time() - start[1]
+        names = ("num_input", "num_new", "num_covered", "num_joined", "num_hidden", "num_groups")
+        step = {name: getattr(report, name) for name in names}
+        steps.append(step | {"seconds": round(seconds[0], 2), "processor": round(seconds[1], 2)})
+        print(steps[-1], {k: round(v, 2) for k, v in report.seconds.items()}, file=sys.stderr, flush=True)
+        del scene
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    with tempfile.TemporaryDirectory() as folder:
+        compactor.save(Path(folder) / "state.gsm")
+        size = (Path(folder) / "state.gsm").stat().st_size
+    found = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
+    for fit, k in (("none", 1), ("none", 2), ("none", 4), ("color", 1), ("full", 1), ("full", 2), ("full", 4)):
+        start = time.perf_counter()
+        gaussians = compactor.decode(k=k, fit=fit)
+        found[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
+    return found
+
+
+def whole(args: argparse.Namespace, fit: str) -> dict:
+    """All views at once; ``input``: as they are."""
+    source = many_views(scene_folders(args.scenes)[0], args.cache / f"{args.scenes}-{args.views}", args.views)
+    scene, targets = gsmerge.read_scene(export(source, args.cache)), read_targets(scene_folders(args.scenes)[0])
+    start = time.perf_counter()
+    if fit == "input":
+        return _scored(scene.gaussians, targets, 0.0, args.lpips)
+    result = gsmerge.compact(scene, fit=fit, checkpoint="none")
+    seconds = time.perf_counter() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return _scored(result.gaussians, targets, seconds, args.lpips) | {"peak_GB": round(peak, 2)}
+
+
+def _scored(gaussians: gsmerge.Gaussians, targets: Targets, seconds: float, perceptual: bool) -> dict:
+    values = score(gaussians, targets, perceptual)
+    found = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
+    return {"count": len(gaussians), **found, "seconds": round(seconds, 1)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scenes", help="train, eval, or names with commas between")
+    parser.add_argument("--views", type=int, default=84)
+    parser.add_argument("--size", type=int, default=12, help="views of a batch")
+    parser.add_argument("--order", choices=("trajectory", "cycle"), default="trajectory")
+    parser.add_argument("--replay", type=int, default=96)
+    parser.add_argument(
+        "--whole", nargs="*", default=[], choices=("input", "none", "color", "full"), help="also in one go"
+    )
+    parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, see benchmarks/quality.py")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-online")
+    parser.add_argument("--run", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.run:
+        print(json.dumps(online(args) if args.run == "online" else whole(args, args.run)))
+        return
+    for folder in scene_folders(args.scenes):
+        for run in ("online", *args.whole):
+            options = [f"--{name}={getattr(args, name)}" for name in ("views", "size", "order", "replay", "cache")]
+            options += ["--lpips"] * args.lpips
+            command = [sys.executable, __file__, folder.name, *options, "--run", run]
+            print(
+                folder.name, run, subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True).stdout.strip()
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Views that arrive one batch after the other: the same stages, folded into a state of bounded size (paper 4.5)."""

@@ -1,0 +1,232 @@
+"""State + new views -> state: grouped, encoded, matched and merged into what is there, and fitted to their photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsmerge import __version__
+from gsmerge.build import Merged, merged_groups
+from gsmerge.errors import UsageError
+from gsmerge.fit import shown
+from gsmerge.journal import Journal, Progress
+from gsmerge.merge import take
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.online.colors import solve_colors
+from gsmerge.online.cover import group_errors, in_view, pixel_errors
+from gsmerge.online.join import absorb, partners
+from gsmerge.online.options import OnlineOptions
+from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at
+from gsmerge.online.state import OnlineState, Parts, Replay, baked, joined, pick, with_solved
+from gsmerge.options import CompactOptions
+from gsmerge.photos import scene_pictures
+from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
+from gsmerge.stored.encoded import StoredSettings
+from gsmerge.threads import use_threads
+from gsmerge.types import Gaussians, LooseScene, PixelScene
+
+
+@dataclass(frozen=True)
+class BatchReport:
+    """What became of a batch of views.
+
+    Args:
+        num_views: Views of the batch.
+        num_input: Gaussians of the batch.
+        num_new: Groups that it was cut to and merged to among its own views.
+        num_covered: Of these, left out because the state shows their pixels as well.
+        num_joined: Of the rest, those that became part of groups that were there.
+        num_hidden: Of the rest, left out because none of the batch's views shows them.
+        num_groups: Groups of the state afterwards.
+        seconds: Wall time of each stage.
+        choices: What the stages decided.
+        notes: Things worth telling, one sentence each.
+        options: All settings by flat name.
+    """
+
+    num_views: int
+    num_input: int
+    num_new: int
+    num_covered: int
+    num_joined: int
+    num_hidden: int
+    num_groups: int
+    seconds: Mapping[str, float]
+    choices: Mapping[str, Any]
+    notes: tuple[str, ...]
+    options: Mapping[str, Any]
+
+
+def extend(
+    state: OnlineState | None,
+    scene: PixelScene | LooseScene,
+    options: CompactOptions | None = None,
+    online: OnlineOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> tuple[OnlineState, BatchReport]:
+    """Add a batch of views to a state (paper section 4.5, "Online reconstruction").
+
+    Args:
+        state: What earlier batches left; None: this is the first one.
+        scene: The new views, in the same world as the earlier ones.
+        options: Settings of all stages; None: the defaults, with the fit of the colours.
+        online: What of the batch enters the state, and how; None: the defaults.
+        progress: As of :func:`gsmerge.compact`.
+
+    Returns:
+        The new state, the old one left as it is, and what was done.
+
+    Raises:
+        ValueError: If a setting is out of range or asks for what a state cannot have, or the degree of the harmonics
+            is not that of the state.
+    """
+    options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
+    _check(state, scene, options)
+    journal = Journal(progress)
+    with use_threads(options.threads), torch.no_grad():
+        work = begin(scene, options, journal, None if state is None else state.frame)
+        work = replace(work, canvas=replace(work.canvas, share=1.0))  # nothing grows here
+        count = decide(work, journal)
+        if keeps_all(work, count):
+            raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
+        grouping = choose_groups(work, count, journal)
+        merged = merged_groups(work.source, grouping, work.options, journal)
+        shots = _shots(state, work)
+        counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+        if state is not None:
+            with journal.stage("cover"):
+                fresh = _uncovered(state.parts, merged, shots, work.source.scene, online)
+                counts["num_covered"] -= len(fresh) - len(merged.features)
+                merged = replace(merged, features=take(merged.features, fresh))
+        most = online.max_k if state is None else state.settings.most
+        with journal.stage("decode"):
+            new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
+        with journal.stage("join"):
+            state, found = _entered(state, new, work, shots, online)
+            counts |= found
+        if work.scene.images is not None:
+            state = _with_photos(state, shots, work.options, online, journal)
+    numbers = {"num_views": len(work.source.scene), "num_input": scene.num_gaussians, **counts}
+    told = options.to_dict() | asdict(online)
+    done = BatchReport(
+        **numbers, num_groups=len(state), seconds=journal.seconds, choices=journal.choices,
+        notes=tuple(journal.notes), options=told,
+    )  # fmt: skip
+    batches = [*state.about.get("batches", []), numbers | {"num_groups": len(state)}]
+    about = {"gsmerge": __version__, "options": _lasting(told), "batches": batches}
+    return replace(state, about=about), done
+
+
+def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions) -> None:
+    """Refuse what no state can have."""
+    target = options.target
+    asked = {f"method {options.method}": options.method != "gsmerge", "levels": target.levels > 1}
+    asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
+    for name in (name for name, wanted in asked.items() if wanted):
+        raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
+    if options.fit.fit == "full":
+        raise UsageError(
+            "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
+        )
+    degree = scene.gaussians.sh_degree
+    if state is not None and degree != state.sh_degree:
+        have = state.sh_degree
+        raise UsageError(f"expected Gaussians with harmonics of degree {have} as the state's, got degree {degree}")
+
+
+def _with_photos(
+    state: OnlineState, shots: Shots, options: CompactOptions, online: OnlineOptions, journal: Journal
+) -> OnlineState:
+    """The state after its newest photos were looked at, with some of them among those that are kept."""
+    parts = state.parts
+    if options.fit.fit == "color":
+        with journal.stage("fit"):
+            parts, report = solve_colors(parts, shots, options.fit, options.seed)
+            journal.choices["fit"] = asdict(report)
+    replay = kept_photos(state.replay, shots, len(state.cameras) - len(shots), online.replay)
+    return replace(state, parts=parts, replay=replay)
+
+
+def _lasting(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options without what depends on the machine."""
+    return {name: value for name, value in options.items() if name != "threads"}
+
+
+def _shots(state: OnlineState | None, work: Work) -> Shots:
+    """Photos of the batch, or what stands in for them, at the size of the state's views."""
+    scene = work.source.scene
+    size = scene.cameras if state is None else state.cameras
+    return shots_at(scene_pictures(scene), scene.cameras, size.width, size.height)
+
+
+def _uncovered(
+    parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | LooseScene, online: OnlineOptions
+) -> torch.Tensor:
+    """Rows of the batch's groups that show something which the state does not show as well."""
+    features, members = batch.features, batch.members
+    if online.tolerance == 0:
+        return torch.arange(len(features))
+    pictures, size = shots.photos(2), (scene.cameras.height, scene.cameras.width)
+    rows = torch.from_numpy(np.flatnonzero(in_view(parts.features, shots.cameras).any(0)))
+    there = group_errors(
+        features, members, pixel_errors(feature_to_gaussians(take(with_solved(parts).features, rows)), pictures, *size)
+    )
+    own = group_errors(features, members, pixel_errors(feature_to_gaussians(features), pictures, *size))
+    return torch.from_numpy(np.flatnonzero(there > np.maximum(online.tolerance**2, online.margin**2 * own)))
+
+
+def _entered(
+    state: OnlineState | None, new: Parts, work: Work, shots: Shots, online: OnlineOptions
+) -> tuple[OnlineState, dict[str, int]]:
+    """The state with new groups in it, and how many joined what was there and how many nothing shows."""
+    options, scene = work.options, work.source.scene
+    if state is None:
+        return _begun(new, work, online), {}
+    rows = torch.from_numpy(np.flatnonzero(in_view(state.parts.features, shots.cameras).any(0)))
+    found = partners(take(state.parts.features, rows), new.features, options.match)
+    joins = found >= 0
+    parts = absorb(
+        state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most, state.rule
+    )
+    alone = pick(new, torch.nonzero(~joins)[:, 0])
+    counts = {"num_joined": int(joins.sum())}
+    if options.fit.prune > 0 and scene.images is not None:
+        beside = take(parts.features, rows)
+        every = Gaussians.concat([feature_to_gaussians(beside), feature_to_gaussians(alone.features)])
+        seen = shown(every, shots.photos(2), options.fit.prune)[len(beside) :]
+        counts["num_hidden"] = int((~seen).sum())
+        alone = pick(alone, torch.nonzero(seen)[:, 0])
+    kept = [one for one in (state.kept, work.kept) if one is not None]
+    settings = replace(state.settings, num_input=state.settings.num_input + work.scene.num_gaussians)
+    size = shots.cameras
+    return replace(
+        state,
+        parts=joined([parts, alone]),
+        kept=Gaussians.concat(kept) if kept else None,
+        cameras=joined_cameras(state.cameras, size),
+        settings=settings,
+    ), counts
+
+
+def _begun(new: Parts, work: Work, online: OnlineOptions) -> OnlineState:
+    """The state that a first batch makes."""
+    options, cameras = work.options, work.source.scene.cameras
+    settings = StoredSettings(
+        num_input=work.scene.num_gaussians,
+        k=options.decode.k,
+        most=online.max_k,
+        min_opacity=options.decode.min_opacity,
+        prune=options.fit.prune if work.scene.images is not None else 0.0,
+        wanted=None,
+        places=None,
+        knee=0,
+    )
+    nothing = np.zeros((0, cameras.height, cameras.width, 3), np.uint8)
+    replay = Replay(nothing, np.zeros(0, np.int64))
+    same = resized(cameras, cameras.width, cameras.height)
+    return OnlineState(new, work.kept, work.frame, same, replay, settings, options.encode.rule, {})

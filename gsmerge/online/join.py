@@ -1,0 +1,64 @@
+"""New groups and the state: those that show the same piece of surface become one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.match import MatchOptions, match
+from gsmerge.merge import merge
+from gsmerge.moments import Rule
+from gsmerge.online.state import Parts, joined, pick, swapped, thinned
+from gsmerge.types import FeatureGaussians, Matches
+
+
+def partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> Tensor:
+    """``[n]`` int64: the state's group that each new one belongs to, -1 for none; no group gets two.
+
+    As across the views of one batch, with the state for one view and the batch for another.
+
+    Args:
+        features: What the state has where the new views look.
+        new: n new groups, merged among themselves.
+        options: As of the matching of views.
+    """
+    both = FeatureGaussians.concat([features, new])
+    sides = (torch.arange(len(both)) >= len(features)).long()
+    matches = match(replace(both, views=sides), replace(options, cluster_size=2))
+    found = torch.full((len(new),), -1)
+    owner = torch.full((matches.count,), -1)
+    owner[matches.clusters[: len(features)]] = torch.arange(len(features))
+    found[:] = owner[matches.clusters[len(features) :]]
+    return found
+
+
+def absorb(parts: Parts, new: Parts, rows: Tensor, most: int, rule: Rule = "depth") -> Parts:
+    """The state's groups, some of them pooled with new ones: moments add up, in place.
+
+    Args:
+        parts: The state's groups.
+        new: n new groups.
+        rows: ``[n]`` int64 the group that each becomes part of, all different.
+        most: Most children of a group.
+        rule: How children are pooled.
+    """
+    if len(rows) == 0:
+        return parts
+    old = pick(parts, rows)
+    both = joined([old, new])
+    pairs = torch.arange(len(rows)).repeat(2)
+    features = merge(both.features, Matches(pairs, len(rows)))
+    children = both.children[features.members]
+    solved = torch.where((old.held > 0)[:, None, None], old.solved, features.sh0)
+    pooled = Parts(replace(features, members=torch.arange(len(children))), children, solved, old.held)
+    return swapped(parts, rows, thinned(pooled, most, rule))
+
+
+def without(parts: Parts, gone: np.ndarray) -> Parts:
+    """The groups without some rows."""
+    stays = np.ones(len(parts), bool)
+    stays[gone] = False
+    return pick(parts, torch.from_numpy(np.flatnonzero(stays)))

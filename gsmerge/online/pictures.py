@@ -1,0 +1,69 @@
+"""The photos of a batch, and those that the state keeps of earlier ones, all at the state's size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.online.state import Replay
+from gsmerge.photos import Photos, photos_of
+from gsmerge.threads import parallel_map
+from gsmerge.types import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """Pictures ``images [v,h,w,3]`` float32, sRGB in [0, 1], and their cameras, of the same size."""
+
+    images: np.ndarray
+    cameras: Cameras
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def photos(self, level: int = 1) -> Photos:
+        """As the stages want them that render against them, each side divided by ``level``."""
+        return photos_of(self.images, self.cameras, level)
+
+
+def shots_at(images: Tensor, cameras: Cameras, width: int, height: int) -> Shots:
+    """Pictures of the cameras' size brought to another one (area averages)."""
+    arrays, size = images.numpy(), (width, height)
+    if size == (cameras.width, cameras.height):
+        return Shots(arrays, cameras)
+    small = parallel_map(lambda one: cv2.resize(one, size, interpolation=cv2.INTER_AREA), arrays)
+    return Shots(np.stack(small), resized(cameras, width, height))
+
+
+def resized(cameras: Cameras, width: int, height: int) -> Cameras:
+    """The same views in pictures of another size."""
+    shape = torch.tensor([[width / cameras.width], [height / cameras.height], [1.0]], dtype=torch.float64)
+    return Cameras(cameras.viewmats.double(), cameras.Ks.double() * shape, width, height)
+
+
+def joined_cameras(first: Cameras, second: Cameras) -> Cameras:
+    """Cameras of one size, one after the other."""
+    viewmats = torch.cat([first.viewmats.double(), second.viewmats.double()])
+    return Cameras(viewmats, torch.cat([first.Ks.double(), second.Ks.double()]), first.width, first.height)
+
+
+def kept_photos(replay: Replay, shots: Shots, first: int, most: int) -> Replay:
+    """The photos that are kept with new ones among them: every so many-th view of all, the step a power of two.
+
+    Args:
+        replay: Those kept so far.
+        shots: The new ones.
+        first: Number of the first of them among all views.
+        most: Most photos that are kept.
+    """
+    views = np.concatenate([replay.views, first + np.arange(len(shots))])
+    step = 1
+    while most and np.count_nonzero(views % step == 0) > most:
+        step *= 2
+    stays = (views % step == 0) & (most > 0)
+    new = np.rint(shots.images[stays[len(replay) :]] * 255).astype(np.uint8)
+    return Replay(np.concatenate([replay.images[stays[: len(replay)]], new]), views[stays])
