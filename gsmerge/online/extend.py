@@ -190,9 +190,7 @@ def _entered(
     rows = torch.from_numpy(np.flatnonzero(in_view(state.parts.features, shots.cameras).any(0)))
     found = partners(take(state.parts.features, rows), new.features, options.match)
     joins = found >= 0
-    parts = absorb(
-        state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most, state.rule
-    )
+    parts = absorb(state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most)
     alone = pick(new, torch.nonzero(~joins)[:, 0])
     counts = {"num_joined": int(joins.sum())}
     if options.fit.prune > 0 and scene.images is not None:
@@ -229,4 +227,4 @@ def _begun(new: Parts, work: Work, online: OnlineOptions) -> OnlineState:
     nothing = np.zeros((0, cameras.height, cameras.width, 3), np.uint8)
     replay = Replay(nothing, np.zeros(0, np.int64))
     same = resized(cameras, cameras.width, cameras.height)
-    return OnlineState(new, work.kept, work.frame, same, replay, settings, options.encode.rule, {})
+    return OnlineState(new, work.kept, work.frame, same, replay, settings, {})
