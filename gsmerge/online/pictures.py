@@ -62,8 +62,10 @@ def kept_photos(replay: Replay, shots: Shots, first: int, most: int) -> Replay:
     """
     views = np.concatenate([replay.views, first + np.arange(len(shots))])
     step = 1
-    while most and np.count_nonzero(views % step == 0) > most:
+    while most and -(-(first + len(shots)) // step) > most:  # of all views, so that the batches' sizes do not matter
         step *= 2
     stays = (views % step == 0) & (most > 0)
+    if most and not stays.any():  # earlier views came without photos
+        stays[-1] = True
     new = np.rint(shots.images[stays[len(replay) :]] * 255).astype(np.uint8)
     return Replay(np.concatenate([replay.images[stays[: len(replay)]], new]), views[stays])
