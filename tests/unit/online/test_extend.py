@@ -307,7 +307,7 @@ def test_more_children_show_more(rule: str, fit: str, scene: PixelScene, pairs: 
     compactor = fed(pairs, rule=rule)
     one, two, four = (scenes.psnr_of(compactor.decode(k=k, fit=fit), scene) for k in (1, 2, 4))
     assert four > one
-    assert two > one - (1.5 if fit == "none" else 0.0)
+    assert fit == "none" or four > two > one
 
 
 def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> None:
