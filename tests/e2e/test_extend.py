@@ -28,9 +28,9 @@ PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 @pytest.fixture(scope="session")
 def walks(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two scenes of three views of the same place, 48 x 32. Read only."""
+    """Two scenes of the same room, three and four views of 48 x 32. Read only."""
     folder = tmp_path_factory.mktemp("walks")
-    return [make_scene(folder / f"walk{n}", num_views=3, width=48, height=32, seed=0) for n in range(2)]
+    return [make_scene(folder / f"walk{n}", num_views=3 + n, width=48, height=32, seed=0) for n in range(2)]
 
 
 @pytest.fixture(scope="session")
@@ -85,7 +85,7 @@ def test_a_first_batch_makes_the_file(states: list[Path], walks: list[Path], tmp
 def test_a_further_batch_is_added(states: list[Path], state: Path, walks: list[Path], run: Run) -> None:
     outcome = run("extend", state, walks[1], "--threads", 1)
     assert outcome.code == 0, outcome.err
-    assert "state.gsm: batch 2, 3 views" in outcome.out
+    assert "state.gsm: batch 2, 4 views" in outcome.out
     assert state.read_bytes() == states[1].read_bytes()
 
 
@@ -103,11 +103,11 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
     batches = json.loads(outcome.out)["batches"]
     assert [one["state"]["num_batches"] for one in batches] == [1, 2]
     assert batches[1]["state"]["bytes"] == state.stat().st_size
-    for one, walk in zip(batches, walks, strict=True):
+    for one, walk, num_views in zip(batches, walks, (3, 4), strict=True):
         assert one["schema_version"] == 1
         assert one["tool"]["version"] == gsmerge.__version__
         assert Path(one["input"]["path"]) == walk / "scene.ply"
-        assert one["num_input"] == 3 * 48 * 32
+        assert one["num_input"] == num_views * 48 * 32
         assert one["num_groups"] > 0
         assert one["options"]["superpixels"] == 60
         assert {"load", "read", "write"} <= set(one["seconds"])
@@ -144,8 +144,8 @@ def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path
     state = Path(shutil.copy(encoded, tmp_path / "state.gsm"))
     outcome = run("extend", state, walks[1])
     assert outcome.code == 0, outcome.err
-    assert "batch 2, 3 views" in outcome.out
-    assert len(load_state(state).replay) == 3
+    assert "batch 2, 4 views" in outcome.out
+    assert len(load_state(state).replay) == 4
     assert run("decode", state, "--fit", "color", "-o", tmp_path / "a.ply").code == 0
 
 
@@ -174,7 +174,7 @@ def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, ru
     assert groups < document["output"]["num_gaussians"] <= groups + 40
     assert document["fit"] is None
     assert document["input"]["num_groups"] == groups
-    assert document["input"]["num_gaussians_encoded"] == 2 * 3 * 48 * 32
+    assert document["input"]["num_gaussians_encoded"] == 7 * 48 * 32
 
 
 def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, run: Run) -> None:
@@ -450,8 +450,8 @@ def test_killed_in_the_middle(state: Path, states: list[Path], walks: list[Path]
 
 def test_no_input_was_ever_damaged(walks: list[Path], make_scene: Callable[..., Path], tmp_path: Path) -> None:
     """After everything above: the scenes are what they were made."""
-    fresh = make_scene(tmp_path / "walk", num_views=3, width=48, height=32, seed=0)
-    wanted = {path.relative_to(fresh): path.read_bytes() for path in fresh.rglob("*") if path.is_file()}
-    for walk in walks:
+    for number, walk in enumerate(walks):
+        fresh = make_scene(tmp_path / f"walk{number}", num_views=3 + number, width=48, height=32, seed=0)
+        wanted = {path.relative_to(fresh): path.read_bytes() for path in fresh.rglob("*") if path.is_file()}
         found = {path.relative_to(walk): path.read_bytes() for path in walk.rglob("*") if path.is_file()}
         assert found == wanted

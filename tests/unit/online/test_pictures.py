@@ -9,7 +9,7 @@ from arriving import room
 
 from gsmerge import Cameras
 from gsmerge.geometry import project
-from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at
+from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
 from gsmerge.online.state import Replay
 
 NOTHING = Replay(np.zeros((0, 2, 3, 3), np.uint8), np.zeros(0, np.int64))
@@ -28,7 +28,7 @@ def kept(sizes: list[int], most: int, start: int = 0) -> Replay:
     """What is kept of batches of given sizes."""
     found, first = NOTHING, start
     for size in sizes:
-        found = kept_photos(found, shots(first, size), first, most)
+        found = kept_photos(found, shots(first, size), np.arange(first, first + size), first + size, most)
         first += size
     return found
 
@@ -63,6 +63,27 @@ def test_views_without_photos_before(start: int, most: int) -> None:
     assert found.images[:, 0, 0, 0].tolist() == found.views.tolist()
 
 
+def test_views_that_come_again_are_kept_once() -> None:
+    many = kept([4], 4)
+    again = kept_photos(many, shots(10, 3), np.array([1, 4, 1]), 5, 8)
+    assert again.views.tolist() == [0, 1, 2, 3, 4]
+    assert again.images[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 11]
+
+
+def test_photos_of_views_that_came_without() -> None:
+    found = kept_photos(kept([1, 1], 8, 4), shots(0, 3), np.array([0, 2, 1]), 6, 8)
+    assert found.views.tolist() == [0, 1, 2, 4, 5]
+    assert found.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
+
+
+def test_known_cameras_are_found() -> None:
+    cameras = room(6).cameras
+    some, others = cameras[torch.tensor([4, 0, 4])], cameras[torch.tensor([5, 4, 3])]
+    assert view_places(some, others).tolist() == [3, 0, 4]
+    assert view_places(some[:0], others).tolist() == [0, 1, 2]
+    assert view_places(some, others[:0]).tolist() == []
+
+
 def test_no_photos_are_kept_where_none_are_wanted() -> None:
     found = kept([3, 2], 0)
     assert found.images.shape == (0, 2, 3, 3)
@@ -71,14 +92,14 @@ def test_no_photos_are_kept_where_none_are_wanted() -> None:
 
 def test_fewer_may_be_wanted_later() -> None:
     many = kept([8], 8)
-    few = kept_photos(many, shots(8, 1), 8, 3)
+    few = kept_photos(many, shots(8, 1), np.array([8]), 9, 3)
     assert few.views.tolist() == [0, 4, 8]
 
 
 def test_colours_are_rounded() -> None:
     one = shots(0, 1)
     values = np.linspace(0, 1, 18, dtype=np.float32).reshape(1, 2, 3, 3)
-    found = kept_photos(NOTHING, Shots(values, one.cameras), 0, 4)
+    found = kept_photos(NOTHING, Shots(values, one.cameras), np.array([0]), 1, 4)
     assert found.images.dtype == np.uint8
     np.testing.assert_allclose(found.images / 255, values, atol=0.5 / 255 + 1e-6)
 
