@@ -20,9 +20,9 @@ from gsmerge.weights import apply_transposed
 def solve_colors(parts: Parts, shots: Shots, options: FitOptions, seed: int = 0) -> tuple[Parts, FitReport]:
     """Base colours that fit new photos, held back by those that each was fitted to before.
 
-    The normal equations of earlier photos are kept as their diagonal, bounded from above by the row sums
-    (``Parts.held``), about the colours that solve them: what is added to the equations of the new photos is
-    ``held |colour - present colour|^2``, and no earlier photo is needed again.
+    The normal equations of earlier photos are kept as their diagonal (``Parts.held``) about the colours that solve
+    them: what is added to the equations of the new photos is ``held |colour - present colour|^2``, and no earlier photo
+    is needed again.
 
     Args:
         parts: The state's groups.
@@ -41,5 +41,5 @@ def solve_colors(parts: Parts, shots: Shots, options: FitOptions, seed: int = 0)
     everywhere = np.ones((photos.height, photos.width, 1), np.float32)
     held = part.held.double().numpy()
     for view in drawn.views:
-        held[view.ids] += apply_transposed(view, everywhere)[:, 0]
+        held[view.ids] += apply_transposed(replace(view, weights=view.weights**2), everywhere)[:, 0]
     return swapped(parts, rows, replace(part, solved=after.sh0, held=torch.from_numpy(held).float())), report

@@ -82,4 +82,8 @@ def decode_stored(
             fitted, report = fit(
                 gaussians, (shots.photos(), shots.photos(2)), options, wanted, seed, journal.fit_progress
             )
+    if report is not None and not report.accepted:  # the colours that were solved batch by batch are better than none
+        held = "the fit was not accepted: held-out parts of the photos did not get better"
+        plain_colors = decode_scene(as_encoded(stored), k=k, budget=budget, threads=threads)
+        return Decoded(plain_colors, report, (*plan.notes, held))
     return Decoded(stored.frame.leave(fitted), report, plan.notes)

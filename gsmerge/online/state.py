@@ -52,8 +52,8 @@ class Parts:
         children: The Gaussians of the finest division, group by group.
         solved: ``[g,1,3]`` base colours (sh0) that fit the photos so far; those of the features are as they came, for a
             fit to begin with that has not seen the photos yet.
-        held: ``[g]`` what earlier photos say of each solved colour: the pixels (of half-size photos) that it was
-            fitted to, weighted by how much of them the group is. Diagonal of the normal equations, bounded from above.
+        held: ``[g]`` what earlier photos say of each solved colour: diagonal of their normal equations, the sum of the
+            squares of the group's blending weights over their pixels (of half-size photos).
     """
 
     features: FeatureGaussians

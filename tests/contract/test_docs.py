@@ -45,6 +45,7 @@ def test_commands_are_the_documented_ones() -> None:
         "encode",
         "decode",
         "evaluate",
+        "extend",
         "inspect",
         "segment",
         "render",

@@ -43,6 +43,8 @@ def test_examples_run_one_after_the_other(root: Path, tmp_path: Path) -> None:
     values = [float(value) for value in re.findall(r": (\S+) dB", measured)]
     assert len(values) == 2
     assert all(10 < value < 60 for value in values)
+    arrived = run_example(root, "05_views_in_batches.py", scene / "scene.ply", scene / "so_far.ply")
+    assert 0 < int(re.search(r"13824 -> (\d+) Gaussians", arrived).group(1)) < 13824 / 5  # type: ignore[union-attr]
 
 
 def test_the_same_seed_makes_the_same_scene(make_scene, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
