@@ -139,11 +139,13 @@ def test_only_colours_in_view_and_what_holds_them_change(parts: Parts, shots: Sh
     assert float(found.held.sum()) > 0
 
 
-def test_what_is_held_is_how_much_of_the_photos_a_group_is(parts: Parts, shots: Shots) -> None:
-    """Of half-size photos: never more in all than they have pixels, and hardly less where all is opaque."""
+def test_what_is_held_is_the_diagonal_of_the_equations(parts: Parts, shots: Shots) -> None:
+    """Squares of the blending weights in half-size photos."""
     found, _ = solve_colors(parts, shots, FEW)
-    pixels = 6 * 24 * 18
-    assert 0.8 * pixels < float(found.held.sum()) <= pixels
+    views = draw(replace(feature_to_gaussians(parts.features), sh0=parts.solved), shots.photos(2)).views
+    for g in range(0, len(parts), 7):
+        wanted = sum(float((dense(view, g, len(parts)) ** 2).sum()) for view in views)
+        assert float(found.held[g]) == pytest.approx(wanted, rel=1e-3, abs=1e-5)
     twice, _ = solve_colors(found, shots, FEW)
     np.testing.assert_allclose(twice.held, 2 * found.held, rtol=1e-5)
 
