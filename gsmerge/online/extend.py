@@ -86,7 +86,7 @@ def extend(
             is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
-    _check(state, scene, options)
+    _check(state, scene, options, online.max_k if state is None else state.settings.most)
     journal = Journal(progress)
     with use_threads(options.threads), torch.no_grad():
         work = begin(scene, options, journal, None if state is None else state.frame)
@@ -123,8 +123,8 @@ def extend(
     return replace(state, about=about), done
 
 
-def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions) -> None:
-    """Refuse what no state can have."""
+def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions, most: int) -> None:
+    """Refuse what no state can have; ``most``: children of a group."""
     target = options.target
     asked = {f"method {options.method}": options.method != "gsmerge", "levels": target.levels > 1}
     asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
@@ -134,6 +134,8 @@ def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: C
         raise UsageError(
             "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
         )
+    if options.decode.count > most:
+        raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {most}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
         have = state.sh_degree

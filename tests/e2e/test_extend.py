@@ -350,6 +350,11 @@ def test_places_that_cannot_be_written(name: str, walks: list[Path], tmp_path: P
     assert digests(tmp_path) == before
 
 
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that nobody can write in")
+def test_a_folder_that_nobody_can_write_in(walks: list[Path], run: Run) -> None:
+    assert_refused(run("extend", "/proc/self/state.gsm", walks[0], *SMALL), 3, "cannot be written (")
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere")
 def test_a_folder_without_permission(state: Path, walks: list[Path], run: Run) -> None:
     before = state.read_bytes()

@@ -12,10 +12,11 @@ import scenes
 import torch
 from arriving import FAST, counts, fed, parts_of, room, same_parts, same_state, state_of
 from learned import noisy, written
-from loose import far_behind, loosened, shuffled
+from loose import NO_CAMERAS, far_behind, loosened, shuffled
 
 from gsmerge import Compactor, Gaussians, LooseScene, PixelScene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
+from gsmerge.fit import FitOptions, FitReport
 from gsmerge.online.extend import extend
 from gsmerge.online.fitted import decode_stored
 from gsmerge.online.state import OnlineState, from_encoded
@@ -208,6 +209,16 @@ def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
     assert len(compactor.decode()) > 50
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene]) -> None:
+    """Views are placed for them."""
+    bare = LooseScene(pairs[0].gaussians, NO_CAMERAS, None, ())
+    compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
+    assert compactor.batches[1]["num_covered"] > 0
+    assert len(state_of(compactor).replay) == 2
+    assert scenes.psnr_of(compactor.decode(fit="color"), pairs[1]) > 17
+
+
 def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
     batches = []
     for pair in pairs[:2]:
@@ -317,6 +328,29 @@ def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> No
     assert scenes.identical(compactor.decode(fit="full", fit_steps=30), full)
 
 
+def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsmerge.online import fitted
+
+    def refused(gaussians: Gaussians, *_: object) -> tuple[Gaussians, FitReport]:
+        return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")
+
+    monkeypatch.setattr(fitted, "fit", refused)
+    compactor = fed(pairs)
+    found = decode_stored(state_of(compactor), k=1, options=FitOptions(fit="color"))
+    assert found.fit is not None
+    assert not found.fit.accepted
+    assert [note for note in found.notes if "the fit was not accepted" in note]
+    assert scenes.identical(found.gaussians, compactor.decode(k=1, fit="none"))
+
+
+@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"max_bytes": "20KB"}], ids=str)
+def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs[:2], **settings)
+    own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))
+    assert abs(len(own) - len(compactor)) < 0.1 * len(own)
+    assert len(decode_stored(own, options=FitOptions(fit="color")).gaussians) >= len(own) - 5
+
+
 def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
     compactor = fed(pairs)
     compactor.decode(fit="full", fit_steps=4)
@@ -354,6 +388,13 @@ def test_what_a_state_cannot_have(settings: dict[str, Any], words: str, pairs: l
 def test_harmonics_of_another_degree(first: OnlineState) -> None:
     with pytest.raises(UsageError, match="expected Gaussians with harmonics of degree 0 as the state's, got degree 1"):
         extend(first, room(2, degree=1), options())
+
+
+def test_more_gaussians_of_a_group_than_are_kept(pairs: list[PixelScene], first: OnlineState) -> None:
+    with pytest.raises(UsageError, match="max k: expected at least 3, which is k, got 2"):
+        Compactor(**FAST, k=3, max_k=2).extend(pairs[0])
+    with pytest.raises(UsageError, match="max k: expected at least 5, which is k, got 4"):
+        extend(first, pairs[1], options(k=5))
 
 
 def test_a_budget_that_keeps_everything(pairs: list[PixelScene]) -> None:
