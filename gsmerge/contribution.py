@@ -23,8 +23,7 @@ from gsmerge.types import Groups, LooseScene
 
 Unseen = Literal["drop", "keep"]
 
-MANY = 4_000_000  # Gaussians; the plan of a view is as large as they are,
-AT_ONCE = 2  # so of many no more views are drawn at once, whatever the threads
+ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
 FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
@@ -130,10 +129,12 @@ def seen_depths(scene: LooseScene, near: float = 0.01) -> tuple[Tensor, Tensor]:
 
 
 def each_view(one_view: Callable[[int], None], num_views: int, num_gaussians: int) -> None:
-    """Call for every view, few at once if the Gaussians are so many that their plans would fill the memory."""
-    step = AT_ONCE if num_gaussians > MANY else max(1, num_views)
-    for first in range(0, num_views, step):
-        parallel_map(one_view, range(first, min(first + step, num_views)))
+    """Call for every view, several at once unless the Gaussians are so many that their plans would fill the memory."""
+    if num_gaussians > ONE_AT_A_TIME:
+        for view in range(num_views):
+            one_view(view)
+    else:
+        parallel_map(one_view, range(num_views))
 
 
 def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

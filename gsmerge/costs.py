@@ -16,7 +16,8 @@ COST_NETWORKS = 2.8  # at the usual density
 COST_SCORE = 0.07  # rendering from input and output, per view that is scored
 COST_ROBUST = 1.6
 COST_COLOR_FIT = 0.9
-COST_FULL_FIT = 0.36  # per step and million pixels of one view
+COST_FULL_FIT = 0.2  # per step and million pixels of one view
+COST_FIT_LOOKS = 1.5  # what the full fit looks at in all views
 COST_RIVALS = {"paper": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
 COST_RIVAL = 0.2  # of the others
 COST_RIVAL_STEP = 0.15  # per step of the full fit, for each million Gaussians of an input that was not merged
@@ -42,7 +43,8 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
         work += COST_NETWORKS * (options["checkpoint"] != "none")
     else:
         work = COST_RIVALS.get(method, COST_RIVAL)
-    work += COST_READ + score_cost(views) * photos + COST_COLOR_FIT * (fit == "color")
+    work += COST_READ + score_cost(views) * photos
+    work += COST_COLOR_FIT * (fit == "color") + COST_FIT_LOOKS * (fit == "full")
     steps = fit_steps if fit == "full" else 0
     seconds = pixels / 1e6 * work + view_pixels / 1e6 * COST_FULL_FIT * steps
     return seconds + pixels / 1e6 * COST_RIVAL_STEP * steps * (method == "unmerged-fit")

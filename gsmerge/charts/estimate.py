@@ -10,6 +10,7 @@ from gsmerge.charts.places import Place
 from gsmerge.charts.record import INPUT, RunRecord
 from gsmerge.costs import (
     COST_COLOR_FIT,
+    COST_FIT_LOOKS,
     COST_FULL_FIT,
     COST_MERGE,
     COST_READ,
@@ -72,6 +73,7 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     fit = settings.get("fit", "full")
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
+        work += pixels * COST_FIT_LOOKS
     else:
         work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
     return work / threads

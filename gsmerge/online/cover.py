@@ -11,7 +11,8 @@ from gsmerge.render import composite, plan_view, prepare
 from gsmerge.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
-REACH = 3.0  # standard deviations of a group that may show
+REACH = 3.34  # standard deviations to where a solid Gaussian adds 1/255
+MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
 
 
 def in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
@@ -28,7 +29,7 @@ def in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
         places = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         inside: np.ndarray = places[:, 2] > -radii
         for axis, size in ((0, cameras.width), (1, cameras.height)):
-            for edge, sign in ((0, 1), (size, -1)):
+            for edge, sign in ((-MARGIN, 1), (size + MARGIN, -1)):
                 normal = np.zeros(3)  # of the plane through the eye and an edge of the picture, pointing inside
                 normal[axis], normal[2] = sign * K[axis, axis], sign * (K[axis, 2] - edge)
                 inside &= places @ (normal / np.linalg.norm(normal)) > -radii

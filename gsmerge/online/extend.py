@@ -20,7 +20,7 @@ from gsmerge.online.colors import solve_colors
 from gsmerge.online.cover import group_errors, in_view, pixel_errors
 from gsmerge.online.join import absorb, partners
 from gsmerge.online.options import OnlineOptions
-from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at
+from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
 from gsmerge.online.state import OnlineState, Parts, Replay, baked, joined, pick, with_solved
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_pictures
@@ -86,7 +86,7 @@ def extend(
             is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
-    _check(state, scene, options)
+    _check(state, scene, options, online.max_k if state is None else state.settings.most)
     journal = Journal(progress)
     with use_threads(options.threads), torch.no_grad():
         work = begin(scene, options, journal, None if state is None else state.frame)
@@ -104,13 +104,14 @@ def extend(
                 counts["num_covered"] -= len(fresh) - len(merged.features)
                 merged = replace(merged, features=take(merged.features, fresh))
         most = online.max_k if state is None else state.settings.most
+        places = np.arange(len(shots)) if state is None else view_places(state.cameras, shots.cameras)
         with journal.stage("decode"):
             new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
         with journal.stage("join"):
-            state, found = _entered(state, new, work, shots, online)
+            state, found = _entered(state, new, work, (shots, places), online)
             counts |= found
         if work.scene.images is not None:
-            state = _with_photos(state, shots, work.options, online, journal)
+            state = _with_photos(state, (shots, places), work.options, online, journal)
     numbers = {"num_views": len(work.source.scene), "num_input": scene.num_gaussians, **counts}
     told = options.to_dict() | asdict(online)
     done = BatchReport(
@@ -122,8 +123,8 @@ def extend(
     return replace(state, about=about), done
 
 
-def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions) -> None:
-    """Refuse what no state can have."""
+def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions, most: int) -> None:
+    """Refuse what no state can have; ``most``: children of a group."""
     target = options.target
     asked = {f"method {options.method}": options.method != "gsmerge", "levels": target.levels > 1}
     asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
@@ -133,6 +134,8 @@ def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: C
         raise UsageError(
             "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
         )
+    if options.decode.count > most:
+        raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {most}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
         have = state.sh_degree
@@ -140,15 +143,19 @@ def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: C
 
 
 def _with_photos(
-    state: OnlineState, shots: Shots, options: CompactOptions, online: OnlineOptions, journal: Journal
+    state: OnlineState,
+    seen: tuple[Shots, np.ndarray],
+    options: CompactOptions,
+    online: OnlineOptions,
+    journal: Journal,
 ) -> OnlineState:
     """The state after its newest photos were looked at, with some of them among those that are kept."""
-    parts = state.parts
+    parts, (shots, places) = state.parts, seen
     if options.fit.fit == "color":
         with journal.stage("fit"):
             parts, report = solve_colors(parts, shots, options.fit, options.seed)
             journal.choices["fit"] = asdict(report)
-    replay = kept_photos(state.replay, shots, len(state.cameras) - len(shots), online.replay)
+    replay = kept_photos(state.replay, shots, places, len(state.cameras), online.replay)
     return replace(state, parts=parts, replay=replay)
 
 
@@ -181,34 +188,35 @@ def _uncovered(
 
 
 def _entered(
-    state: OnlineState | None, new: Parts, work: Work, shots: Shots, online: OnlineOptions
+    state: OnlineState | None, new: Parts, work: Work, seen: tuple[Shots, np.ndarray], online: OnlineOptions
 ) -> tuple[OnlineState, dict[str, int]]:
-    """The state with new groups in it, and how many joined what was there and how many nothing shows."""
-    options, scene = work.options, work.source.scene
+    """The state with new groups in it, and how many joined what was there and how many nothing shows.
+
+    ``seen`` are the batch's photos, and which of all views they show.
+    """
+    options, scene, (shots, places) = work.options, work.source.scene, seen
     if state is None:
         return _begun(new, work, online), {}
     rows = torch.from_numpy(np.flatnonzero(in_view(state.parts.features, shots.cameras).any(0)))
     found = partners(take(state.parts.features, rows), new.features, options.match)
     joins = found >= 0
-    parts = absorb(
-        state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most, state.rule
-    )
+    parts = absorb(state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most)
     alone = pick(new, torch.nonzero(~joins)[:, 0])
     counts = {"num_joined": int(joins.sum())}
     if options.fit.prune > 0 and scene.images is not None:
         beside = take(parts.features, rows)
         every = Gaussians.concat([feature_to_gaussians(beside), feature_to_gaussians(alone.features)])
-        seen = shown(every, shots.photos(2), options.fit.prune)[len(beside) :]
-        counts["num_hidden"] = int((~seen).sum())
-        alone = pick(alone, torch.nonzero(seen)[:, 0])
+        shows = shown(every, shots.photos(2), options.fit.prune)[len(beside) :]
+        counts["num_hidden"] = int((~shows).sum())
+        alone = pick(alone, torch.nonzero(shows)[:, 0])
     kept = [one for one in (state.kept, work.kept) if one is not None]
     settings = replace(state.settings, num_input=state.settings.num_input + work.scene.num_gaussians)
-    size = shots.cameras
+    further = shots.cameras[torch.from_numpy(places >= len(state.cameras))]
     return replace(
         state,
         parts=joined([parts, alone]),
         kept=Gaussians.concat(kept) if kept else None,
-        cameras=joined_cameras(state.cameras, size),
+        cameras=joined_cameras(state.cameras, further),
         settings=settings,
     ), counts
 
@@ -229,4 +237,4 @@ def _begun(new: Parts, work: Work, online: OnlineOptions) -> OnlineState:
     nothing = np.zeros((0, cameras.height, cameras.width, 3), np.uint8)
     replay = Replay(nothing, np.zeros(0, np.int64))
     same = resized(cameras, cameras.width, cameras.height)
-    return OnlineState(new, work.kept, work.frame, same, replay, settings, options.encode.rule, {})
+    return OnlineState(new, work.kept, work.frame, same, replay, settings, {})

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 from gsmerge.canonical import Frame
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.moments import Rule
 from gsmerge.online.state import OnlineState, Parts, Replay, from_encoded, owning
 from gsmerge.stored.encoded import Encoded
 from gsmerge.stored.file import FORMAT as ENCODED
@@ -40,7 +39,7 @@ from gsmerge.stored.parts import (
 MINOR = 0  # what was added since the first files of the schema
 FORMAT = "gsmerge-state"
 PREFIXES = ("features.", "children.", "kept.", "cameras.", "frame.", "replay.")
-KINDS = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict, "rule": str}
+KINDS = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
@@ -60,7 +59,6 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
         "unit": state.frame.unit,
         "width": state.cameras.width,
         "height": state.cameras.height,
-        "rule": state.rule,
         "about": dict(state.about),
     }
     data = to_bytes(FORMAT, header, _tensors(state))
@@ -104,8 +102,6 @@ def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
     if FORMAT not in told:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
     header, take = read_header(path, told[FORMAT], KINDS), taker(path, tensors)
-    if header["rule"] not in get_args(Rule):
-        raise SceneError(path, f"rule: expected {' or '.join(get_args(Rule))}, found {header['rule']!r:.40}", REMEDY)
     settings = read_settings(path, header["settings"])
     parts, cameras = _parts(path, take, settings.most), read_cameras(path, take, header)
     kept = read_gaussians(take, "kept", None, parts.children.shN.shape[1])
@@ -116,7 +112,6 @@ def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
         cameras=cameras,
         replay=_replay(path, take, (len(cameras), cameras.height, cameras.width)),
         settings=settings,
-        rule=header["rule"],
         about=_about(path, header["about"]),
     )
 

@@ -87,6 +87,6 @@ def _mark(path: Path) -> Mark:
     """What tells one file of this name from the next; None where there is none."""
     try:
         found = os.stat(path)
-    except FileNotFoundError:
+    except OSError:  # what is wrong with it shows when it is written
         return None
     return found.st_ino, found.st_mtime_ns, found.st_size

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from gsmerge.match import MatchOptions, match
 from gsmerge.merge import merge
-from gsmerge.moments import Rule
 from gsmerge.online.state import Parts, joined, pick, swapped, thinned
 from gsmerge.types import FeatureGaussians, Matches
 
@@ -35,7 +33,7 @@ def partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOp
     return found
 
 
-def absorb(parts: Parts, new: Parts, rows: Tensor, most: int, rule: Rule = "depth") -> Parts:
+def absorb(parts: Parts, new: Parts, rows: Tensor, most: int) -> Parts:
     """The state's groups, some of them pooled with new ones: moments add up, in place.
 
     Args:
@@ -43,7 +41,6 @@ def absorb(parts: Parts, new: Parts, rows: Tensor, most: int, rule: Rule = "dept
         new: n new groups.
         rows: ``[n]`` int64 the group that each becomes part of, all different.
         most: Most children of a group.
-        rule: How children are pooled.
     """
     if len(rows) == 0:
         return parts
@@ -54,11 +51,4 @@ def absorb(parts: Parts, new: Parts, rows: Tensor, most: int, rule: Rule = "dept
     children = both.children[features.members]
     solved = torch.where((old.held > 0)[:, None, None], old.solved, features.sh0)
     pooled = Parts(replace(features, members=torch.arange(len(children))), children, solved, old.held)
-    return swapped(parts, rows, thinned(pooled, most, rule))
-
-
-def without(parts: Parts, gone: np.ndarray) -> Parts:
-    """The groups without some rows."""
-    stays = np.ones(len(parts), bool)
-    stays[gone] = False
-    return pick(parts, torch.from_numpy(np.flatnonzero(stays)))
+    return swapped(parts, rows, thinned(pooled, most))

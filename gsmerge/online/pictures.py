@@ -51,19 +51,40 @@ def joined_cameras(first: Cameras, second: Cameras) -> Cameras:
     return Cameras(viewmats, torch.cat([first.Ks.double(), second.Ks.double()]), first.width, first.height)
 
 
-def kept_photos(replay: Replay, shots: Shots, first: int, most: int) -> Replay:
+def view_places(known: Cameras, cameras: Cameras) -> np.ndarray:
+    """``[v]`` which of all views each is: a known one of the same camera to the last bit, otherwise a further one."""
+    places = {row: place for place, row in reversed(list(enumerate(_rows(known))))}
+    found = [places.get(row, -1) for row in _rows(cameras)]
+    numbers = np.array(found, np.int64)
+    numbers[numbers < 0] = len(known) + np.arange(np.count_nonzero(numbers < 0))
+    return numbers
+
+
+def _rows(cameras: Cameras) -> list[bytes]:
+    """Every camera as bytes."""
+    flat = torch.cat([cameras.viewmats.double().flatten(1), cameras.Ks.double().flatten(1)], 1)
+    return [row.tobytes() for row in flat.numpy()]
+
+
+def kept_photos(replay: Replay, shots: Shots, places: np.ndarray, total: int, most: int) -> Replay:
     """The photos that are kept with new ones among them: every so many-th view of all, the step a power of two.
 
     Args:
         replay: Those kept so far.
         shots: The new ones.
-        first: Number of the first of them among all views.
+        places: ``[s]`` which of all views each of them shows; of one that was kept already, the first stays.
+        total: Views in all.
         most: Most photos that are kept.
     """
-    views = np.concatenate([replay.views, first + np.arange(len(shots))])
-    step = 1
-    while most and np.count_nonzero(views % step == 0) > most:
+    numbers, rows = np.unique(places, return_index=True)
+    fresh = ~np.isin(numbers, replay.views)
+    views, step = np.concatenate([replay.views, numbers[fresh]]), 1
+    while most and -(-total // step) > most:  # of all views, so that the batches' sizes do not matter
         step *= 2
     stays = (views % step == 0) & (most > 0)
-    new = np.rint(shots.images[stays[len(replay) :]] * 255).astype(np.uint8)
-    return Replay(np.concatenate([replay.images[stays[: len(replay)]], new]), views[stays])
+    if most and not stays.any():  # earlier views came without photos
+        stays[np.argmax(views)] = True
+    old, new = stays[: len(replay)], stays[len(replay) :]
+    images = np.rint(shots.images[rows[fresh][new]] * 255).astype(np.uint8)
+    order = np.argsort(views[stays])
+    return Replay(np.concatenate([replay.images[old], images])[order], views[stays][order])

@@ -22,6 +22,9 @@ from gsmerge.stored.divide import divide_all
 from gsmerge.stored.encoded import Encoded, StoredSettings, without_members
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
+POOLED: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by
+NO_FLOOR = 1e-3  # of the footprints of members that are children
+
 
 @dataclass(frozen=True, eq=False)
 class Replay:
@@ -73,7 +76,6 @@ class OnlineState:
         cameras: All views so far, canonical, at the size of the first batch.
         replay: Photos of some of them.
         settings: As of an encoded scene.
-        rule: How children are pooled.
         about: Options, batches, version; plain JSON types.
     """
 
@@ -83,7 +85,6 @@ class OnlineState:
     cameras: Cameras
     replay: Replay
     settings: StoredSettings
-    rule: Rule
     about: Mapping[str, Any]
 
     def __len__(self) -> int:
@@ -137,8 +138,7 @@ def from_encoded(encoded: Encoded) -> OnlineState:
     batch = {"num_views": len(cameras), "num_input": settings.num_input, "num_new": len(encoded)}
     batch |= {"num_covered": 0, "num_joined": 0, "num_hidden": 0, "num_groups": len(encoded)}
     about = {"gsmerge": __version__, "options": options, "batches": [batch]}
-    rule: Rule = "paper" if options.get("rule") == "paper" else "depth"
-    return OnlineState(parts, encoded.kept, encoded.frame, cameras, replay, settings, rule, about)
+    return OnlineState(parts, encoded.kept, encoded.frame, cameras, replay, settings, about)
 
 
 def moments_of(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -162,9 +162,10 @@ def owning(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
 
 
 def part_members(parts: Parts) -> Members:
-    """The children as members of their groups."""
+    """The children as members of their groups, their least size already in them."""
     sizes = parts.features.starts.diff()
-    return gaussian_members(parts.children, parts.features.footprints.repeat_interleave(sizes).numpy())
+    footprints = NO_FLOOR * parts.features.footprints.repeat_interleave(sizes)
+    return gaussian_members(parts.children, footprints.numpy())
 
 
 def pick(parts: Parts, rows: Tensor) -> Parts:
@@ -184,13 +185,13 @@ def joined(parts: list[Parts]) -> Parts:
     return Parts(features, children, solved, held)
 
 
-def thinned(parts: Parts, most: int, rule: Rule = "depth") -> Parts:
+def thinned(parts: Parts, most: int) -> Parts:
     """Groups with at most ``most`` children each, those of larger ones pooled."""
     crowded = torch.nonzero(parts.features.starts.diff() > most)[:, 0]
     if len(crowded) == 0:
         return parts
     few = pick(parts, crowded)
-    children, parents = divide(few.features, part_members(few), np.full(len(few), most), rule)
+    children, parents = divide(few.features, part_members(few), np.full(len(few), most), POOLED)
     return swapped(parts, crowded, replace(few, features=owning(few.features, parents), children=children))
 
 
@@ -202,12 +203,11 @@ def swapped(parts: Parts, rows: Tensor, others: Parts) -> Parts:
 
 
 def with_solved(parts: Parts) -> Parts:
-    """Groups and children in the colours that fit the photos."""
-    offsets = parts.solved - parts.features.sh0
-    sizes = parts.features.starts.diff()
-    features = replace(parts.features, sh0=parts.solved)
-    children = replace(parts.children, sh0=parts.children.sh0 + offsets.repeat_interleave(sizes, 0))
-    return replace(parts, features=features, children=children)
+    """Groups in the colours that fit the photos.
+
+    Children keep theirs: what is solved makes up for what one Gaussian blurs, and more of them blur less.
+    """
+    return replace(parts, features=replace(parts.features, sh0=parts.solved))
 
 
 def as_encoded(state: OnlineState, *, solved: bool = True) -> Encoded:
@@ -215,13 +215,13 @@ def as_encoded(state: OnlineState, *, solved: bool = True) -> Encoded:
 
     Args:
         state: Of one or more batches.
-        solved: Colours that fit the photos; otherwise as they came.
+        solved: Groups in colours that fit the photos; otherwise as they came.
     """
     parts = with_solved(state.parts) if solved else state.parts
     features, members = parts.features, part_members(parts)
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, members, state.settings.most, state.rule),
+        division=divide_all(features, members, state.settings.most, POOLED),
         kept=state.kept,
         frame=state.frame,
         cameras=state.cameras,

@@ -44,9 +44,9 @@ def test_higher_harmonics_are_not_copied() -> None:
     assert members.shN.__array_interface__["data"][0] == g.gaussians.shN.data_ptr()
 
 
-def test_of_many_gaussians_few_views_at_once(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_gaussians_one_view_at_a_time(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for many in (0, 10**9):
-        monkeypatch.setattr("gsmerge.contribution.MANY", many)
+        monkeypatch.setattr("gsmerge.contribution.ONE_AT_A_TIME", many)
         found.append(compact(loose.loosened(scene), fit="none", density=0.1, unseen="keep").gaussians)
     assert scenes.identical(found[0], found[1])

@@ -1,0 +1,116 @@
+"""Made scenes whose views arrive in batches, and states that were made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import numpy as np
+import scenes
+import torch
+
+from gsmerge import Compactor, PixelScene
+from gsmerge.merge import take
+from gsmerge.online.state import OnlineState, Parts
+from gsmerge.types import SH_C0, Gaussians
+
+FAST: dict[str, Any] = {"density": 0.1, "robust": False, "checkpoint": "none"}
+
+
+def room(num_views: int = 6, width: int = 36, height: int = 24, **settings: Any) -> PixelScene:
+    """Views side by side of a ball before a wall."""
+    return scenes.make_scene(scenes.room(), scenes.arc(num_views, width, height), noise=0.005, **settings)
+
+
+def parts_of(scene: PixelScene, size: int, *, backwards: bool = False) -> list[PixelScene]:
+    """The scene's views in batches of a size, the first or the last first."""
+    found = [
+        scenes.take_views(scene, range(first, min(first + size, len(scene)))) for first in range(0, len(scene), size)
+    ]
+    return found[::-1] if backwards else found
+
+
+def fed(batches: Iterable[PixelScene], **settings: Any) -> Compactor:
+    """What becomes of batches, one after the other."""
+    compactor = Compactor(**{**FAST, **settings})
+    for batch in batches:
+        compactor.extend(batch)
+    return compactor
+
+
+def state_of(compactor: Compactor) -> OnlineState:
+    """The state, which must be there."""
+    assert compactor.state is not None
+    return compactor.state
+
+
+def same_state(one: OnlineState, other: OnlineState) -> None:
+    """To the last bit, and in everything that is told."""
+    same_parts(one.parts, other.parts)
+    assert (one.kept is None) == (other.kept is None)
+    if one.kept is not None and other.kept is not None:
+        assert scenes.identical(one.kept, other.kept)
+    assert torch.equal(one.frame.origin, other.frame.origin)
+    assert one.frame.unit == other.frame.unit
+    for name in ("viewmats", "Ks"):
+        assert torch.equal(getattr(one.cameras, name), getattr(other.cameras, name)), name
+    assert (one.cameras.width, one.cameras.height) == (other.cameras.width, other.cameras.height)
+    np.testing.assert_array_equal(one.replay.images, other.replay.images)
+    np.testing.assert_array_equal(one.replay.views, other.replay.views)
+    assert asdict(one.settings) == asdict(other.settings)
+    assert one.about == other.about
+
+
+def same_parts(one: Parts, other: Parts) -> None:
+    """To the last bit, types included."""
+    for f in fields(one.features):
+        a, b = getattr(one.features, f.name), getattr(other.features, f.name)
+        assert a.dtype == b.dtype, f.name
+        assert torch.equal(a, b), f.name
+    assert scenes.identical(one.children, other.children)
+    assert torch.equal(one.solved, other.solved)
+    assert torch.equal(one.held, other.held)
+
+
+def group(parts: Parts, row: int) -> tuple[dict[str, torch.Tensor], Gaussians]:
+    """One group's columns and its children."""
+    one = take(parts.features, torch.tensor([row]))
+    names = [f.name for f in fields(one) if f.name not in ("starts", "members")]
+    columns = {name: getattr(one, name) for name in names}
+    return columns | {"solved": parts.solved[row], "held": parts.held[row]}, parts.children[one.members]
+
+
+def same_group(one: Parts, row: int, other: Parts, place: int) -> bool:
+    """Whether a group of one is a group of the other, to the last bit."""
+    (columns, children), (others, those) = group(one, row), group(other, place)
+    return scenes.identical(children, those) and all(torch.equal(columns[name], others[name]) for name in columns)
+
+
+def random_gaussians(count: int, seed: int, *, size: tuple[float, float] = (0.01, 0.2), degree: int = 0) -> Gaussians:
+    """Gaussians of any shape, turned at random, before and beside the cameras of :func:`scenes.arc`."""
+    rng = np.random.default_rng(seed)
+    turns = rng.normal(size=(count, 4))
+    low, high = np.log(size)
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values.astype(np.float32))
+
+    return Gaussians(
+        means=tensor(rng.uniform([-4, -4, -2], [4, 4, 6], (count, 3))),
+        quats=tensor(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
+        scales=tensor(np.exp(rng.uniform(low, high, (count, 3)))),
+        opacities=tensor(rng.uniform(0.05, 0.99, count)),
+        sh0=tensor(rng.uniform(-1, 1, (count, 1, 3)) / SH_C0 / 2),
+        shN=tensor(rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)) / 9),
+    )
+
+
+def repainted(scene: PixelScene, images: torch.Tensor) -> PixelScene:
+    """The scene with other photos."""
+    return replace(scene, images=images.float())
+
+
+def counts(reports: Sequence[Any], name: str) -> list[int]:
+    """One number of every report."""
+    return [getattr(report, name) for report in reports]

@@ -1,0 +1,462 @@
+"""``extend`` and ``decode`` of states, on scenes that the project makes itself; and whatever may happen meanwhile."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file, save_file
+
+import gsmerge
+from gsmerge.cli import main
+from gsmerge.online.file import FORMAT, load_state
+
+from .conftest import Outcome, Run, listing
+
+SMALL = ("--superpixels", 60, "--no-robust", "--checkpoint", "none")
+PATIENCE = 120  # seconds, on a machine that is busy with other things
+
+
+@pytest.fixture(scope="session")
+def walks(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two scenes of the same room, three and four views of 48 x 32. Read only."""
+    folder = tmp_path_factory.mktemp("walks")
+    return [make_scene(folder / f"walk{n}", num_views=3 + n, width=48, height=32, seed=0) for n in range(2)]
+
+
+@pytest.fixture(scope="session")
+def states(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The states after one and after two batches. Read only."""
+    folder = tmp_path_factory.mktemp("states")
+    assert main(["extend", str(folder / "1.gsm"), str(walks[0]), *map(str, SMALL), "--quiet"]) == 0
+    shutil.copy(folder / "1.gsm", folder / "2.gsm")
+    assert main(["extend", str(folder / "2.gsm"), str(walks[1]), "--quiet"]) == 0
+    return [folder / "1.gsm", folder / "2.gsm"]
+
+
+@pytest.fixture(scope="session")
+def encoded(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first scene, encoded. Read only."""
+    out = tmp_path_factory.mktemp("encoded") / "scene.gsm"
+    assert main(["encode", str(walks[0]), "-o", str(out), *map(str, SMALL), "--quiet"]) == 0
+    return out
+
+
+@pytest.fixture
+def state(states: list[Path], tmp_path: Path) -> Path:
+    """A state of one batch that a test may spoil."""
+    (tmp_path / "work").mkdir()
+    return Path(shutil.copy(states[0], tmp_path / "work" / "state.gsm"))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file."""
+    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def assert_refused(outcome: Outcome, code: int, words: str) -> None:
+    """One line on stderr, and nothing else."""
+    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (code, "", 1), outcome.err
+    assert outcome.err.startswith("gsmerge: error: ")
+    assert words in outcome.err
+    assert "Traceback" not in outcome.err
+
+
+# batches
+
+
+def test_a_first_batch_makes_the_file(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    outcome = run("extend", tmp_path / "state.gsm", walks[0], *SMALL)
+    assert (outcome.code, outcome.out.count("\n")) == (0, 1), outcome.err
+    assert "state.gsm: batch 1, 3 views, 4,608 Gaussians ->" in outcome.out
+    assert list(listing(tmp_path)) == ["state.gsm"]
+    assert (tmp_path / "state.gsm").read_bytes() == states[0].read_bytes()
+
+
+def test_a_further_batch_is_added(states: list[Path], state: Path, walks: list[Path], run: Run) -> None:
+    outcome = run("extend", state, walks[1], "--threads", 1)
+    assert outcome.code == 0, outcome.err
+    assert "state.gsm: batch 2, 4 views" in outcome.out
+    assert state.read_bytes() == states[1].read_bytes()
+
+
+def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL)
+    assert (outcome.code, outcome.out.count("\n")) == (0, 2), outcome.err
+    assert [line.split(",")[0][-1] for line in outcome.out.splitlines()] == ["1", "2"]
+    assert (tmp_path / "state.gsm").read_bytes() == states[1].read_bytes()
+
+
+def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: Run) -> None:
+    state = tmp_path / "state.gsm"
+    outcome = run("extend", state, *walks, *SMALL, "--json")
+    assert (outcome.code, outcome.err) == (0, "")
+    batches = json.loads(outcome.out)["batches"]
+    assert [one["state"]["num_batches"] for one in batches] == [1, 2]
+    assert batches[1]["state"]["bytes"] == state.stat().st_size
+    for one, walk, num_views in zip(batches, walks, (3, 4), strict=True):
+        assert one["schema_version"] == 1
+        assert one["tool"]["version"] == gsmerge.__version__
+        assert Path(one["input"]["path"]) == walk / "scene.ply"
+        assert one["num_input"] == num_views * 48 * 32
+        assert one["num_groups"] > 0
+        assert one["options"]["superpixels"] == 60
+        assert {"load", "read", "write"} <= set(one["seconds"])
+        assert min(one["seconds"].values()) >= -1e-3
+        assert one["notes"] == []
+    assert "import" in batches[0]["seconds"]
+    assert "import" not in batches[1]["seconds"]
+    numbers = ("num_views", "num_input", "num_new", "num_covered", "num_joined", "num_hidden", "num_groups")
+    assert load_state(state).about["batches"] == [{name: one[name] for name in numbers} for one in batches]
+
+
+def test_quiet_says_nothing(state: Path, walks: list[Path], run: Run) -> None:
+    outcome = run("extend", state, walks[1], "--quiet")
+    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+
+
+def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run: Run) -> None:
+    state = tmp_path / "state.gsm"
+    told = (*SMALL, "--fit", "none", "--tolerance", 0, "--max-k", 2, "--replay", 2, "--seed", 5)
+    assert run("extend", state, walks[0], *told).code == 0
+    first = load_state(state).about["options"]
+    document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]
+    assert document["num_covered"] == 0
+    same = {"superpixels": 60, "fit": "none", "tolerance": 0.0, "max_k": 2, "replay": 2, "seed": 5, "robust": False}
+    assert same.items() <= first.items()
+    assert same.items() <= document["options"].items()
+    assert len(load_state(state).replay) <= 2
+    document = json.loads(run("extend", state, walks[0], "--tolerance", 0.5, "--json").out)["batches"][0]
+    assert (document["options"]["tolerance"], document["options"]["superpixels"]) == (0.5, 60)
+    assert document["num_covered"] > 0
+
+
+def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
+    state = Path(shutil.copy(encoded, tmp_path / "state.gsm"))
+    outcome = run("extend", state, walks[1])
+    assert outcome.code == 0, outcome.err
+    assert "batch 2, 4 views" in outcome.out
+    assert len(load_state(state).replay) == 4
+    assert run("decode", state, "--fit", "color", "-o", tmp_path / "a.ply").code == 0
+
+
+def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
+    scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
+    moved = shutil.move(scene / "transforms.json", tmp_path / "poses.json")
+    told = ("--cameras", moved, "--images", scene / "images")
+    assert run("extend", state, scene / "scene.ply", *told).code == 0
+    refused = run("extend", state, scene / "scene.ply", walks[0], *told)
+    assert_refused(refused, 2, "--cameras and --images: expected one batch with them, got several")
+
+
+# decoding
+
+
+def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, run: Run) -> None:
+    groups, found = len(load_state(states[1])), []
+    for k in (1, 2, 4):
+        outcome = run("decode", states[1], "--k", k, "--fit", "none", "-o", tmp_path / f"{k}.ply")
+        assert (outcome.code, outcome.out.count("\n")) == (0, 1), outcome.err
+        found.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
+    assert found == sorted(found)
+    assert found[0] <= groups < found[2] <= 4 * groups
+    told = ("--budget", groups + 40, "--fit", "none", "-o", tmp_path / "b.ply", "--json")
+    document = json.loads(run("decode", states[1], *told).out)
+    assert groups < document["output"]["num_gaussians"] <= groups + 40
+    assert document["fit"] is None
+    assert document["input"]["num_groups"] == groups
+    assert document["input"]["num_gaussians_encoded"] == 7 * 48 * 32
+
+
+def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, run: Run) -> None:
+    told = ("--fit-steps", 4)
+    for fit in ((), ("--fit", "full"), ("--fit", "color")):
+        out = tmp_path / f"{len(listing(tmp_path))}.ply"
+        outcome = run("decode", states[1], *fit, *told, "-o", out, "--json")
+        assert (outcome.code, outcome.err) == (0, "")
+        document = json.loads(outcome.out)
+        assert document["fit"]["method"] in {"full", "color", "none"}
+        assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
+    assert (tmp_path / "0.ply").read_bytes() == (tmp_path / "1.ply").read_bytes()  # the full one, unless told
+
+
+def test_decoding_twice_gives_the_same_bytes(states: list[Path], tmp_path: Path, run: Run) -> None:
+    for threads in (1, 2):
+        told = ("--fit-steps", 4, "--threads", threads, "-o", tmp_path / f"{threads}.ply")
+        assert run("decode", states[1], *told).code == 0
+    assert (tmp_path / "1.ply").read_bytes() == (tmp_path / "2.ply").read_bytes()
+
+
+def test_a_dry_run_of_decode_writes_nothing(states: list[Path], tmp_path: Path, run: Run) -> None:
+    before = digests(states[1].parent)
+    outcome = run("decode", states[1], "--k", 2, "-o", tmp_path / "a.ply", "--dry-run")
+    assert outcome.code == 0
+    assert "would write" in outcome.out
+    most = json.loads(run("decode", states[1], "--k", 2, "-o", tmp_path / "a.ply", "--dry-run", "--json").out)
+    assert most["dry_run"] is True
+    assert listing(tmp_path) == {}
+    assert digests(states[1].parent) == before
+    assert run("decode", states[1], "--k", 2, "--fit", "none", "-o", tmp_path / "a.ply").code == 0
+    assert len(gsmerge.read_ply(tmp_path / "a.ply").gaussians) <= most["output"]["num_gaussians_at_most"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--k", "8"), "k: expected 1 to 4"),
+        (("--k", "2", "--budget", "900"), "expected one of k and budget"),
+        (("--budget", "3"), "one for each group"),
+        (("--fit", "some"), "--fit"),
+    ],
+)
+def test_wrong_decoding_is_one_line(
+    arguments: tuple[str, ...], words: str, states: list[Path], tmp_path: Path, run: Run
+) -> None:
+    assert_refused(run("decode", states[1], *arguments, "-o", tmp_path / "a.ply"), 2, words)
+    assert listing(tmp_path) == {}
+
+
+@pytest.mark.parametrize("fit", ["color", "full"])
+def test_an_encoded_scene_has_no_photos(fit: str, encoded: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("decode", encoded, "--fit", fit, "-o", tmp_path / "a.ply")
+    assert_refused(outcome, 2, f"fit {fit}: expected a state with photos, found none")
+    assert listing(tmp_path) == {}
+    assert run("decode", encoded, "-o", tmp_path / "a.ply").code == 0
+
+
+# wrong usage
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--fit", "full"), "--fit"),
+        (("--tolerance", "2"), "--tolerance"),
+        (("--max-k", "9"), "--max-k"),
+        (("--replay", "-1"), "--replay"),
+        (("--density", "0"), "density"),
+        (("--budget", "many"), "budget"),
+        (("--dialect", "nobody"), "dialect"),
+    ],
+)
+def test_wrong_usage_is_one_line(
+    arguments: tuple[str, ...], words: str, state: Path, walks: list[Path], run: Run
+) -> None:
+    before = digests(state.parent)
+    assert_refused(run("extend", state, walks[1], *arguments), 2, words)
+    assert digests(state.parent) == before
+
+
+def test_no_batch_is_wrong_usage(state: Path, run: Run) -> None:
+    assert_refused(run("extend", state), 2, "SCENE")
+
+
+def test_the_state_is_never_the_input(scene_copy: Path, run: Run) -> None:
+    before = digests(scene_copy)
+    assert_refused(run("extend", scene_copy / "scene.ply", scene_copy, *SMALL), 2, "other than the input")
+    assert_refused(run("extend", scene_copy / "transforms.json", scene_copy, *SMALL), 2, "other than the input")
+    assert digests(scene_copy) == before
+
+
+def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
+    from dataclasses import replace
+
+    import torch
+
+    scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
+    have = gsmerge.read_ply(scene / "scene.ply").gaussians
+    degree = 1 if have.sh_degree == 0 else 0
+    other = replace(have, shN=torch.zeros(len(have), (degree + 1) ** 2 - 1, 3))
+    gsmerge.write_ply(scene / "scene.ply", other, overwrite=True)
+    before = state.read_bytes()
+    assert_refused(run("extend", state, scene), 2, f"harmonics of degree {have.sh_degree} as the state's")
+    assert state.read_bytes() == before
+
+
+# what may go wrong
+
+
+def newer(path: Path) -> None:
+    """A state of a version to come."""
+    size = int.from_bytes(path.read_bytes()[:8], "little")
+    told = json.loads(json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"][FORMAT])
+    save_file(load_file(path), path, {FORMAT: json.dumps(told | {"schema": 9, "gsmerge": "9.9"})})
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "newer": (newer, "expected schema 1, found 9; written by gsmerge 9.9"),
+    "half": (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "could not read it"),
+    "empty": (lambda path: path.write_bytes(b""), "state.gsm"),
+    "another file": (lambda path: path.write_text("ply\nformat ascii 1.0\n"), "could not read it"),
+    "networks": (lambda path: save_file(load_file(path), path, {"gsmerge-networks": "{}"}), "another safetensors file"),
+}
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGE))
+@pytest.mark.parametrize("command", ["extend", "decode"])
+def test_a_damaged_state_is_told(damage: str, command: str, state: Path, walks: list[Path], run: Run) -> None:
+    spoil, words = DAMAGE[damage]
+    spoil(state)
+    before = digests(state.parent)
+    assert_refused(run(command, state, *([walks[1]] if command == "extend" else [])), 3, words)
+    assert digests(state.parent) == before
+
+
+def test_a_half_written_scene_is_told(state: Path, scene_copy: Path, run: Run) -> None:
+    ply = scene_copy / "scene.ply"
+    ply.write_bytes(ply.read_bytes()[:-5000])
+    before = digests(state.parent), digests(scene_copy)
+    assert_refused(run("extend", state, scene_copy), 3, "scene.ply")
+    assert (digests(state.parent), digests(scene_copy)) == before
+
+
+def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    broken = Path(shutil.copytree(walks[1], tmp_path / "broken"))
+    (broken / "scene.ply").write_bytes(b"ply\n")
+    outcome = run("extend", tmp_path / "state.gsm", walks[0], broken, *SMALL)
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1)
+    assert (tmp_path / "state.gsm").read_bytes() == states[0].read_bytes()
+    assert run("extend", tmp_path / "state.gsm", walks[1]).code == 0
+    assert (tmp_path / "state.gsm").read_bytes() == states[1].read_bytes()
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_broken_first_batch_makes_no_file(there: bool, scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    if there:
+        (scene_copy / "scene.ply").write_bytes(b"")
+    else:
+        shutil.rmtree(scene_copy)
+    outcome = run("extend", tmp_path / "state.gsm", scene_copy)
+    assert_refused(outcome, 3, "")
+    assert not (tmp_path / "state.gsm").exists()
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize("name", ["nowhere/state.gsm", "file/state.gsm", "folder"])
+def test_places_that_cannot_be_written(name: str, walks: list[Path], tmp_path: Path, run: Run) -> None:
+    (tmp_path / "file").write_text("precious")
+    (tmp_path / "folder").mkdir()
+    before = digests(tmp_path)
+    assert_refused(run("extend", tmp_path / name, walks[0], *SMALL), 3, str(tmp_path / name))
+    assert digests(tmp_path) == before
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that nobody can write in")
+def test_a_folder_that_nobody_can_write_in(walks: list[Path], run: Run) -> None:
+    assert_refused(run("extend", "/proc/self/state.gsm", walks[0], *SMALL), 3, "cannot be written (")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_without_permission(state: Path, walks: list[Path], run: Run) -> None:
+    before = state.read_bytes()
+    state.parent.chmod(0o500)
+    try:
+        assert_refused(run("extend", state, walks[1]), 3, "cannot be written")
+        assert state.read_bytes() == before
+    finally:
+        state.parent.chmod(0o700)
+
+
+def test_a_state_that_another_process_changes_meanwhile(
+    state: Path, states: list[Path], walks: list[Path], run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is left as the other one made it."""
+    import gsmerge.online.files as files
+
+    extended = files.extend
+
+    def slowly(*arguments: object, **named: object) -> object:
+        done = extended(*arguments, **named)  # type: ignore[arg-type]
+        shutil.copy(states[1], state.parent / "other.gsm")
+        (state.parent / "other.gsm").replace(state)
+        return done
+
+    monkeypatch.setattr(files, "extend", slowly)
+    assert_refused(run("extend", state, walks[1]), 3, "was changed by another process meanwhile")
+    assert state.read_bytes() == states[1].read_bytes()
+    assert list(listing(state.parent)) == ["state.gsm"]
+
+
+def test_a_state_that_another_process_makes_meanwhile(
+    states: list[Path], walks: list[Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import gsmerge.online.files as files
+
+    extended, state = files.extend, tmp_path / "state.gsm"
+
+    def slowly(*arguments: object, **named: object) -> object:
+        shutil.copy(states[1], state)
+        return extended(*arguments, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(files, "extend", slowly)
+    assert_refused(run("extend", state, walks[0], *SMALL), 3, "state.gsm")
+    assert state.read_bytes() == states[1].read_bytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of files as Linux has them")
+def test_a_full_disk_leaves_the_old_state(state: Path, states: list[Path], walks: list[Path], run: Run) -> None:
+    """No file may grow beyond a size, as on a disk that fills up."""
+    limit = state.stat().st_size // 2
+    code = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))\n"
+    code += "import sys; from gsmerge.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "extend", str(state), str(walks[1])]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (3, "", 1), done.stderr
+    assert "state.gsm: could not be written (" in done.stderr
+    assert list(listing(state.parent)) == ["state.gsm"]
+    assert state.read_bytes() == states[0].read_bytes()
+    assert run("extend", state, walks[1]).code == 0
+    assert state.read_bytes() == states[1].read_bytes()
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="signals as Linux has them")
+def test_killed_in_the_middle(state: Path, states: list[Path], walks: list[Path], run: Run) -> None:
+    """While it works, then right when it writes: the old state stays whole, and a rerun gives the usual bytes."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gsmerge", "extend", str(state), str(walks[1]), "--quiet"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    deadline = time.monotonic() + PATIENCE
+    while len(listing(state.parent)) == 1 and process.poll() is None:  # until the temporary file is there
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert state.read_bytes() == states[0].read_bytes()
+    code = (
+        "import os, signal, sys\n"
+        "import gsmerge.online.files as files\n"
+        "from gsmerge.cli import main\n"
+        "saved = files.save_state\n"
+        "def save(path, state, **named):\n"
+        "    saved(path, state, **named)\n"
+        "    os.truncate(path, 1000)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "files.save_state = save\n"
+        "main(sys.argv[1:])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "extend", str(state), str(walks[1])], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert state.read_bytes() == states[0].read_bytes()
+    assert run("extend", state, walks[1]).code == 0
+    assert state.read_bytes() == states[1].read_bytes()
+
+
+def test_no_input_was_ever_damaged(walks: list[Path], make_scene: Callable[..., Path], tmp_path: Path) -> None:
+    """After everything above: the scenes are what they were made."""
+    for number, walk in enumerate(walks):
+        fresh = make_scene(tmp_path / f"walk{number}", num_views=3 + number, width=48, height=32, seed=0)
+        wanted = {path.relative_to(fresh): path.read_bytes() for path in fresh.rglob("*") if path.is_file()}
+        found = {path.relative_to(walk): path.read_bytes() for path in walk.rglob("*") if path.is_file()}
+        assert found == wanted

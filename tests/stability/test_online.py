@@ -1,0 +1,126 @@
+"""Views that arrive in batches (method reference, case 53): fed twice, in reverse, in batches of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+from arriving import fed, parts_of, state_of
+from safetensors.torch import load_file, save_file
+
+from gsmerge import Compactor, PixelScene, SceneError
+from gsmerge.stored.parts import SCHEMA
+
+SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
+FULL = {"fit": "full", "fit_steps": 30}
+
+
+@pytest.fixture(scope="module")
+def made() -> list[PixelScene]:
+    """Three scenes of six views."""
+    return [scenes.make_scene(shape(), scenes.arc(6, 48, 36), noise=0.005) for shape in SHAPES.values()]
+
+
+def psnrs(compactors: Sequence[Compactor], made: Sequence[PixelScene], **wish: Any) -> np.ndarray:
+    """PSNR (dB) of each over all of its scene's views, those of later batches and of earlier ones."""
+    return np.array([scenes.psnr_of(c.decode(**wish), scene) for c, scene in zip(compactors, made, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def forward(made: list[PixelScene]) -> list[Compactor]:
+    return [fed(parts_of(scene, 2)) for scene in made]
+
+
+# 53: the same batch twice
+
+
+def test_a_batch_fed_twice(made: list[PixelScene]) -> None:
+    """Count within 2 %, quality within 0.2 dB in every scene."""
+    once = [fed([scene]) for scene in made]
+    twice = [fed([scene, scene]) for scene in made]
+    for one, two in zip(once, twice, strict=True):
+        assert len(one) <= len(two) <= 1.02 * len(one)
+    for wish in ({"fit": "none"}, {"fit": "color"}, FULL):
+        difference = psnrs(twice, made, **wish) - psnrs(once, made, **wish)
+        assert difference.min() > -0.2, wish
+
+
+def test_batches_fed_again_and_again(made: list[PixelScene]) -> None:
+    """Three times over all batches: what is there is enough after the first."""
+    batches = parts_of(made[0], 2)
+    rounds = [len(fed(batches * times)) for times in (1, 2, 3)]
+    assert rounds[1] <= 1.15 * rounds[0]
+    assert rounds[2] - rounds[1] <= max(0.05 * rounds[0], rounds[1] - rounds[0])
+
+
+# 53: batches in reverse
+
+
+@pytest.mark.parametrize("wish", [{"fit": "none"}, {"fit": "color"}, FULL], ids=str)
+def test_batches_in_reverse(wish: dict[str, Any], made: list[PixelScene], forward: list[Compactor]) -> None:
+    """Within 0.2 dB on average over the scenes, 0.5 dB in each: tiny ones, of some 260 Gaussians."""
+    backward = [fed(parts_of(scene, 2, backwards=True)) for scene in made]
+    for one, other in zip(forward, backward, strict=True):
+        assert abs(len(one) - len(other)) < 0.08 * len(one)
+    difference = psnrs(backward, made, **wish) - psnrs(forward, made, **wish)
+    assert abs(difference.mean()) < 0.2
+    assert np.abs(difference).max() < 0.5
+
+
+# 53: batches of any size
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("wish", [{"fit": "color"}, FULL], ids=str)
+def test_batches_of_any_size(size: int, wish: dict[str, Any], made: list[PixelScene]) -> None:
+    """For as many Gaussians, no more than 0.3 dB below all views at once, on average over the scenes.
+
+    The fewer the groups that batches leave, the more of these are divided: equal numbers are what compares.
+    """
+    whole, batched = [fed([scene]) for scene in made], [fed(parts_of(scene, size)) for scene in made]
+    difference = []
+    for scene, one, other in zip(made, whole, batched, strict=True):
+        count = int(1.5 * len(one))
+        assert len(other) <= 1.1 * len(one)
+        found = [scenes.psnr_of(c.decode(budget=count, **wish), scene) for c in (one, other)]
+        difference.append(found[1] - found[0])
+    assert np.mean(difference) > -0.3
+
+
+def test_as_they_come_batches_need_no_more_gaussians(made: list[PixelScene], forward: list[Compactor]) -> None:
+    """Decoded at K = 1, pairs of views give fewer Gaussians than all at once, and at most 0.6 dB less."""
+    whole = [fed([scene]) for scene in made]
+    assert all(0.8 * len(one) < len(two) < len(one) for one, two in zip(whole, forward, strict=True))
+    difference = psnrs(forward, made, fit="color") - psnrs(whole, made, fit="color")
+    assert difference.mean() > -0.6
+
+
+# 53: the file is versioned
+
+
+def test_a_file_of_another_version_is_refused(forward: list[Compactor], tmp_path: Path) -> None:
+    path = tmp_path / "state.gsm"
+    forward[0].save(path)
+    text = path.read_bytes()
+    assert f'\\"schema\\": {SCHEMA}'.encode() in text
+    path.write_bytes(text.replace(f'\\"schema\\": {SCHEMA}'.encode(), f'\\"schema\\": {SCHEMA + 1}'.encode()))
+    with pytest.raises(SceneError, match=f"expected schema {SCHEMA}, found {SCHEMA + 1}.* update it"):
+        Compactor.load(path)
+    save_file(load_file(path), path)
+    with pytest.raises(SceneError, match="another safetensors file"):
+        Compactor.load(path)
+
+
+def test_the_same_views_again_are_none_that_are_new(made: list[PixelScene], tmp_path: Path) -> None:
+    """Neither their cameras nor their photos are kept twice, so that a limit on photos leaves room for others."""
+    one, two = (fed([made[0]] * times, replay=6) for times in (1, 2))
+    assert len(state_of(two).cameras) == 6
+    assert state_of(two).replay.views.tolist() == list(range(6))
+    np.testing.assert_array_equal(state_of(two).replay.images, state_of(one).replay.images)
+    for name, compactor in (("a.gsm", one), ("b.gsm", two)):
+        compactor.save(tmp_path / name)
+    assert (tmp_path / "b.gsm").stat().st_size < 1.02 * (tmp_path / "a.gsm").stat().st_size

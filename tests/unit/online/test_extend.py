@@ -1,0 +1,420 @@
+"""Batches of views, one after the other: what each does to the state, and what is decoded afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+from arriving import FAST, counts, fed, parts_of, room, same_parts, same_state, state_of
+from learned import noisy, written
+from loose import NO_CAMERAS, far_behind, loosened, shuffled
+
+from gsmerge import Compactor, Gaussians, LooseScene, PixelScene, decode_scene, encode_scene
+from gsmerge.errors import UsageError
+from gsmerge.fit import FitOptions, FitReport
+from gsmerge.online.extend import extend
+from gsmerge.online.fitted import decode_stored
+from gsmerge.online.state import OnlineState, from_encoded
+from gsmerge.options import CompactOptions
+
+Change = Callable[[PixelScene], PixelScene | LooseScene]
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return room()
+
+
+@pytest.fixture(scope="module")
+def pairs(scene: PixelScene) -> list[PixelScene]:
+    return parts_of(scene, 2)
+
+
+@pytest.fixture(scope="module")
+def first(pairs: list[PixelScene]) -> OnlineState:
+    """Of the first pair alone."""
+    return state_of(fed(pairs[:1]))
+
+
+def options(**settings: Any) -> CompactOptions:
+    return CompactOptions().with_settings({**FAST, "fit": "color", **settings})
+
+
+# the first batch
+
+
+@pytest.mark.parametrize("k", [1, 4])
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_first_batch_is_an_encoded_scene(robust: bool, k: int, scene: PixelScene) -> None:
+    """As many Gaussians, about the same ones: what is solid is told by the moments, in float32."""
+    settings = FAST | {"robust": robust}
+    found = fed([scene], fit="none", robust=robust).decode(k=k, fit="none")
+    wanted = decode_scene(encode_scene(scene, **settings), k=k)
+    scenes.assert_same_set(found, wanted, atol=5e-3, unit=0.05)
+
+
+def test_a_first_batch_with_networks(scene: PixelScene, tmp_path: Any) -> None:
+    checkpoint = str(written(tmp_path / "a.safetensors", noisy()))
+    for k in (1, 4):
+        found = fed([scene], fit="none", checkpoint=checkpoint).decode(k=k, fit="none")
+        wanted = decode_scene(encode_scene(scene, **FAST | {"checkpoint": checkpoint}), k=k)
+        scenes.assert_same_set(found, wanted, atol=5e-3, unit=0.05)
+
+
+def test_a_first_batch_keeps_its_frame_and_views(scene: PixelScene) -> None:
+    state = state_of(fed([scene]))
+    assert (len(state.cameras), state.cameras.width, state.cameras.height) == (6, 36, 24)
+    assert state.settings.num_input == scene.num_gaussians
+    assert state.replay.views.tolist() == list(range(6))
+    assert scene.images is not None
+    np.testing.assert_allclose(state.replay.images / 255, scene.images, atol=0.5 / 255 + 1e-6)
+
+
+def test_a_colour_fit_helps(scene: PixelScene) -> None:
+    fitted, plain = (fed(parts_of(scene, 2), fit=fit).decode(fit="none") for fit in ("color", "none"))
+    assert scenes.psnr_of(fitted, scene) > scenes.psnr_of(plain, scene)
+
+
+# further batches
+
+
+def test_reports_add_up(pairs: list[PixelScene]) -> None:
+    compactor = Compactor(**FAST)
+    reports = [compactor.extend(batch) for batch in pairs]
+    assert counts(reports, "num_views") == [2, 2, 2]
+    assert counts(reports, "num_input") == [2 * 36 * 24] * 3
+    groups = 0
+    for report in reports:
+        gone = report.num_covered + report.num_joined + report.num_hidden
+        groups += report.num_new - gone
+        assert report.num_groups == groups
+        assert all(seconds >= 0 for seconds in report.seconds.values())
+        assert report.options["density"] == FAST["density"]
+    assert groups == len(compactor) == len(state_of(compactor))
+    assert reports[0].num_covered == reports[0].num_joined == reports[0].num_hidden == 0
+    assert min(report.num_covered for report in reports[1:]) > 0
+    assert min(report.num_joined for report in reports[1:]) > 0
+    assert [batch["num_groups"] for batch in compactor.batches] == counts(reports, "num_groups")
+    assert state_of(compactor).settings.num_input == 6 * 36 * 24
+    assert len(state_of(compactor).cameras) == 6
+
+
+def test_stages_are_told(pairs: list[PixelScene]) -> None:
+    told: list[str] = []
+    compactor = Compactor(**FAST)
+    for batch in pairs[:2]:
+        compactor.extend(batch, progress=lambda stage, done, total: told.append(stage))
+    assert {"prepare", "segment", "encode", "match", "cover", "join", "fit"} <= {name.split(":")[0] for name in told}
+
+
+def test_the_old_state_is_left_as_it_is(pairs: list[PixelScene], first: OnlineState) -> None:
+    before = state_of(fed(pairs[:1]))
+    after, _ = extend(first, pairs[1], options())
+    assert after is not first
+    assert len(after) > len(first)
+    same_state(first, before)
+
+
+def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
+    once, twice = fed([scene]), fed([scene, scene])
+    assert len(twice) <= 1.02 * len(once)
+    one, other = (scenes.psnr_of(c.decode(fit="none"), scene) for c in (once, twice))
+    assert abs(one - other) < 0.2
+
+
+@pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=str)
+def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
+    states, found = [], []
+    for threads in (1, 2, 8):
+        compactor = fed(pairs, **settings, threads=threads)
+        states.append(state_of(compactor))
+        found.append(compactor.decode(fit="full", fit_steps=4, effort="fast"))
+    for one, gaussians in zip(states[1:], found[1:], strict=True):
+        same_state(replace(one, about={}), replace(states[0], about={}))
+        assert scenes.identical(gaussians, found[0])
+
+
+def test_the_same_seed_gives_the_same(pairs: list[PixelScene]) -> None:
+    one, other = fed(pairs, seed=3), fed(pairs, seed=3)
+    same_state(state_of(one), state_of(other))
+    fits = [c.decode(fit="full", fit_steps=4) for c in (one, other)]
+    assert scenes.identical(*fits)
+
+
+def test_the_settings_of_each_batch_are_its_own(pairs: list[PixelScene], first: OnlineState) -> None:
+    _, few = extend(first, pairs[1], options(superpixels=20))
+    _, many = extend(first, pairs[1], options(superpixels=60))
+    assert few.num_new < many.num_new
+
+
+# what batches may be
+
+
+def test_pictures_of_another_size(scene: PixelScene, first: OnlineState) -> None:
+    large = room(6, 54, 36)
+    state, report = extend(first, scenes.take_views(large, [2, 3]), options())
+    assert report.num_input == 2 * 54 * 36
+    assert (state.cameras.width, state.cameras.height) == (36, 24)
+    assert state.replay.images.shape == (4, 24, 36, 3)
+    assert report.num_covered + report.num_joined > 0.3 * report.num_new
+    gaussians = decode_stored(state, options=options().fit).gaussians
+    assert scenes.psnr_of(gaussians, scenes.take_views(scene, [2, 3])) > 18
+    single, _ = extend(first, scenes.take_views(scene, [2, 3]), options())
+    np.testing.assert_allclose(state.cameras.Ks, single.cameras.Ks, rtol=1e-9)
+
+
+def test_without_photos(pairs: list[PixelScene]) -> None:
+    """Pictures of the Gaussians' colours stand in for them, and nothing is fitted or kept."""
+    bare = [replace(pair, images=None) for pair in pairs]
+    compactor = fed(bare)
+    state = state_of(compactor)
+    assert len(state.replay) == 0
+    assert not state.parts.held.any()
+    assert len(compactor) < sum(len(fed([pair])) for pair in bare)
+    plain = compactor.decode()
+    assert scenes.identical(plain, compactor.decode(fit="none"))
+    with pytest.raises(UsageError, match="fit color: expected a state with photos, found none"):
+        compactor.decode(fit="color")
+
+
+@pytest.mark.parametrize("bare", [0, 1])
+def test_photos_of_some_batches(bare: int, pairs: list[PixelScene]) -> None:
+    batches = list(pairs[:2])
+    batches[bare] = replace(batches[bare], images=None)
+    compactor = fed(batches)
+    assert state_of(compactor).replay.views.tolist() == [[2, 3], [0, 1]][bare]
+    assert len(state_of(compactor).cameras) == 4
+    assert len(compactor.decode(fit="full", fit_steps=4)) > 50
+
+
+@pytest.mark.parametrize("change", [loosened, shuffled], ids=str)
+def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene]) -> None:
+    for batches in ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]]):
+        compactor = fed(batches)  # type: ignore[arg-type]
+        assert compactor.batches[1]["num_covered"] + compactor.batches[1]["num_joined"] > 0
+        both = scenes.take_views(room(), range(4))
+        assert scenes.psnr_of(compactor.decode(fit="color"), both) > 17
+
+
+def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
+    """Pictures are rendered of the Gaussians, and count for as long as it takes to make room for them."""
+    bare = [replace(loosened(pair), images=None) for pair in pairs[:2]]
+    compactor = fed(bare)  # type: ignore[arg-type]
+    assert len(state_of(compactor).replay) == 0
+    assert len(compactor.decode()) > 50
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene]) -> None:
+    """Views are placed for them."""
+    bare = LooseScene(pairs[0].gaussians, NO_CAMERAS, None, ())
+    compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
+    assert compactor.batches[1]["num_covered"] > 0
+    assert len(state_of(compactor).replay) == 2
+    assert scenes.psnr_of(compactor.decode(fit="color"), pairs[1]) > 17
+
+
+def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
+    batches = []
+    for pair in pairs[:2]:
+        loose = loosened(pair)
+        hidden = far_behind(loose.gaussians, 300)
+        batches.append(replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden])))
+    compactor = fed(batches, unseen="keep")  # type: ignore[arg-type]
+    kept = state_of(compactor).kept
+    assert kept is not None
+    num = len(kept)
+    for wish in ({"fit": "none"}, {"fit": "color"}, {"fit": "full", "fit_steps": 30}):
+        found = compactor.decode(**wish)
+        assert int((found.means[:, 2] < -10).sum()) == num, wish
+        wanted = len(compactor) + num + 60
+        assert len(compactor.decode(**wish, budget=wanted)) == pytest.approx(wanted, abs=2), wish
+
+
+def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
+    """A room far away: all is new, and what was there stays as it was."""
+    away = scenes.move(room(2), np.eye(3), 1.0, np.array([100.0, 0.0, 0.0]))
+    state, report = extend(first, away, options())
+    assert (report.num_covered, report.num_joined) == (0, 0)
+    assert len(state) == len(first) + report.num_new - report.num_hidden
+    before = replace(state, parts=first.parts)
+    pick = torch.arange(len(first))
+    from gsmerge.online.state import pick as picked
+
+    same_parts(picked(state.parts, pick), picked(before.parts, pick))
+
+
+def test_a_batch_without_a_valid_gaussian(pairs: list[PixelScene], first: OnlineState) -> None:
+    """Its photos count all the same."""
+    nothing = replace(pairs[1], valid=torch.zeros_like(pairs[1].valid))
+    state, report = extend(first, nothing, options())
+    assert (report.num_new, len(state)) == (0, len(first))
+    assert len(state.replay) == 4
+    assert scenes.identical(state.parts.children, first.parts.children)
+    with pytest.raises(ValueError, match="expected at least one valid Gaussian"):
+        Compactor(**FAST).extend(nothing)
+
+
+def test_one_view(scene: PixelScene) -> None:
+    compactor = fed(parts_of(scenes.take_views(scene, [0, 1]), 1))
+    assert len(state_of(compactor).cameras) == 2
+
+
+def test_an_encoded_scene_is_extended(pairs: list[PixelScene]) -> None:
+    encoded = encode_scene(pairs[0], **FAST)
+    state, report = extend(from_encoded(encoded), pairs[1], options())
+    assert report.num_covered + report.num_joined > 0
+    assert len(state) > len(encoded)
+    assert state.replay.views.tolist() == [2, 3]
+    assert [batch["num_views"] for batch in state.about["batches"]] == [2, 2]
+    other, _ = extend(state_of(fed(pairs[:1], fit="none")), pairs[1], options())
+    assert abs(len(state) - len(other)) < 0.1 * len(other)
+
+
+def test_everything_counts_without_a_tolerance(pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs, tolerance=0)
+    assert [batch["num_covered"] for batch in compactor.batches] == [0, 0, 0]
+    assert len(compactor) > len(fed(pairs))
+
+
+def test_higher_harmonics_of_the_same_degree() -> None:
+    compactor = fed(parts_of(room(2, degree=2), 1))
+    assert compactor.decode(fit="none").sh_degree == 2
+
+
+# decoding
+
+
+@pytest.mark.parametrize("fit", ["none", "color", "full"])
+def test_a_budget_is_met(fit: str, pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs)
+    wanted = len(compactor) + 60
+    steps = {"fit_steps": 6} if fit == "full" else {}
+    assert wanted - 3 <= len(compactor.decode(budget=wanted, fit=fit, **steps)) <= wanted
+    with pytest.raises(UsageError, match="one for each group"):
+        compactor.decode(budget=10, fit=fit)
+
+
+def test_every_k_up_to_the_most(pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs, max_k=2)
+    one, two = (compactor.decode(k=k, fit="none") for k in (1, 2))
+    assert len(compactor) >= len(one)
+    assert len(one) < len(two) <= 2 * len(compactor)
+    with pytest.raises(UsageError, match='expected 1 to 2 or "auto"'):
+        compactor.decode(k=3)
+    with pytest.raises(UsageError, match="one of k and budget"):
+        compactor.decode(k=1, budget=500)
+
+
+@pytest.mark.parametrize("rule", ["depth", "paper"])
+@pytest.mark.parametrize("fit", ["none", "color"])
+def test_more_children_show_more(rule: str, fit: str, scene: PixelScene, pairs: list[PixelScene]) -> None:
+    """Also where the colours that were solved are those of one Gaussian for each group, and nothing is fitted after."""
+    compactor = fed(pairs, rule=rule)
+    one, two, four = (scenes.psnr_of(compactor.decode(k=k, fit=fit), scene) for k in (1, 2, 4))
+    assert four > one
+    assert fit == "none" or four > two > one
+
+
+def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs)
+    color, full = compactor.decode(fit="color"), compactor.decode(fit="full", fit_steps=30)
+    assert scenes.psnr_of(full, scene) > scenes.psnr_of(color, scene) + 0.5
+    assert scenes.identical(compactor.decode(fit="full", fit_steps=30), full)
+
+
+def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsmerge.online import fitted
+
+    def refused(gaussians: Gaussians, *_: object) -> tuple[Gaussians, FitReport]:
+        return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")
+
+    monkeypatch.setattr(fitted, "fit", refused)
+    compactor = fed(pairs)
+    found = decode_stored(state_of(compactor), k=1, options=FitOptions(fit="color"))
+    assert found.fit is not None
+    assert not found.fit.accepted
+    assert [note for note in found.notes if "the fit was not accepted" in note]
+    assert scenes.identical(found.gaussians, compactor.decode(k=1, fit="none"))
+
+
+@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"max_bytes": "20KB"}], ids=str)
+def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs[:2], **settings)
+    own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))
+    assert abs(len(own) - len(compactor)) < 0.1 * len(own)
+    assert len(decode_stored(own, options=FitOptions(fit="color")).gaussians) >= len(own) - 5
+
+
+def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs)
+    compactor.decode(fit="full", fit_steps=4)
+    same_state(state_of(compactor), state_of(fed(pairs)))
+
+
+def test_results_are_in_the_world(scene: PixelScene) -> None:
+    turn, shift = scenes.random_rotation(0), np.array([30.0, -20.0, 10.0])
+    moved = scenes.move(scene, turn, 4.0, shift)
+    compactor = fed(parts_of(moved, 3))
+    for fit in ("none", "color"):
+        assert scenes.psnr_of(compactor.decode(fit=fit), moved) > 17
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"fit": "full"}, "fit full: goes with all photos together"),
+        ({"method": "voxel"}, "method voxel: goes with a whole scene"),
+        ({"levels": 2}, "levels: goes with a whole scene"),
+        ({"max_drop": 0.1}, "max drop: goes with a whole scene"),
+        ({"target_psnr": 20.0}, "target psnr: goes with a whole scene"),
+    ],
+)
+def test_what_a_state_cannot_have(settings: dict[str, Any], words: str, pairs: list[PixelScene]) -> None:
+    compactor = Compactor(**FAST | settings)
+    with pytest.raises(UsageError, match=words):
+        compactor.extend(pairs[0])
+    assert compactor.state is None
+
+
+def test_harmonics_of_another_degree(first: OnlineState) -> None:
+    with pytest.raises(UsageError, match="expected Gaussians with harmonics of degree 0 as the state's, got degree 1"):
+        extend(first, room(2, degree=1), options())
+
+
+def test_more_gaussians_of_a_group_than_are_kept(pairs: list[PixelScene], first: OnlineState) -> None:
+    with pytest.raises(UsageError, match="max k: expected at least 3, which is k, got 2"):
+        Compactor(**FAST, k=3, max_k=2).extend(pairs[0])
+    with pytest.raises(UsageError, match="max k: expected at least 5, which is k, got 4"):
+        extend(first, pairs[1], options(k=5))
+
+
+def test_a_budget_that_keeps_everything(pairs: list[PixelScene]) -> None:
+    with pytest.raises(UsageError, match="keeps every Gaussian"):
+        Compactor(**FAST, budget="100%").extend(loosened(pairs[0]))
+
+
+def test_nothing_before_the_first_batch(tmp_path: Any) -> None:
+    compactor = Compactor()
+    assert (len(compactor), compactor.state, list(compactor.batches)) == (0, None, [])
+    with pytest.raises(ValueError, match="expected at least one batch of views before decoding, got none"):
+        compactor.decode()
+    with pytest.raises(ValueError, match="expected at least one batch of views before saving, got none"):
+        compactor.save(tmp_path / "a.gsm")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_batch_that_fails_changes_nothing(pairs: list[PixelScene]) -> None:
+    compactor = fed(pairs[:1])
+    before = compactor.state
+    with pytest.raises(UsageError):
+        compactor.extend(room(2, degree=1))
+    assert compactor.state is before

@@ -1,0 +1,58 @@
+"""Settings: what is refused, and where those that are not given come from."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from gsmerge import Compactor
+from gsmerge.online.compactor import settled
+from gsmerge.online.options import OnlineOptions
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"max_k": 0}, "max k: expected 1 to 8, got 0"),
+        ({"max_k": 9}, "max k: expected 1 to 8, got 9"),
+        ({"tolerance": -0.1}, r"tolerance: expected 0 to 1, got -0\.1"),
+        ({"tolerance": 1.1}, "tolerance: expected 0 to 1"),
+        ({"tolerance": float("nan")}, "tolerance: expected 0 to 1, got nan"),
+        ({"margin": -1.0}, "margin: expected at least 0"),
+        ({"margin": float("nan")}, "margin: expected at least 0, got nan"),
+        ({"replay": -1}, "replay: expected at least 0, got -1"),
+    ],
+)
+def test_settings_out_of_range(values: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        OnlineOptions(**values)
+    with pytest.raises(ValueError, match=words):
+        Compactor(**values)
+
+
+@pytest.mark.parametrize("values", [{"max_k": 1}, {"max_k": 8}, {"tolerance": 0}, {"tolerance": 1}, {"replay": 0}])
+def test_settings_within_range(values: dict[str, Any]) -> None:
+    assert vars(OnlineOptions(**values)).items() >= values.items()
+
+
+@pytest.mark.parametrize("values", [{"mood": 1}, {"density": -1}, {"k": 0}, {"fit": "some"}], ids=str)
+def test_other_settings_are_checked_too(values: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(values))):
+        Compactor(**values)
+
+
+def test_colours_are_fitted_unless_told_otherwise() -> None:
+    options, online = settled({})
+    assert options.fit.fit == "color"
+    assert online == OnlineOptions()
+    assert settled({"fit": "none"})[0].fit.fit == "none"
+
+
+def test_the_state_s_settings_come_before_the_defaults() -> None:
+    told = {"density": 0.07, "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
+    state: Any = SimpleNamespace(about={"options": told, "batches": []})
+    options, online = settled({"tolerance": 0.3, "seed": 4}, state)
+    assert options.to_dict().items() >= {"density": 0.07, "fit": "none", "seed": 4}.items()
+    assert online.tolerance == 0.3

@@ -1,0 +1,244 @@
+"""The file of a state: what comes back, and every kind of damage."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from arriving import fed, parts_of, room, same_state, state_of
+from loose import far_behind, shuffled
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
+from gsmerge.errors import SceneError
+from gsmerge.online.file import FORMAT, load_state, load_stored, save_state
+from gsmerge.online.state import OnlineState
+
+Spoil = Callable[[Path], Any]
+
+
+@pytest.fixture(scope="module")
+def state() -> OnlineState:
+    return state_of(fed(parts_of(room(4, degree=1), 2)))
+
+
+@pytest.fixture
+def path(state: OnlineState, tmp_path: Path) -> Path:
+    save_state(tmp_path / "state.gsm", state)
+    return tmp_path / "state.gsm"
+
+
+def header(path: Path) -> dict[str, Any]:
+    size = int.from_bytes(path.read_bytes()[:8], "little")
+    told = json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"]
+    return dict(json.loads(told[FORMAT]))
+
+
+def with_text(text: str, name: str = FORMAT) -> Spoil:
+    return lambda path: save_file(load_file(path), path, {name: text})
+
+
+def with_header(**changes: Any) -> Spoil:
+    return lambda path: with_text(json.dumps(header(path) | changes))(path)
+
+
+def with_settings(**changes: Any) -> Spoil:
+    def spoil(path: Path) -> None:
+        with_header(settings=header(path)["settings"] | changes)(path)
+
+    return spoil
+
+
+def without(name: str) -> Spoil:
+    def spoil(path: Path) -> None:
+        told = header(path)
+        with_text(json.dumps({key: value for key, value in told.items() if key != name}))(path)
+
+    return spoil
+
+
+def with_tensor(name: str, change: Callable[[Tensor], Tensor] | None) -> Spoil:
+    def spoil(path: Path) -> None:
+        told, tensors = header(path), load_file(path)
+        tensor = tensors.pop(name)
+        if change is not None:
+            tensors[name] = change(tensor)
+        save_file(tensors, path, {FORMAT: json.dumps(told)})
+
+    return spoil
+
+
+def filled(value: float) -> Callable[[Tensor], Tensor]:
+    def change(tensor: Tensor) -> Tensor:
+        tensor = tensor.clone()
+        tensor.view(-1)[len(tensor.view(-1)) // 2] = value
+        return tensor
+
+    return change
+
+
+def cut(share: float) -> Spoil:
+    return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+TENSORS = (
+    *(f"features.{name}" for name in ("means", "covars", "weights", "masses", "extinctions", "latents", "footprints")),
+    *("features.sh0", "features.shN", "features.views", "features.backing", "features.solved", "features.held"),
+    *(f"children.{name}" for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "counts")),
+    *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "replay.images", "replay.views"),
+)
+FLOATS = [name for name in TENSORS if name.split(".")[1] not in ("views", "backing", "counts", "images")]
+FLOATS = [name for name in FLOATS if name not in ("features.latents", "kept.means")]  # nothing is in those
+DAMAGED: dict[str, Spoil] = {
+    "missing": Path.unlink,
+    "empty": lambda path: path.write_bytes(b""),
+    "a few bytes": cut(0.0001),
+    "half": cut(0.5),
+    "all but the end": cut(0.999),
+    "a byte too many": lambda path: path.write_bytes(path.read_bytes() + b"x"),
+    "a PLY file": lambda path: path.write_text("ply\nformat ascii 1.0\nend_header\n"),
+    "a pickle": lambda path: path.write_bytes(pickle.dumps({"a": 1}) * 9),
+    "a huge header": lambda path: path.write_bytes(b"\xff" * 8 + path.read_bytes()[8:]),
+    "no header": lambda path: save_file(load_file(path), path),
+    "networks": with_text("{}", "gsmerge-networks"),
+    "an encoded scene by its name": with_text("{}", "gsmerge-encoded"),
+    "no JSON": with_text("{"),
+    "a list": with_text("[]"),
+    "deep JSON": with_text("[" * 100_000),
+    "no schema": without("schema"),
+    "an older schema": with_header(schema=0),
+    "a newer schema": with_header(schema=2, gsmerge="9.9"),
+    "no settings": without("settings"),
+    "settings in a list": with_header(settings=[]),
+    "no unit": without("unit"),
+    "a unit of zero": with_header(unit=0.0),
+    "a unit that is none": with_header(unit=float("nan")),
+    "no width": without("width"),
+    "views without pixels": with_header(width=0),
+    "views of another size": with_header(width=35),
+    "no about": without("about"),
+    "about without options": with_header(about={"batches": []}),
+    "about without batches": with_header(about={"options": {}}),
+    "options in a list": with_header(about={"options": [], "batches": []}),
+    "batches by number": with_header(about={"options": {}, "batches": {"0": 1}}),
+    "k of nine": with_settings(k=9),
+    "k of words": with_settings(k="many"),
+    "most of none": with_settings(most=0),
+    "most of fewer than there are": with_settings(most=1),
+    "an opacity of two": with_settings(min_opacity=2.0),
+    "a share that is none": with_settings(prune=float("nan")),
+    "a negative number": with_settings(num_input=-1),
+    "a group without children": with_tensor("children.counts", filled(0)),
+    "a group with too many": with_tensor("children.counts", filled(9)),
+    "children of nobody": with_tensor("children.counts", lambda t: t.clamp(max=1)),
+    "fewer children": with_tensor("children.means", lambda t: t[1:].clone()),
+    "harmonics of another degree": with_tensor("children.shN", lambda t: t[:, :0].clone()),
+    "views beyond": with_tensor("replay.views", lambda t: t + 3),
+    "views before": with_tensor("replay.views", lambda t: t - 1),
+    "views twice": with_tensor("replay.views", torch.zeros_like),
+    "views in no order": with_tensor("replay.views", lambda t: t.flip(0).clone()),
+    "fewer photos": with_tensor("replay.images", lambda t: t[1:].clone()),
+    "photos of another size": with_tensor("replay.images", lambda t: t[:, 1:].clone()),
+    **{f"no {name}": with_tensor(name, None) for name in TENSORS},
+    **{
+        f"{name} of doubles": with_tensor(name, lambda t: t.float() if t.dtype == torch.float64 else t.double())
+        for name in TENSORS
+    },
+    **{f"{name} of another shape": with_tensor(name, lambda t: t[None].clone()) for name in TENSORS},
+    **{f"NaN in {name}": with_tensor(name, filled(float("nan"))) for name in FLOATS},
+    "infinity in features.means": with_tensor("features.means", filled(float("inf"))),
+}
+
+
+def test_everything_comes_back(path: Path, state: OnlineState) -> None:
+    same_state(load_state(path), state)
+
+
+def test_the_same_state_gives_the_same_bytes(path: Path, state: OnlineState, tmp_path: Path) -> None:
+    save_state(tmp_path / "again.gsm", state)
+    save_state(tmp_path / "loaded.gsm", load_state(path))
+    assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
+    assert (tmp_path / "loaded.gsm").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("settings", [{}, {"fit": "none", "replay": 2}, {"max_k": 1, "k": 1, "tolerance": 0}], ids=str)
+def test_saved_between_batches_is_kept_in_memory(settings: dict[str, Any], tmp_path: Path) -> None:
+    """Bit for bit, in everything."""
+    batches = parts_of(room(6), 2)
+    kept = fed(batches, **settings)
+    stored = fed(batches[:1], **settings)
+    for number, batch in enumerate(batches[1:]):
+        stored.save(tmp_path / f"{number}.gsm")
+        stored = Compactor.load(tmp_path / f"{number}.gsm")
+        stored.extend(batch)
+    same_state(state_of(stored), state_of(kept))
+    assert stored.batches == kept.batches
+
+
+def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
+    loose = shuffled(room(2))
+    both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, far_behind(loose.gaussians, 200)]))
+    state = state_of(fed([both], unseen="keep", fit="none"))  # type: ignore[list-item]
+    assert state.kept is not None
+    save_state(tmp_path / "a.gsm", state)
+    same_state(load_state(tmp_path / "a.gsm"), state)
+
+
+def test_without_photos(tmp_path: Path) -> None:
+    state = state_of(fed([replace(room(2), images=None)]))
+    assert len(state.replay) == 0
+    save_state(tmp_path / "a.gsm", state)
+    same_state(load_state(tmp_path / "a.gsm"), state)
+
+
+def test_what_is_not_known_is_not_looked_at(path: Path, state: OnlineState) -> None:
+    told, tensors = header(path), load_file(path)
+    tensors["features.moods"], tensors["division.slots"] = torch.full((7,), float("nan")), torch.zeros(3)
+    told |= {"minor": 7, "moods": ["good"]}
+    told["settings"]["mood"] = "better"
+    save_file(tensors, path, {FORMAT: json.dumps(told), "mood": "best"})
+    same_state(load_state(path), state)
+
+
+def test_an_encoded_scene_is_one_too(tmp_path: Path) -> None:
+    encoded = encode_scene(room(2), density=0.1, robust=False, checkpoint="none")
+    save_encoded(tmp_path / "scene.gsm", encoded)
+    assert isinstance(load_stored(tmp_path / "scene.gsm"), Encoded)
+    assert len(load_state(tmp_path / "scene.gsm")) == len(encoded)
+
+
+def test_a_state_is_no_encoded_scene(path: Path) -> None:
+    assert isinstance(load_stored(path), OnlineState)
+    with pytest.raises(SceneError, match="expected Feature Gaussians"):
+        load_encoded(path)
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGED))
+def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
+    DAMAGED[damage](path)
+    with pytest.raises(SceneError) as told:
+        load_state(path)
+    assert str(told.value).startswith(f"{path}: ")
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 400 + len(str(path))
+
+
+def test_a_newer_schema_says_what_to_do(path: Path) -> None:
+    DAMAGED["a newer schema"](path)
+    with pytest.raises(SceneError, match=r"expected schema 1, found 2; written by gsmerge 9\.9; this is .*, update it"):
+        load_state(path)
+
+
+def test_an_existing_file_is_kept(path: Path, state: OnlineState) -> None:
+    before = path.read_bytes()
+    with pytest.raises(SceneError, match="exists already"):
+        save_state(path, state)
+    save_state(path, state, overwrite=True)
+    assert path.read_bytes() == before
