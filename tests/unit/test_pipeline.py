@@ -10,7 +10,7 @@ from gsmerge import CompactOptions, PixelScene, compact
 from gsmerge.journal import STAGES
 from gsmerge.segment import SEGMENTATIONS
 
-USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "choose")]
+USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "cover", "choose", "join")]
 
 
 @pytest.fixture(scope="module")
