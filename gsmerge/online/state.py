@@ -203,11 +203,12 @@ def swapped(parts: Parts, rows: Tensor, others: Parts) -> Parts:
 
 
 def with_solved(parts: Parts) -> Parts:
-    """Groups in the colours that fit the photos.
-
-    Children keep theirs: what is solved makes up for what one Gaussian blurs, and more of them blur less.
-    """
-    return replace(parts, features=replace(parts.features, sh0=parts.solved))
+    """Groups and children in the colours that fit the photos."""
+    offsets = parts.solved - parts.features.sh0
+    sizes = parts.features.starts.diff()
+    features = replace(parts.features, sh0=parts.solved)
+    children = replace(parts.children, sh0=parts.children.sh0 + offsets.repeat_interleave(sizes, 0))
+    return replace(parts, features=features, children=children)
 
 
 def as_encoded(state: OnlineState, *, solved: bool = True) -> Encoded:
@@ -215,7 +216,7 @@ def as_encoded(state: OnlineState, *, solved: bool = True) -> Encoded:
 
     Args:
         state: Of one or more batches.
-        solved: Groups in colours that fit the photos; otherwise as they came.
+        solved: Colours that fit the photos; otherwise as they came.
     """
     parts = with_solved(state.parts) if solved else state.parts
     features, members = parts.features, part_members(parts)
