@@ -103,7 +103,7 @@ def _run(
     """Read, decode and write; returns the report."""
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.file import load_stored
-    from gsmerge.online.fitted import as_decoded, decode_stored, num_photos
+    from gsmerge.online.fitted import as_decoded, check_fit, decode_stored, num_photos, usual_fit
     from gsmerge.report import document_head, seconds_document
     from gsmerge.stored.decode import plan_decode
 
@@ -117,13 +117,14 @@ def _run(
         **wish,
     }
     notes = [lost] if lost else []
+    fit = settings.fit if params["fit"] is not None or num_photos(stored) else None
+    check_fit(stored, fit or usual_fit(stored))
     if params["dry_run"]:
         encoded = as_decoded(stored)
         plan = plan_decode(encoded, **wish)
         most = int(plan.counts.sum()) + encoded.num_kept
         told = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
         return document | told | {"notes": [*plan.notes, *notes]}
-    fit = settings.fit if params["fit"] is not None or num_photos(stored) else None
     with atomic_output(out, overwrite=params["overwrite"]) as temporary:
         with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
             decoded = decode_stored(

@@ -31,7 +31,8 @@ def solve_colors(parts: Parts, shots: Shots, options: FitOptions, seed: int = 0)
         seed: Chooses the held-out blocks.
 
     Returns:
-        The groups, with the new photos in what they are held by, and what was done.
+        The groups, with the new photos in what they are held by, and what was done. Where held-out blocks did not get
+        better the new photos speak for the colours that are there, and hold those.
     """
     rows = torch.from_numpy(np.flatnonzero(in_view(parts.features, shots.cameras).any(0)))
     part, photos = pick(parts, rows), shots.photos(2)

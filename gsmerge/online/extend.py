@@ -210,7 +210,8 @@ def _entered(
         counts["num_hidden"] = int((~shows).sum())
         alone = pick(alone, torch.nonzero(shows)[:, 0])
     kept = [one for one in (state.kept, work.kept) if one is not None]
-    settings = replace(state.settings, num_input=state.settings.num_input + work.scene.num_gaussians)
+    total = state.settings.num_input + work.scene.num_gaussians
+    settings = replace(state.settings, num_input=total, k=options.decode.k)
     further = shots.cameras[torch.from_numpy(places >= len(state.cameras))]
     return replace(
         state,

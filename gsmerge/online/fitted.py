@@ -38,6 +38,21 @@ def num_photos(stored: Encoded | OnlineState) -> int:
     return 0 if isinstance(stored, Encoded) else len(stored.replay)
 
 
+def usual_fit(stored: Encoded | OnlineState) -> FitOptions:
+    """The full fit where there are photos, otherwise none."""
+    return FitOptions(fit="full" if num_photos(stored) else "none")
+
+
+def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
+    """Refuse a fit where no photos are.
+
+    Raises:
+        UsageError: If there are none and one is asked for.
+    """
+    if options.fit != "none" and not num_photos(stored):
+        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
+
+
 def decode_stored(
     stored: Encoded | OnlineState,
     *,
@@ -62,13 +77,13 @@ def decode_stored(
     Raises:
         UsageError: If a fit is asked for and no photos were kept, or K or the budget cannot be had.
     """
-    options = options or FitOptions(fit="full" if num_photos(stored) else "none")
+    options = options or usual_fit(stored)
+    check_fit(stored, options)
     encoded = as_decoded(stored, solved=options.fit == "none")
     if options.fit == "none":
         notes = plan_decode(encoded, k=k, budget=budget).notes
         return Decoded(decode_scene(encoded, k=k, budget=budget, threads=threads), None, notes)
-    if isinstance(stored, Encoded) or not num_photos(stored):
-        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
+    assert isinstance(stored, OnlineState)
     journal = Journal(progress)
     plan = plan_decode(encoded, k=k, budget=budget)
     wanted = int(plan.counts.sum())
