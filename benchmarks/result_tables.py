@@ -374,5 +374,5 @@ def _without(records: Sequence[RunRecord]) -> str:
 def _missing() -> str:
     return """## Of the paper's tables, what has no counterpart yet
 
-- Online reconstruction (`tab:online`, `fig:online`): views are not yet added to a state.
+- Online reconstruction (`tab:online`, `fig:online`): on its own page, [online.md](online.md).
 - Posed against unposed Depth Anything 3 (`tab:da3_posed_unposed`), ReSplat, VolSplat: exports that need the models."""
