@@ -40,9 +40,9 @@ def preview(
     from gsmerge.sampling import pick_views
     from gsmerge.threads import use_threads
 
-    check_picture(output)
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     check_output(output, (*scenes, *input_files(files)), overwrite=overwrite)
+    check_picture(output)
     check_cameras(files)
     plys = [read_told(files.ply, opacity=opacity.value, reading=reading)]
     plys += [read_ply(path, opacity=opacity.value) for path in scenes[1:]]

@@ -85,8 +85,10 @@ def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[
 def test_a_run_with_other_settings_is_refused_meanwhile(rooms: Path, tmp_path: Path) -> None:
     first = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")
     until(lambda: holders(tmp_path), first)
+    os.kill(first.pid, signal.SIGSTOP)  # or it may be done before the other has begun
     second = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q", "--k", 2)
     errors = second.communicate()[1]
+    os.kill(first.pid, signal.SIGCONT)
     assert second.returncode == 2
     assert f"a batch with other settings is at work there (process {first.pid} on" in errors
     assert first.communicate()[1] == ""
