@@ -31,7 +31,7 @@ StateArgument = Annotated[
 ]
 BatchArgument = Annotated[
     list[Path],
-    typer.Argument(metavar="SCENE...", help="Batches of new views, in order: scenes as gsmerge compact takes them."),
+    typer.Argument(metavar="SCENE", help="Batches of new views, in order: scenes as gsmerge compact takes them."),
 ]
 BatchFitOption = Annotated[
     BatchFit | None,
