@@ -11,11 +11,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from gsmerge.charts import figures
 from gsmerge.charts.draw import style
-from gsmerge.charts.draw.labels import Label, end_labels, place_labels, settle
+from gsmerge.charts.draw.labels import SIZE, Label, end_labels, place_labels, settle
 from gsmerge.charts.experiment import OURS
 from gsmerge.charts.record import INPUT
 from gsmerge.charts.series import Line
@@ -23,6 +24,8 @@ from gsmerge.charts.statistics import pareto_front
 
 PANEL_WIDTH, HEIGHT = 2.9, 2.5  # inches
 SINGLE_WIDTH = 4.4
+KEY_WIDTH, KEY_LINE = 2.3, 0.135  # inches: of the key, and for each of its lines
+CROWDED = 10  # names beside their lines: more would lie over one another
 SAME_COST = 1.02  # costs that differ by less than this factor are drawn as one
 FEWEST = 3  # scenes that a band is drawn from; two say next to nothing
 MARGIN = 0.12  # of the range of the means, above and below
@@ -94,12 +97,30 @@ def _draw_curves(figure: figures.Curves, looks: Looks) -> Canvas:
     first, last = all_axes[0], all_axes[-1]
     labels = _labels(last, figure.panels[-1], looks)
     names = end_labels(last, labels)  # one panel has the names for all
+    crowded = not names and len(labels) > CROWDED
+    if crowded:
+        _key(canvas, labels, looks)
     _lay_out(canvas)
     if names:
         settle(last, labels, names)
-    else:
+    elif not crowded:
         place_labels(first, _labels(first, figure.panels[0], looks))
     return canvas
+
+
+def _key(canvas: Canvas, labels: Sequence[Label], looks: Looks) -> None:
+    """The names right of all panels, with their lines, where there are too many to stand beside them."""
+    handles = []
+    for label in labels:
+        look = looks.get(label.text)
+        dash, marker, width = (look.dash, look.marker, look.width) if look else ((0, (2, 2)), "", 0.9)
+        handles.append(Line2D([], [], color=label.color, linestyle=dash, marker=marker, markersize=4, linewidth=width))
+    width, height = canvas.get_size_inches()
+    canvas.set_size_inches(width + KEY_WIDTH, max(height, KEY_LINE * len(labels)))
+    canvas.legend(
+        handles, [label.text for label in labels], loc="outside right center", fontsize=SIZE, frameon=False,
+        handlelength=2.6, labelspacing=0.15, borderpad=0, labelcolor=[label.color for label in labels],
+    )  # fmt: skip
 
 
 def _labels(axes: Axes, panel: figures.Panel, looks: Looks) -> list[Label]:
