@@ -107,6 +107,14 @@ class CompactOptions:
         """As :meth:`to_dict`, with the checkpoint and the matching that are used where nothing else was asked for."""
         return self.to_dict() | {"checkpoint": self.networks(photos=photos), "match": self.match.method}
 
+    @property
+    def whole_only(self) -> list[str]:
+        """What is asked for that only a whole scene, compacted at once, can have: rivals, searches, levels."""
+        target = self.target
+        asked = {f"method {self.method}": self.method != "gsmerge", "levels": target.levels > 1}
+        asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
+        return [name for name, wanted in asked.items() if wanted]
+
     def to_dict(self) -> dict[str, Any]:
         """All settings by their flat names, as plain values."""
         flat: dict[str, Any] = {}

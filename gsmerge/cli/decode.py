@@ -117,8 +117,8 @@ def _run(
         **wish,
     }
     notes = [lost] if lost else []
-    fit = settings.fit if params["fit"] is not None or num_photos(stored) else None
-    check_fit(stored, fit or usual_fit(stored))
+    fit = settings.fit if params["fit"] is not None or num_photos(stored) else usual_fit(stored)
+    check_fit(stored, fit)
     if params["dry_run"]:
         encoded = as_decoded(stored)
         plan = plan_decode(encoded, **wish)

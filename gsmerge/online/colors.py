@@ -11,7 +11,7 @@ from gsmerge.fit import FitReport
 from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.options import FitOptions
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.cover import in_view
+from gsmerge.online.cover import rows_in_view
 from gsmerge.online.pictures import Shots
 from gsmerge.online.state import Parts, pick, swapped
 from gsmerge.weights import apply_transposed
@@ -34,7 +34,7 @@ def solve_colors(parts: Parts, shots: Shots, options: FitOptions, seed: int = 0)
         The groups, with the new photos in what they are held by, and what was done. Where held-out blocks did not get
         better the new photos speak for the colours that are there, and hold those.
     """
-    rows = torch.from_numpy(np.flatnonzero(in_view(parts.features, shots.cameras).any(0)))
+    rows = rows_in_view(parts.features, shots.cameras)
     part, photos = pick(parts, rows), shots.photos(2)
     before = replace(feature_to_gaussians(part.features), sh0=part.solved)
     drawn = draw(before, photos)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
 
 from gsmerge.moments import Members
 from gsmerge.photos import Photos
@@ -36,6 +38,11 @@ def in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
         return inside
 
     return np.stack(parallel_map(one_view, range(len(cameras))))
+
+
+def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> Tensor:
+    """Rows, rising, of the groups that may show in some view."""
+    return torch.from_numpy(np.flatnonzero(in_view(features, cameras).any(0)))
 
 
 def pixel_errors(gaussians: Gaussians, pictures: Photos, height: int, width: int) -> np.ndarray:

@@ -17,11 +17,11 @@ from gsmerge.journal import Journal, Progress
 from gsmerge.merge import take
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.colors import solve_colors
-from gsmerge.online.cover import group_errors, in_view, pixel_errors
+from gsmerge.online.cover import group_errors, pixel_errors, rows_in_view
 from gsmerge.online.join import absorb, partners
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
-from gsmerge.online.state import OnlineState, Parts, Replay, baked, joined, pick, with_solved
+from gsmerge.online.state import OnlineState, Parts, baked, joined, no_photos, pick, with_solved
 from gsmerge.options import CompactOptions
 from gsmerge.photos import scene_pictures
 from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
@@ -98,17 +98,19 @@ def extend(
         merged = merged_groups(work.source, grouping, work.options, journal)
         shots = _shots(state, work)
         counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+        rows = torch.zeros(0, dtype=torch.int64)
         if state is not None:
             with journal.stage("cover"):
-                fresh = _uncovered(state.parts, merged, shots, work.source.scene, online)
-                counts["num_covered"] -= len(fresh) - len(merged.features)
+                rows = rows_in_view(state.parts.features, shots.cameras)
+                fresh = _uncovered(pick(state.parts, rows), merged, shots, work.source.scene, online)
+                counts["num_covered"] = len(merged.features) - len(fresh)
                 merged = replace(merged, features=take(merged.features, fresh))
         most = online.max_k if state is None else state.settings.most
         places = np.arange(len(shots)) if state is None else view_places(state.cameras, shots.cameras)
         with journal.stage("decode"):
             new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
         with journal.stage("join"):
-            state, found = _entered(state, new, work, (shots, places), online)
+            state, found = _entered(state, new, work, (shots, places, rows), online)
             counts |= found
         if work.scene.images is not None:
             state = _with_photos(state, (shots, places), work.options, online, journal)
@@ -125,10 +127,7 @@ def extend(
 
 def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions, most: int) -> None:
     """Refuse what no state can have; ``most``: children of a group."""
-    target = options.target
-    asked = {f"method {options.method}": options.method != "gsmerge", "levels": target.levels > 1}
-    asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
-    for name in (name for name, wanted in asked.items() if wanted):
+    for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
         raise UsageError(
@@ -174,30 +173,31 @@ def _shots(state: OnlineState | None, work: Work) -> Shots:
 def _uncovered(
     parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | LooseScene, online: OnlineOptions
 ) -> torch.Tensor:
-    """Rows of the batch's groups that show something which the state does not show as well."""
+    """Rows of the batch's groups that show something which the groups in view do not show as well."""
     features, members = batch.features, batch.members
     if online.tolerance == 0:
         return torch.arange(len(features))
     pictures, size = shots.photos(2), (scene.cameras.height, scene.cameras.width)
-    rows = torch.from_numpy(np.flatnonzero(in_view(parts.features, shots.cameras).any(0)))
-    there = group_errors(
-        features, members, pixel_errors(feature_to_gaussians(take(with_solved(parts).features, rows)), pictures, *size)
-    )
+    solved = feature_to_gaussians(with_solved(parts).features)
+    there = group_errors(features, members, pixel_errors(solved, pictures, *size))
     own = group_errors(features, members, pixel_errors(feature_to_gaussians(features), pictures, *size))
     return torch.from_numpy(np.flatnonzero(there > np.maximum(online.tolerance**2, online.margin**2 * own)))
 
 
 def _entered(
-    state: OnlineState | None, new: Parts, work: Work, seen: tuple[Shots, np.ndarray], online: OnlineOptions
+    state: OnlineState | None,
+    new: Parts,
+    work: Work,
+    seen: tuple[Shots, np.ndarray, torch.Tensor],
+    online: OnlineOptions,
 ) -> tuple[OnlineState, dict[str, int]]:
     """The state with new groups in it, and how many joined what was there and how many nothing shows.
 
-    ``seen`` are the batch's photos, and which of all views they show.
+    ``seen`` are the batch's photos, which of all views they show, and the rows of the state's groups in their view.
     """
-    options, scene, (shots, places) = work.options, work.source.scene, seen
+    options, scene, (shots, places, rows) = work.options, work.source.scene, seen
     if state is None:
         return _begun(new, work, online), {}
-    rows = torch.from_numpy(np.flatnonzero(in_view(state.parts.features, shots.cameras).any(0)))
     found = partners(take(state.parts.features, rows), new.features, options.match)
     joins = found >= 0
     parts = absorb(state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most)
@@ -235,7 +235,5 @@ def _begun(new: Parts, work: Work, online: OnlineOptions) -> OnlineState:
         places=None,
         knee=0,
     )
-    nothing = np.zeros((0, cameras.height, cameras.width, 3), np.uint8)
-    replay = Replay(nothing, np.zeros(0, np.int64))
     same = resized(cameras, cameras.width, cameras.height)
-    return OnlineState(new, work.kept, work.frame, same, replay, settings, {})
+    return OnlineState(new, work.kept, work.frame, same, no_photos(cameras), settings, {})

@@ -26,11 +26,9 @@ def partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOp
     both = FeatureGaussians.concat([features, new])
     sides = (torch.arange(len(both)) >= len(features)).long()
     matches = match(replace(both, views=sides), replace(options, cluster_size=2))
-    found = torch.full((len(new),), -1)
     owner = torch.full((matches.count,), -1)
     owner[matches.clusters[: len(features)]] = torch.arange(len(features))
-    found[:] = owner[matches.clusters[len(features) :]]
-    return found
+    return owner[matches.clusters[len(features) :]]
 
 
 def absorb(parts: Parts, new: Parts, rows: Tensor, most: int) -> Parts:

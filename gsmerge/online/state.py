@@ -42,6 +42,11 @@ class Replay:
         return len(self.views)
 
 
+def no_photos(cameras: Cameras) -> Replay:
+    """None at all, of the size of some views."""
+    return Replay(np.zeros((0, cameras.height, cameras.width, 3), np.uint8), np.zeros(0, np.int64))
+
+
 @dataclass(frozen=True, eq=False)
 class Parts:
     """Groups with the Gaussians that they divide into.
@@ -108,7 +113,8 @@ def baked(
         most: Most children that are kept of a group.
         rule: How children are pooled.
     """
-    ones, children, parents = feature_to_gaussians(features), feature_to_gaussians(features), np.arange(len(features))
+    ones = feature_to_gaussians(features)
+    children, parents = ones, np.arange(len(features))
     if most > 1:
         children, parents = divide(features, members, np.full(len(features), most), rule)
     if learned is not None:
@@ -131,14 +137,13 @@ def from_encoded(encoded: Encoded) -> OnlineState:
     children, parents = children_of(encoded, np.full(len(encoded), most))
     parts = _parts(encoded.features, ones, children, parents)
     cameras = encoded.cameras
-    replay = Replay(np.zeros((0, cameras.height, cameras.width, 3), np.uint8), np.zeros(0, np.int64))
     settings = replace(encoded.settings, wanted=None, places=None)
     options = dict(encoded.about.get("options", {}))
     options.pop("fit", None)  # none, for want of photos
     batch = {"num_views": len(cameras), "num_input": settings.num_input, "num_new": len(encoded)}
     batch |= {"num_covered": 0, "num_joined": 0, "num_hidden": 0, "num_groups": len(encoded)}
     about = {"gsmerge": __version__, "options": options, "batches": [batch]}
-    return OnlineState(parts, encoded.kept, encoded.frame, cameras, replay, settings, about)
+    return OnlineState(parts, encoded.kept, encoded.frame, cameras, no_photos(cameras), settings, about)
 
 
 def moments_of(gaussians: Gaussians) -> dict[str, Tensor]:

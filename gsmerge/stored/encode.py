@@ -72,11 +72,8 @@ def _unfitted(options: CompactOptions, settings: dict[str, Any]) -> CompactOptio
     Raises:
         UsageError: If a fit, another method, a quality or levels are asked for.
     """
-    target = options.target
-    asked = {f"fit {options.fit.fit}": settings.get("fit", "none") != "none"}
-    asked |= {f"method {options.method}": options.method != "gsmerge", "levels": target.levels > 1}
-    asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
-    for name in (name for name, wanted in asked.items() if wanted):
+    fitted = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
+    for name in (*fitted, *options.whole_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")
     return replace(options, fit=replace(options.fit, fit="none"))
 

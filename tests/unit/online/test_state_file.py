@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,12 @@ import torch
 from arriving import fed, parts_of, room, same_state, state_of
 from loose import far_behind, shuffled
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
 
 from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
 from gsmerge.errors import SceneError
 from gsmerge.online.file import FORMAT, load_state, load_stored, save_state
 from gsmerge.online.state import OnlineState
-
-Spoil = Callable[[Path], Any]
 
 
 @pytest.fixture(scope="module")
@@ -33,59 +30,6 @@ def state() -> OnlineState:
 def path(state: OnlineState, tmp_path: Path) -> Path:
     save_state(tmp_path / "state.gsm", state)
     return tmp_path / "state.gsm"
-
-
-def header(path: Path) -> dict[str, Any]:
-    size = int.from_bytes(path.read_bytes()[:8], "little")
-    told = json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"]
-    return dict(json.loads(told[FORMAT]))
-
-
-def with_text(text: str, name: str = FORMAT) -> Spoil:
-    return lambda path: save_file(load_file(path), path, {name: text})
-
-
-def with_header(**changes: Any) -> Spoil:
-    return lambda path: with_text(json.dumps(header(path) | changes))(path)
-
-
-def with_settings(**changes: Any) -> Spoil:
-    def spoil(path: Path) -> None:
-        with_header(settings=header(path)["settings"] | changes)(path)
-
-    return spoil
-
-
-def without(name: str) -> Spoil:
-    def spoil(path: Path) -> None:
-        told = header(path)
-        with_text(json.dumps({key: value for key, value in told.items() if key != name}))(path)
-
-    return spoil
-
-
-def with_tensor(name: str, change: Callable[[Tensor], Tensor] | None) -> Spoil:
-    def spoil(path: Path) -> None:
-        told, tensors = header(path), load_file(path)
-        tensor = tensors.pop(name)
-        if change is not None:
-            tensors[name] = change(tensor)
-        save_file(tensors, path, {FORMAT: json.dumps(told)})
-
-    return spoil
-
-
-def filled(value: float) -> Callable[[Tensor], Tensor]:
-    def change(tensor: Tensor) -> Tensor:
-        tensor = tensor.clone()
-        tensor.view(-1)[len(tensor.view(-1)) // 2] = value
-        return tensor
-
-    return change
-
-
-def cut(share: float) -> Spoil:
-    return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
 
 
 TENSORS = (

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import scenes
 import torch
 from learned import noisy, written
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
 
 from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
 from gsmerge.errors import SceneError
 from gsmerge.stored.file import FORMAT
-
-Spoil = Callable[[Path], Any]
 
 
 @pytest.fixture(scope="module")
@@ -34,59 +30,6 @@ def encoded(tmp_path_factory: pytest.TempPathFactory) -> Encoded:
 def path(encoded: Encoded, tmp_path: Path) -> Path:
     save_encoded(tmp_path / "scene.gsm", encoded)
     return tmp_path / "scene.gsm"
-
-
-def header(path: Path) -> dict[str, Any]:
-    size = int.from_bytes(path.read_bytes()[:8], "little")
-    told = json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"]
-    return dict(json.loads(told[FORMAT]))
-
-
-def with_text(text: str, name: str = FORMAT) -> Spoil:
-    return lambda path: save_file(load_file(path), path, {name: text})
-
-
-def with_header(**changes: Any) -> Spoil:
-    return lambda path: with_text(json.dumps(header(path) | changes))(path)
-
-
-def with_settings(**changes: Any) -> Spoil:
-    def spoil(path: Path) -> None:
-        with_header(settings=header(path)["settings"] | changes)(path)
-
-    return spoil
-
-
-def without(name: str) -> Spoil:
-    def spoil(path: Path) -> None:
-        told = header(path)
-        with_text(json.dumps({key: value for key, value in told.items() if key != name}))(path)
-
-    return spoil
-
-
-def with_tensor(name: str, change: Callable[[Tensor], Tensor] | None) -> Spoil:
-    def spoil(path: Path) -> None:
-        told, tensors = header(path), load_file(path)
-        tensor = tensors.pop(name)
-        if change is not None:
-            tensors[name] = change(tensor)
-        save_file(tensors, path, {FORMAT: json.dumps(told)})
-
-    return spoil
-
-
-def filled(value: float) -> Callable[[Tensor], Tensor]:
-    def change(tensor: Tensor) -> Tensor:
-        tensor = tensor.clone()
-        tensor.view(-1)[len(tensor.view(-1)) // 2] = value
-        return tensor
-
-    return change
-
-
-def cut(share: float) -> Spoil:
-    return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
 
 
 TENSORS = (
