@@ -26,8 +26,8 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsmerge.generate import GenerateOptions, generate
-from gsmerge.threads import available_threads
+from gsmerge.research.generate import GenerateOptions, generate
+from gsmerge.runtime.threads import available_threads
 
 COMMAND = [sys.executable, "-m", "gsmerge"]
 SINGLES = 5

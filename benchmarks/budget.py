@@ -19,15 +19,15 @@ from quality import score
 from shared_scenes import export, read_targets, scene_folders
 
 import gsmerge
-from gsmerge.allocate import auto_count, cut_tree, pixel_depths, region_tree, split_counts
-from gsmerge.canonical import Frame, canonicalise
-from gsmerge.decode import DecodeOptions, decode
-from gsmerge.encode import EncodeOptions, encode
-from gsmerge.fit import FitOptions, fit
 from gsmerge.moments import Members, scene_members
-from gsmerge.photos import scene_photos
-from gsmerge.segment import SegmentOptions, segment
-from gsmerge.threads import use_threads
+from gsmerge.render.photos import scene_photos
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.fit import FitOptions, fit
+from gsmerge.stages.prepare import Frame, canonicalise
+from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree, split_counts
+from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Gaussians, Groups, PixelScene
 
 DENSITY = 0.044

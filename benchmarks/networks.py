@@ -23,11 +23,11 @@ import torch
 from shared_scenes import export, read_targets, scene_folders
 
 import gsmerge
-from gsmerge.charts.statistics import Interval, mean_interval, paired_difference
-from gsmerge.evaluate import EvaluateOptions, Views, evaluate
+from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
 from gsmerge.networks import load_checkpoint, save_checkpoint
 from gsmerge.networks.checkpoint import SHIPPED
-from gsmerge.sampling import even_views, subset
+from gsmerge.research.charts.statistics import Interval, mean_interval, paired_difference
+from gsmerge.views import even_views, subset
 
 LEFT_OUT = ("terrace", "mamechun")  # failure cases: depth mostly wrong, targets mostly unseen
 MEASURES = ("psnr", "ssim", "lpips_vgg")

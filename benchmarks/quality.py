@@ -20,8 +20,8 @@ import numpy as np
 from shared_scenes import Targets, export, read_targets, scene_folders
 
 import gsmerge
-from gsmerge.metrics import psnr, ssim
-from gsmerge.perceptual import INSTALL, lpips, lpips_available
+from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
+from gsmerge.render.metrics import psnr, ssim
 from gsmerge.types import Gaussians
 
 LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, third, ...

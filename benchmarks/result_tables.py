@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from gsmerge.charts.figures import make_verdicts
-from gsmerge.charts.record import INPUT, RunRecord
-from gsmerge.charts.statistics import mean_interval
-from gsmerge.compare import break_even
+from gsmerge.measure.compare import break_even
 from gsmerge.report import human_bytes
+from gsmerge.research.charts.figures import make_verdicts
+from gsmerge.research.charts.record import INPUT, RunRecord
+from gsmerge.research.charts.statistics import mean_interval
 
 Row = Sequence[str]
 OURS = "gsmerge"

@@ -20,9 +20,9 @@ from pathlib import Path
 from result_tables import page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
-from gsmerge.charts.record import RunRecord
-from gsmerge.charts.store import CHARTS, read_runs
 from gsmerge.cli import main as gsmerge
+from gsmerge.research.charts.record import RunRecord
+from gsmerge.research.charts.store import CHARTS, read_runs
 
 ROOT = Path(__file__).parents[1]
 FAST_RIVALS = "random,opacity,contribution,blocks,voxel,paper"

@@ -25,7 +25,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from segmentation_scores import DENSITIES, SIDE, count_at, photos, proxy_psnr, splat_psnr  # noqa: E402
 
-from gsmerge.segment import superpixels  # noqa: E402
+from gsmerge.stages.segment import superpixels  # noqa: E402
 
 RUNS = [
     ("bass-st", "default"),

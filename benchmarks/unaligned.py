@@ -21,14 +21,14 @@ from shared_scenes import export, read_targets, scene_folders
 
 import gsmerge
 from gsmerge import read_scene
-from gsmerge.contribution import find_owners
-from gsmerge.segment import SegmentOptions, segment
-from gsmerge.threads import use_threads
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.assign import find_owners
+from gsmerge.stages.segment import SegmentOptions, segment
 
 
-def loosened(scene: gsmerge.PixelScene) -> gsmerge.LooseScene:
+def loosened(scene: gsmerge.PixelScene) -> gsmerge.UnalignedScene:
     """The Gaussians without their order."""
-    return gsmerge.LooseScene(scene.gaussians[scene.valid.reshape(-1)], scene.cameras, scene.images, scene.names)
+    return gsmerge.UnalignedScene(scene.gaussians[scene.valid.reshape(-1)], scene.cameras, scene.images, scene.names)
 
 
 def time_pass(folder: Path, cache: Path, threads: int) -> None:

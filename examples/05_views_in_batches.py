@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 import gsmerge
-from gsmerge.sampling import subset
+from gsmerge.views import subset
 
 
 def main() -> None:

@@ -17,19 +17,24 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gsmerge.encoded.decode import decode_scene as decode_scene
+    from gsmerge.encoded.encode import encode_scene as encode_scene
+    from gsmerge.encoded.encoded import Encoded as Encoded
+    from gsmerge.encoded.file import load_encoded as load_encoded
+    from gsmerge.encoded.file import save_encoded as save_encoded
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
-    from gsmerge.evaluate import EvaluateOptions as EvaluateOptions
-    from gsmerge.evaluate import Evaluation as Evaluation
-    from gsmerge.evaluate import Views as Views
-    from gsmerge.evaluate import evaluate as evaluate
-    from gsmerge.inspect import inspect as inspect
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_ply as read_ply
     from gsmerge.io import read_scene as read_scene
     from gsmerge.io import to_cameras as to_cameras
     from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_ply as write_ply
+    from gsmerge.measure.evaluate import EvaluateOptions as EvaluateOptions
+    from gsmerge.measure.evaluate import Evaluation as Evaluation
+    from gsmerge.measure.evaluate import Views as Views
+    from gsmerge.measure.evaluate import evaluate as evaluate
+    from gsmerge.measure.inspect import inspect as inspect
     from gsmerge.online.compactor import Compactor as Compactor
     from gsmerge.options import CompactOptions as CompactOptions
     from gsmerge.pipeline import CompactReport as CompactReport
@@ -37,35 +42,30 @@ if TYPE_CHECKING:
     from gsmerge.pipeline import compact as compact
     from gsmerge.render import Rendering as Rendering
     from gsmerge.render import render as render
-    from gsmerge.segment import saliency as saliency
-    from gsmerge.segment import superpixels as superpixels
-    from gsmerge.stored.decode import decode_scene as decode_scene
-    from gsmerge.stored.encode import encode_scene as encode_scene
-    from gsmerge.stored.encoded import Encoded as Encoded
-    from gsmerge.stored.file import load_encoded as load_encoded
-    from gsmerge.stored.file import save_encoded as save_encoded
+    from gsmerge.stages.segment import saliency as saliency
+    from gsmerge.stages.segment import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
-    from gsmerge.types import LooseScene as LooseScene
     from gsmerge.types import PixelScene as PixelScene
+    from gsmerge.types import UnalignedScene as UnalignedScene
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "errors": ("GsmergeError", "SceneError"),
-    "evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
-    "inspect": ("inspect",),
+    "measure.evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
+    "measure.inspect": ("inspect",),
     "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_gaussians", "write_ply"),
     "online.compactor": ("Compactor",),
     "options": ("CompactOptions",),
     "pipeline": ("CompactReport", "CompactResult", "compact"),
     "render": ("Rendering", "render"),
-    "segment": ("saliency", "superpixels"),
-    "stored.decode": ("decode_scene",),
-    "stored.encode": ("encode_scene",),
-    "stored.encoded": ("Encoded",),
-    "stored.file": ("load_encoded", "save_encoded"),
-    "types": ("Cameras", "Gaussians", "LooseScene", "PixelScene"),
+    "stages.segment": ("saliency", "superpixels"),
+    "encoded.decode": ("decode_scene",),
+    "encoded.encode": ("encode_scene",),
+    "encoded.encoded": ("Encoded",),
+    "encoded.file": ("load_encoded", "save_encoded"),
+    "types": ("Cameras", "Gaussians", "UnalignedScene", "PixelScene"),
 }
 _EXPORTS = {name: home for home, names in _HOMES.items() for name in names}
 

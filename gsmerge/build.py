@@ -7,24 +7,24 @@ from dataclasses import asdict, dataclass, replace
 
 import torch
 
-from gsmerge.allocate import split_counts
-from gsmerge.backing import encode_backing
-from gsmerge.decode import decode
-from gsmerge.encode import encode
-from gsmerge.fit import fit
-from gsmerge.grouping import Grouping
-from gsmerge.journal import Journal
-from gsmerge.match import match
-from gsmerge.merge import merge
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks import Checkpoint, Learned
 from gsmerge.options import CompactOptions
-from gsmerge.photos import scene_photos
-from gsmerge.refine import refine
-from gsmerge.robust import choose_merge, close_holes
-from gsmerge.starts import views_psnr
-from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
-from gsmerge.unaligned import loose_count, members_of
+from gsmerge.render.photos import scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.backing import encode_backing
+from gsmerge.stages.choose_merge import choose_merge, close_holes
+from gsmerge.stages.decode import decode
+from gsmerge.stages.encode import encode
+from gsmerge.stages.fit import fit
+from gsmerge.stages.group import Grouping
+from gsmerge.stages.match import match
+from gsmerge.stages.merge import merge
+from gsmerge.stages.refine import refine
+from gsmerge.stages.region_tree import split_counts
+from gsmerge.stages.starts import views_psnr
+from gsmerge.stages.unaligned import members_of, unaligned_count
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Source:
         checkpoint: Networks that correct what the analytic stages make; None: those alone.
     """
 
-    scene: PixelScene | LooseScene
+    scene: PixelScene | UnalignedScene
     members: Members | None
     checkpoint: Checkpoint | None = None
 
@@ -59,52 +59,52 @@ class Merged:
     ones: Gaussians | None = None
 
 
-def build(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Gaussians:
+def build(source: Source, grouping: Grouping, options: CompactOptions, log: RunLog) -> Gaussians:
     """The Gaussians of some superpixels: encoded, merged across views, decoded, fitted to the photos.
 
     Args:
         source: Scene and members.
         grouping: Superpixels, and the number of Gaussians that they are to become.
         options: All settings.
-        journal: Told what is done.
+        log: Told what is done.
 
     Returns:
         Canonical Gaussians.
     """
-    merged = merged_groups(source, grouping, options, journal)
-    with journal.stage("decode"):
+    merged = merged_groups(source, grouping, options, log)
+    with log.stage("decode"):
         gaussians = _decoded(merged, wanted_count(merged, grouping, options), options)
         if grouping.exact and len(gaussians) > grouping.wanted:  # K each would be more than the fit may grow to
             gaussians = _decoded(merged, grouping.wanted, options)
     if source.scene.images is None or not options.fit.looks:
         return gaussians
-    with journal.stage("fit"):
+    with log.stage("fit"):
         rival = None
         if merged.learned is not None and options.fit.fit == "full":
             rival = feature_to_gaussians(encode(source.scene, merged.members, grouping.groups, options.encode))
         del merged
-        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, journal, rival)
+        return _fitted(gaussians, source.scene, (grouping.wanted, grouping.exact), options, log, rival)
 
 
-def merged_groups(source: Source, grouping: Grouping, options: CompactOptions, journal: Journal) -> Merged:
+def merged_groups(source: Source, grouping: Grouping, options: CompactOptions, log: RunLog) -> Merged:
     """The Feature Gaussians of some superpixels, merged across views, with their members and any networks."""
     members = source.members
     if members is None:
-        with journal.stage("members"):
+        with log.stage("members"):
             members = members_of(source.scene, grouping.groups, options)
     if source.checkpoint is None:
-        return Merged(_merged_features(source.scene, members, grouping, options, journal, None), members, None)
+        return Merged(_merged_features(source.scene, members, grouping, options, log, None), members, None)
     networks, cameras = source.checkpoint.networks, source.scene.cameras
     learned = Learned(networks, members, cameras, options.seed, options.precision)
     if options.checkpoint == "auto":
-        return _better(source, (members, learned), grouping, options, journal)
-    journal.choices["networks"] = source.checkpoint.facts()
+        return _better(source, (members, learned), grouping, options, log)
+    log.choices["networks"] = source.checkpoint.facts()
     cut = _unchosen(grouping, options)
-    return Merged(_merged_features(source.scene, members, cut, options, journal, learned), members, learned)
+    return Merged(_merged_features(source.scene, members, cut, options, log, learned), members, learned)
 
 
 def _better(
-    source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, journal: Journal
+    source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, log: RunLog
 ) -> Merged:
     """Feature Gaussians with and without networks: those whose Gaussians, one for each, show the views better.
 
@@ -116,7 +116,7 @@ def _better(
     best: Merged | None = None
     scores: dict[str, float] = {}
     for name, used, cut in (("learned", learned, _unchosen(grouping, options)), ("analytic", None, grouping)):
-        own = Journal(journal.progress, journal.seconds)
+        own = RunLog(log.progress, log.seconds)
         features = _merged_features(source.scene, members, cut, options, own, used)
         with own.stage("choose"):
             ones = decode(features, members, replace(options.decode, k=1), None, options.encode.rule, used)
@@ -124,9 +124,9 @@ def _better(
         if best is None or scores[name] >= scores["learned"]:
             best, choices = Merged(features, members, used, ones), own.choices
     assert best is not None
-    journal.choices |= {**choices, "start_scores": scores}
+    log.choices |= {**choices, "start_scores": scores}
     if best.learned is not None:
-        journal.choices["networks"] = source.checkpoint.facts()
+        log.choices["networks"] = source.checkpoint.facts()
     return best
 
 
@@ -135,29 +135,29 @@ def _unchosen(grouping: Grouping, options: CompactOptions) -> Grouping:
     return grouping if options.robust.robust else replace(grouping, robust=False, coarse=None)
 
 
-def keep_all(scene: LooseScene, options: CompactOptions, journal: Journal) -> Gaussians:
+def keep_all(scene: UnalignedScene, options: CompactOptions, log: RunLog) -> Gaussians:
     """Every Gaussian as it is, fitted to the photos: what remains to be done where none has to go.
 
     Merging those that share a superpixel and splitting others would only blur, pass after pass.
     """
-    with journal.stage("fit"):
-        return _fitted(scene.gaussians, scene, (len(scene.gaussians), True), options, journal)
+    with log.stage("fit"):
+        return _fitted(scene.gaussians, scene, (len(scene.gaussians), True), options, log)
 
 
 def _merged_features(
-    scene: PixelScene | LooseScene,
+    scene: PixelScene | UnalignedScene,
     members: Members,
     grouping: Grouping,
     options: CompactOptions,
-    journal: Journal,
+    log: RunLog,
     learned: Learned | None,
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
-    with journal.stage("encode"):
+    with log.stage("encode"):
         features = encode(scene, members, grouping.groups, options.encode, learned)
     if not grouping.robust:
-        return _matched(features, options, journal, learned, lambda merged: merged)
-    with journal.stage("robust"):
+        return _matched(features, options, log, learned, lambda merged: merged)
+    with log.stage("robust"):
         backing = None
         if grouping.coarse is not None:
             backing = encode_backing(scene, members, grouping.coarse, options.backing)
@@ -165,21 +165,21 @@ def _merged_features(
         photos = scene_photos(scene, 2)
         aligned = isinstance(scene, PixelScene)
         features, choice = choose_merge(features, backing, photos, options.robust, left_out=aligned)
-        journal.choices["merge"], journal.choices["merge_scores"] = choice.name, choice.scores
+        log.choices["merge"], log.choices["merge_scores"] = choice.name, choice.scores
 
     def closed(merged: FeatureGaussians) -> FeatureGaussians:
         merged, choice = close_holes(merged, backing, photos, options.robust)
-        journal.choices["closed"] = choice.name
+        log.choices["closed"] = choice.name
         return merged
 
-    return _matched(features, options, journal, learned, closed)
+    return _matched(features, options, log, learned, closed)
 
 
 def wanted_count(merged: Merged, grouping: Grouping, options: CompactOptions) -> int | None:
     """Gaussians that the groups are to become where a number is to be met and no fit grows to it; None: K each."""
     if grouping.exact and not options.fit.grows:
         return grouping.wanted
-    return loose_count(merged.features, merged.members, grouping, options)
+    return unaligned_count(merged.features, merged.members, grouping, options)
 
 
 def _decoded(merged: Merged, wanted: int | None, options: CompactOptions) -> Gaussians:
@@ -194,27 +194,27 @@ def _decoded(merged: Merged, wanted: int | None, options: CompactOptions) -> Gau
 def _matched(
     features: FeatureGaussians,
     options: CompactOptions,
-    journal: Journal,
+    log: RunLog,
     learned: Learned | None,
     finish: Callable[[FeatureGaussians], FeatureGaussians],
 ) -> FeatureGaussians:
     """Merged across views; where networks are loaded, in line with their neighbours; then what ``finish`` does."""
-    with journal.stage("match"):
+    with log.stage("match"):
         matches = match(features, options.match, learned)
-        journal.choices["groups"], journal.choices["clusters"] = len(features), matches.count
+        log.choices["groups"], log.choices["clusters"] = len(features), matches.count
         features = merge(features, matches, learned)
         if learned is None:
             return finish(features)
-    with journal.stage("refine"):
+    with log.stage("refine"):
         return finish(refine(features, learned))
 
 
 def _fitted(
     gaussians: Gaussians,
-    scene: PixelScene | LooseScene,
+    scene: PixelScene | UnalignedScene,
     goal: tuple[int, bool],
     options: CompactOptions,
-    journal: Journal,
+    log: RunLog,
     rival: Gaussians | None = None,
 ) -> Gaussians:
     """Gaussians that no photo shows left out, the rest fitted to the photos.
@@ -222,13 +222,13 @@ def _fitted(
     ``goal``: how many, whether exactly; ``rival``: the start without networks, which the fit has to beat.
     """
     wanted, exact = goal
-    journal.choices["begun_with"] = len(gaussians)
+    log.choices["begun_with"] = len(gaussians)
     # where nothing grows to the number asked for, nothing may fall below it either
     settings = replace(options.fit, prune=0.0) if exact and not options.fit.grows else options.fit
     photos = scene_photos(scene), scene_photos(scene, 2)
-    gaussians, report = fit(gaussians, photos, settings, wanted, options.seed, journal.fit_progress, rival)
+    gaussians, report = fit(gaussians, photos, settings, wanted, options.seed, log.fit_progress, rival)
     if report:
-        journal.choices["fit"] = asdict(report)
+        log.choices["fit"] = asdict(report)
         if not report.accepted:
-            journal.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
     return gaussians

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.kernels.pool import decompose, pool
-from gsmerge.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, LooseScene, PixelScene
+from gsmerge.kernels.gaussians.pool import decompose, pool
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene
 
 Rule = Literal["depth", "paper"]
 
@@ -68,7 +68,7 @@ def scene_members(scene: PixelScene) -> Members:
     return gaussian_members(g, footprints)
 
 
-def loose_members(scene: LooseScene, pixels: np.ndarray) -> Members:
+def unaligned_members(scene: UnalignedScene, pixels: np.ndarray) -> Members:
     """The members of a canonical scene without an order, by the pixel that each belongs to.
 
     Args:

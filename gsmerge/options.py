@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gsmerge.allocate import AllocateOptions
-from gsmerge.backing import BackingOptions
-from gsmerge.contribution import ContributionOptions
-from gsmerge.decode import DecodeOptions
-from gsmerge.encode import EncodeOptions
-from gsmerge.fit import FitOptions
-from gsmerge.match import MatchOptions
-from gsmerge.robust import RobustOptions
-from gsmerge.segment import SegmentOptions
-from gsmerge.targets import TargetOptions
+from gsmerge.budget import TargetOptions
+from gsmerge.stages.assign import ContributionOptions
+from gsmerge.stages.backing import BackingOptions
+from gsmerge.stages.choose_merge import RobustOptions
+from gsmerge.stages.decode import DecodeOptions
+from gsmerge.stages.encode import EncodeOptions
+from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.match import MatchOptions
+from gsmerge.stages.region_tree import AllocateOptions
+from gsmerge.stages.segment import SegmentOptions
 
 METHODS = (
     "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "paper", "voxel", "opacity", "contribution", "random",

@@ -11,27 +11,38 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsmerge.allocate import RegionTree
 from gsmerge.baselines import Baseline, check_scene, find_baseline, unused_notes
 from gsmerge.build import Source, build, keep_all
-from gsmerge.canonical import NEAR, Frame
-from gsmerge.contribution import ContributionOptions
-from gsmerge.curve import LONG, SHORT, measure_curve
 from gsmerge.errors import UsageError
-from gsmerge.grouping import Canvas, Grouping, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
-from gsmerge.journal import STAGES, Journal, Progress
-from gsmerge.memory import peak_memory
-from gsmerge.metrics import psnr
 from gsmerge.moments import scene_members
 from gsmerge.networks import find_checkpoint
 from gsmerge.options import CompactOptions
-from gsmerge.photos import Photos, scene_photos
 from gsmerge.render import composite, plan_view, prepare
-from gsmerge.sampling import judged_views
-from gsmerge.targets import AUTO_RUNGS, MOST, RUNGS, count_within, curve_knee, level_counts, rungs, search_count
-from gsmerge.threads import parallel_map, use_threads
-from gsmerge.types import Gaussians, LooseScene, PixelScene
-from gsmerge.unaligned import make_ready
+from gsmerge.render.metrics import psnr
+from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.run_log import STAGES, Progress, RunLog
+from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.search import (
+    AUTO_RUNGS,
+    LONG,
+    MOST,
+    RUNGS,
+    SHORT,
+    count_within,
+    curve_knee,
+    level_counts,
+    measure_curve,
+    rungs,
+    search_count,
+)
+from gsmerge.stages.assign import ContributionOptions
+from gsmerge.stages.group import Canvas, Grouping, cut_scene, group_scene, knee_count, scene_canvas, scene_tree
+from gsmerge.stages.prepare import NEAR, Frame
+from gsmerge.stages.region_tree import RegionTree
+from gsmerge.stages.unaligned import make_ready
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.views import judged_views
 
 ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 AUTO_STEPS = 2  # times the usual ones
@@ -89,7 +100,7 @@ class Work:
     ``options`` are what is left without those.
     """
 
-    scene: PixelScene | LooseScene
+    scene: PixelScene | UnalignedScene
     frame: Frame
     source: Source
     options: CompactOptions
@@ -101,7 +112,7 @@ class Work:
 
 
 def compact(
-    scene: PixelScene | LooseScene,
+    scene: PixelScene | UnalignedScene,
     options: CompactOptions | None = None,
     *,
     progress: Progress | None = None,
@@ -124,19 +135,19 @@ def compact(
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
     options = _settled((options or CompactOptions()).with_settings(settings))
-    journal = Journal(progress)
+    log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, journal)
+        work = begin(scene, options, log)
         if options.target.target_psnr is not None:
-            result = _searched(work, options.target.target_psnr, journal)
+            result = _searched(work, options.target.target_psnr, log)
         else:
-            result = _built(work, decide(work, journal), journal)
+            result = _built(work, decide(work, log), log)
         counts = level_counts(len(result.gaussians), options.target.levels, work.canvas.least)
-        results = [result, *(_built(work, count, Journal(progress)) for count in counts)]
+        results = [result, *(_built(work, count, RunLog(progress)) for count in counts)]
         near = NEAR * work.frame.unit
         del work
         if scene.images is not None:  # last, when the kernels are there and the rest is gone
-            ending = Journal(progress)
+            ending = RunLog(progress)
             with ending.stage("input"):
                 before = input_psnr(scene.file_gaussians, scene_photos(scene), near)
             results = [_compared(one, before, ending.seconds if i == 0 else {}) for i, one in enumerate(results)]
@@ -161,49 +172,49 @@ def _settled(options: CompactOptions) -> CompactOptions:
 
 
 def begin(
-    scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal, frame: Frame | None = None
+    scene: PixelScene | UnalignedScene, settings: CompactOptions, log: RunLog, frame: Frame | None = None
 ) -> Work:
     """The scene in its own frame, or a given one, and its superpixels if they are to be cut to a number."""
-    target, baseline = settings.target, _rival(scene, settings, journal)
+    target, baseline = settings.target, _rival(scene, settings, log)
     if baseline is not None:  # nothing is set aside, and nothing is learned
         settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
     if scene.images is None and target.searches:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
-    with journal.stage("prepare"):
+    with log.stage("prepare"):
         ready = make_ready(scene, settings, frame)
         canonical, frame, options = ready.scene, ready.frame, ready.options
         known = isinstance(canonical, PixelScene) or options.checkpoint != "auto"  # they learnt from one per pixel
         name = options.networks(photos=scene.images is not None) if known else "none"
         checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
-        journal.notes += [*ready.notes, *notes, *_judged_note(scene)]
+        log.notes += [*ready.notes, *notes, *_judged_note(scene)]
         canvas = scene_canvas(canonical, options)
     members = scene_members(canonical) if isinstance(canonical, PixelScene) else None
     source = Source(canonical, members, checkpoint)
     plain = not target.searches and options.decode.k != "auto" and canvas.limit is None
     tree = None
     if baseline is None and (not plain or target.levels > 1):
-        with journal.stage("segment"):
+        with log.stage("segment"):
             tree = scene_tree(canonical, canvas, options, canvas.exact or canvas.usual)
     return Work(scene, frame, source, options, canvas, tree, ready.kept, settings, baseline)
 
 
-def _judged_note(scene: PixelScene | LooseScene) -> list[str]:
+def _judged_note(scene: PixelScene | UnalignedScene) -> list[str]:
     """A note where not all views are scored."""
     if scene.images is None or len(judged_views(len(scene))) == len(scene):
         return []
     return [f"the input views are scored on {len(judged_views(len(scene)))} of {len(scene)}"]
 
 
-def _rival(scene: PixelScene | LooseScene, settings: CompactOptions, journal: Journal) -> Baseline | None:
+def _rival(scene: PixelScene | UnalignedScene, settings: CompactOptions, log: RunLog) -> Baseline | None:
     """The rival method that was asked for, fit for the scene; what it does not look at is told."""
     baseline = find_baseline(settings.method)
     if baseline is not None:
         check_scene(baseline, scene)
-        journal.notes += unused_notes(baseline, settings)
+        log.notes += unused_notes(baseline, settings)
     return baseline
 
 
-def decide(work: Work, journal: Journal) -> int | None:
+def decide(work: Work, log: RunLog) -> int | None:
     """The number of Gaussians, as the options and the scene's own curve have it; None: as density and K say."""
     canvas, options, drop = work.canvas, work.options, work.options.target.max_drop
     if drop is None and options.decode.k != "auto":
@@ -211,31 +222,29 @@ def decide(work: Work, journal: Journal) -> int | None:
     assert work.tree is not None
     if work.scene.images is None:
         return knee_count(work.tree, canvas, options)
-    with journal.stage("curve"):
+    with log.stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, canvas.usual, canvas.least, canvas.most)
         steps = SHORT if drop is None else LONG
-        points = measure_curve(
-            replace(work.source, checkpoint=None), canvas, work.tree, options, steps, counts, journal
-        )
+        points = measure_curve(replace(work.source, checkpoint=None), canvas, work.tree, options, steps, counts, log)
     count = curve_knee(points) if drop is None else count_within(points, drop)
-    journal.choices["curve"] = [asdict(point) for point in points]
+    log.choices["curve"] = [asdict(point) for point in points]
     return count
 
 
-def _searched(work: Work, target: float, journal: Journal) -> CompactResult:
+def _searched(work: Work, target: float, log: RunLog) -> CompactResult:
     """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do."""
     results: dict[int, CompactResult] = {}
 
     def run(count: int) -> float:
-        own = Journal(journal.progress)
+        own = RunLog(log.progress)
         results[count] = _built(work, count, own)
         return results[count].report.psnr_after or 0.0
 
     most = min(work.canvas.most, MOST * work.canvas.usual)
     search = search_count(run, target, min(work.canvas.usual, most), work.canvas.least, most)
     result = results[search.count]
-    seconds = journal.seconds | {
-        name: sum(r.report.seconds.get(name, 0.0) for r in results.values()) + journal.seconds.get(name, 0.0)
+    seconds = log.seconds | {
+        name: sum(r.report.seconds.get(name, 0.0) for r in results.values()) + log.seconds.get(name, 0.0)
         for name in result.report.seconds
     }
     unmet = None
@@ -245,42 +254,40 @@ def _searched(work: Work, target: float, journal: Journal) -> CompactResult:
             f" with {len(result.gaussians)} Gaussians"
         )
     choices = result.report.choices | {"search": asdict(search)}
-    notes = [*journal.notes, *result.report.notes]
+    notes = [*log.notes, *result.report.notes]
     return replace(result, report=replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet))
 
 
-def _built(work: Work, count: int | None, journal: Journal) -> CompactResult:
+def _built(work: Work, count: int | None, log: RunLog) -> CompactResult:
     """One result: cut to a number of Gaussians, or as density and K say, built or made by a rival method, scored."""
     options, canvas = work.options, work.canvas
     if work.baseline is not None:
-        gaussians = work.baseline.run(work.source, canvas, options, canvas.usual if count is None else count, journal)
+        gaussians = work.baseline.run(work.source, canvas, options, canvas.usual if count is None else count, log)
     elif keeps_all(work, count):
-        assert isinstance(work.source.scene, LooseScene)
-        gaussians = keep_all(work.source.scene, options, journal)
+        assert isinstance(work.source.scene, UnalignedScene)
+        gaussians = keep_all(work.source.scene, options, log)
     else:
-        gaussians = build(work.source, choose_groups(work, count, journal), options, journal)
+        gaussians = build(work.source, choose_groups(work, count, log), options, log)
     gaussians = work.frame.leave(gaussians if work.kept is None else Gaussians.concat([gaussians, work.kept]))
     after = None
     if work.scene.images is not None:
-        with journal.stage("score"):
+        with log.stage("score"):
             after = input_psnr(gaussians, scene_photos(work.scene), NEAR * work.frame.unit)
     counts = work.scene.num_gaussians, len(gaussians)
     settings = work.settings.to_dict() | {"fit_steps": options.fit.steps}
-    report = CompactReport(
-        *counts, journal.seconds, None, after, journal.choices, journal.notes, settings, peak_memory()
-    )
+    report = CompactReport(*counts, log.seconds, None, after, log.choices, log.notes, settings, peak_memory())
     return CompactResult(gaussians, report)
 
 
 def keeps_all(work: Work, count: int | None) -> bool:
     """Whether so many Gaussians are asked for that a scene in no order need not be grouped."""
     scene = work.source.scene
-    return count is not None and isinstance(scene, LooseScene) and count >= len(scene.gaussians)
+    return count is not None and isinstance(scene, UnalignedScene) and count >= len(scene.gaussians)
 
 
-def choose_groups(work: Work, count: int | None, journal: Journal) -> Grouping:
+def choose_groups(work: Work, count: int | None, log: RunLog) -> Grouping:
     """Superpixels cut to a number of Gaussians, or as density and K say."""
-    with journal.stage("segment"):
+    with log.stage("segment"):
         if count is None:
             return group_scene(work.canvas, work.options)
         assert work.tree is not None

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.costs import COST_FIXED, fit_of, is_robust, memory_bytes, memory_problem, work_seconds
-from gsmerge.memory import machine_memory
+from gsmerge.runtime.estimate import COST_FIXED, fit_of, is_robust, memory_bytes, memory_problem, work_seconds
+from gsmerge.runtime.memory import machine_memory
 
 SCHEMA_VERSION = 1
 

@@ -195,7 +195,7 @@ class PixelScene:
 
 
 @dataclass(frozen=True)
-class LooseScene:
+class UnalignedScene:
     """Gaussians that belong to no pixels, with views that see them.
 
     Args:

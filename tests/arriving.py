@@ -11,8 +11,8 @@ import scenes
 import torch
 
 from gsmerge import Compactor, PixelScene
-from gsmerge.merge import take
 from gsmerge.online.state import OnlineState, Parts
+from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
 
 FAST: dict[str, Any] = {"density": 0.1, "robust": False, "checkpoint": "none"}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gsmerge.charts.proxies import SEGMENTATIONS, SHARES, Proxy
-from gsmerge.charts.record import RunRecord
+from gsmerge.research.charts.proxies import SEGMENTATIONS, SHARES, Proxy
+from gsmerge.research.charts.record import RunRecord
 
 SCENES = ("apples", "fern", "fox")
 LEVELS = {"apples": 2.0, "fern": 0.0, "fox": -3.0}  # how hard a scene is, dB

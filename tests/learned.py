@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from scenes import arc, make_scene, room
 
-from gsmerge.encode import EncodeOptions, encode
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks import Learned, NetworkOptions, Networks, save_checkpoint
+from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.types import FeatureGaussians, Groups, PixelScene
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)

@@ -8,24 +8,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge import Cameras, Gaussians, LooseScene, PixelScene
+from gsmerge import Cameras, Gaussians, PixelScene, UnalignedScene
 
 NO_CAMERAS = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
 
 
-def loosened(scene: PixelScene, order: Tensor | None = None) -> LooseScene:
+def loosened(scene: PixelScene, order: Tensor | None = None) -> UnalignedScene:
     """The same Gaussians without their order."""
     gaussians = scene.gaussians if order is None else scene.gaussians[order]
-    return LooseScene(gaussians, scene.cameras, scene.images, scene.names)
+    return UnalignedScene(gaussians, scene.cameras, scene.images, scene.names)
 
 
-def shuffled(scene: PixelScene, seed: int = 0) -> LooseScene:
+def shuffled(scene: PixelScene, seed: int = 0) -> UnalignedScene:
     """In a random order."""
     order = torch.randperm(len(scene.gaussians), generator=torch.Generator().manual_seed(seed))
     return loosened(scene, order)
 
 
-def voxels(scene: PixelScene, size: float) -> LooseScene:
+def voxels(scene: PixelScene, size: float) -> UnalignedScene:
     """One Gaussian per occupied cell: the means of what it holds."""
     g = scene.gaussians
     cells = np.floor(g.means.double().numpy() / size).astype(np.int64)
@@ -40,7 +40,7 @@ def voxels(scene: PixelScene, size: float) -> LooseScene:
 
     merged = Gaussians(*(mean(t).float() for t in vars(g).values()))
     merged = replace(merged, quats=torch.nn.functional.normalize(merged.quats, dim=1))
-    return LooseScene(merged, scene.cameras, scene.images, scene.names)
+    return UnalignedScene(merged, scene.cameras, scene.images, scene.names)
 
 
 def far_behind(gaussians: Gaussians, count: int) -> Gaussians:

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from gsmerge import Cameras, Gaussians, PixelScene, compact, render
 from gsmerge.geometry import covariances, quat_to_rotmat
-from gsmerge.photos import Photos, scene_photos
 from gsmerge.pipeline import CompactReport, CompactResult
-from gsmerge.sampling import subset
+from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.types import SH_C0, FeatureGaussians
+from gsmerge.views import subset
 
 Texture = Callable[[np.ndarray], np.ndarray]
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gsmerge.networks import NetworkOptions
-from gsmerge.training import TrainOptions
+from gsmerge.research.training import TrainOptions
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 OPTIONS = TrainOptions(

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gsmerge.build import Source
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.group import Canvas
 from gsmerge.types import Gaussians, PixelScene
 
 Need = Literal["photos", "pixels", "node"]
-Run = Callable[[Source, Canvas, CompactOptions, int, Journal], Gaussians]
+Run = Callable[[Source, Canvas, CompactOptions, int, RunLog], Gaussians]
 
 COUNTS = ("budget", "max_bytes", "preset", "superpixels", "density", "k")  # settings that decide how many
 

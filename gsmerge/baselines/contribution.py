@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.allocate import trim
 from gsmerge.baselines.baseline import Baseline, own_gaussians
 from gsmerge.build import Source
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
 from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.threads import parallel_map
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.group import Canvas
+from gsmerge.stages.region_tree import trim
 from gsmerge.types import Cameras, Gaussians
 
 AT_ONCE = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
@@ -33,10 +33,10 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     return total
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """Those that show most, unchanged and in their order; of equal ones the first of the file."""
     gaussians = own_gaussians(source)
-    with journal.stage("reduce"):
+    with log.stage("reduce"):
         return gaussians[trim(summed_weights(gaussians, source.scene.cameras), count)]
 
 

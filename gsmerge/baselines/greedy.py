@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from gsmerge.baselines.baseline import Baseline, own_gaussians
 from gsmerge.build import Source
 from gsmerge.geometry import covariances
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.options import CompactOptions
-from gsmerge.threads import parallel_map, use_threads
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.stages.group import Canvas
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
@@ -199,12 +199,12 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """Exactly ``count``; the input itself where it has no more."""
     gaussians = own_gaussians(source)
     if len(gaussians) <= count:
         return gaussians
-    with journal.stage("reduce"):
+    with log.stage("reduce"):
         return gaussians_of(reduce_to(cloud_of(gaussians), count))
 
 

@@ -11,31 +11,31 @@ import torch
 
 from gsmerge.baselines.baseline import Baseline, view_shares
 from gsmerge.build import Source
-from gsmerge.decode import DecodeOptions, decode
-from gsmerge.encode import EncodeOptions, encode
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
-from gsmerge.segment import superpixels
-from gsmerge.threads import parallel_map
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.group import Canvas
+from gsmerge.stages.segment import superpixels
+from gsmerge.stages.unaligned import members_of
 from gsmerge.types import Gaussians, Groups
-from gsmerge.unaligned import members_of
 
 SEGMENTATION = "bass-st"
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """As many superpixels as Gaussians, the same number in every view; those that hold nothing are left out."""
     scene = source.scene
     counts = view_shares(count, len(scene), scene.pixels_per_view)
-    with journal.stage("segment"):
+    with log.stage("segment"):
         views = range(len(scene))
         labels = parallel_map(lambda view: superpixels(canvas.pictures[view], counts[view], SEGMENTATION), views)
         groups = Groups(torch.stack(labels), tuple(counts))
-    with journal.stage("encode"):
+    with log.stage("encode"):
         members = members_of(scene, groups, options) if source.members is None else source.members
         features = encode(scene, members, groups, EncodeOptions(rule="paper"))
-    with journal.stage("decode"):
+    with log.stage("decode"):
         return decode(features, members, DecodeOptions(min_opacity=0.0), rule="paper")
 
 

@@ -16,7 +16,7 @@ from gsmerge.baselines.unmerged_fit import UNMERGED_FIT
 from gsmerge.baselines.voxel import VOXEL
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
-from gsmerge.types import LooseScene, PixelScene
+from gsmerge.types import PixelScene, UnalignedScene
 
 _ALL = (
     UNMERGED, UNMERGED_COLOR, UNMERGED_FIT, PAPER, VOXEL, OPACITY, CONTRIBUTION, RANDOM, BLOCKS, GREEDY,
@@ -39,7 +39,7 @@ def find_baseline(name: str) -> Baseline | None:
     return BASELINES[name]
 
 
-def check_scene(baseline: Baseline, scene: PixelScene | LooseScene) -> None:
+def check_scene(baseline: Baseline, scene: PixelScene | UnalignedScene) -> None:
     """Whether a scene has what a method needs.
 
     Raises:
@@ -47,7 +47,7 @@ def check_scene(baseline: Baseline, scene: PixelScene | LooseScene) -> None:
     """
     if "photos" in baseline.needs and scene.images is None:
         raise UsageError(f"method {baseline.name}: expected photos, found none; give --images, or another --method")
-    if "pixels" in baseline.needs and isinstance(scene, LooseScene):
+    if "pixels" in baseline.needs and isinstance(scene, UnalignedScene):
         raise UsageError(
             f"method {baseline.name}: expected one Gaussian per pixel, found them in no order; give another --method"
         )

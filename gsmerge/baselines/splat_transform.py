@@ -15,10 +15,10 @@ from pathlib import Path
 from gsmerge.baselines.baseline import Baseline, own_gaussians
 from gsmerge.build import Source
 from gsmerge.errors import GsmergeError, UsageError
-from gsmerge.grouping import Canvas
 from gsmerge.io import read_ply, write_ply
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.group import Canvas
 from gsmerge.types import Gaussians
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
@@ -42,7 +42,7 @@ def find_program() -> str:
     return found
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that.
 
     Raises:
@@ -56,7 +56,7 @@ def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, jou
         given, made = Path(folder) / "in.ply", Path(folder) / "out.ply"
         write_ply(given, gaussians)
         command = [program, "-w", "-g", "cpu", str(given), "-d", str(count), str(made)]
-        with journal.stage("reduce"):
+        with log.stage("reduce"):
             done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
         if done.returncode != 0 or not made.exists():
             raise GsmergeError(_failure(program, done))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
 from gsmerge.build import Source
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.group import Canvas
 from gsmerge.types import Gaussians
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """All Gaussians, whatever the count."""
     return own_gaussians(source)
 

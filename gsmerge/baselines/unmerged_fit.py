@@ -6,30 +6,30 @@ from dataclasses import asdict, fields, replace
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
 from gsmerge.build import Source
-from gsmerge.fit import FitOptions, fit
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
-from gsmerge.photos import scene_photos
+from gsmerge.render.photos import scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.fit import FitOptions, fit
+from gsmerge.stages.group import Canvas
 from gsmerge.types import Gaussians
 
 
-def fitted_input(source: Source, settings: FitOptions, seed: int, journal: Journal) -> Gaussians:
+def fitted_input(source: Source, settings: FitOptions, seed: int, log: RunLog) -> Gaussians:
     """All Gaussians, fitted to the photos; those that no photo shows make way for others, so the number stays."""
     gaussians = own_gaussians(source)
-    with journal.stage("fit"):
+    with log.stage("fit"):
         photos = scene_photos(source.scene), scene_photos(source.scene, 2)
-        gaussians, report = fit(gaussians, photos, settings, len(gaussians), seed, journal.fit_progress)
+        gaussians, report = fit(gaussians, photos, settings, len(gaussians), seed, log.fit_progress)
     if report:
-        journal.choices["fit"] = asdict(report)
+        log.choices["fit"] = asdict(report)
         if not report.accepted:
-            journal.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
     return gaussians
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """As many steps as ours by default, as much time with a time budget; whatever the count."""
-    return fitted_input(source, replace(options.fit, fit="full"), options.seed, journal)
+    return fitted_input(source, replace(options.fit, fit="full"), options.seed, log)
 
 
 UNMERGED_FIT = Baseline(

@@ -14,9 +14,9 @@ import torch
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
 from gsmerge.build import Source
-from gsmerge.grouping import Canvas
-from gsmerge.journal import Journal
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.group import Canvas
 from gsmerge.types import Gaussians
 
 BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
@@ -79,13 +79,13 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)).float() for array in arrays))
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, journal: Journal) -> Gaussians:
+def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
     """At most ``count`` voxels, and hardly fewer."""
     gaussians = own_gaussians(source)
-    with journal.stage("reduce"):
+    with log.stage("reduce"):
         means = gaussians.means.double().numpy()
         size = voxel_size(means, count)
-        journal.choices["voxel_size"] = size
+        log.choices["voxel_size"] = size
         return fuse(gaussians, voxel_keys(means, size))
 
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.batch.options import BatchOptions
-from gsmerge.contents import stem_of
-from gsmerge.costs import memory_bytes
+from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.files import level_output
 from gsmerge.io.bounds import read_text
-from gsmerge.io.ply_file import promised
+from gsmerge.io.content_hash import stem_of
+from gsmerge.io.formats.ply_file import promised
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
+from gsmerge.runtime.estimate import memory_bytes
 
 SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *IMAGE_PLACES}
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from string import Formatter
 from typing import Any
 
-from gsmerge.contents import digest
-from gsmerge.io import AUTO, OUTPUT_FORMATS, Reading, output_format
-from gsmerge.io.ply import OpacityChoice
+from gsmerge.io import AUTO, OUTPUT_FORMATS, ReadHints, output_format
+from gsmerge.io.content_hash import digest
+from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.options import CompactOptions
 
 FIELDS = ("stem", "parent", "index", "k")
@@ -22,7 +22,7 @@ class BatchOptions:
     Args:
         settings: Of every scene. ``threads``: those of one scene; None: processors by jobs.
         opacity: How all files store opacity.
-        reading: What is told of all files instead of found.
+        hints: What is told of all files instead of found.
         cameras: Cameras of a scene: one path for all, or with ``{scene}``, ``{parent}`` and ``{stem}`` in it; None:
             found beside each.
         images: The same for the folder of photos.
@@ -43,7 +43,7 @@ class BatchOptions:
 
     settings: CompactOptions = field(default_factory=CompactOptions)
     opacity: OpacityChoice = "auto"
-    reading: Reading = AUTO
+    hints: ReadHints = AUTO
     cameras: str | None = None
     images: str | None = None
     output: str = "{stem}.ply"
@@ -79,7 +79,7 @@ class BatchOptions:
         """Everything that the bytes of a result hang on beside the scene's files, as plain values."""
         settings = self.settings.to_dict()
         del settings["threads"]
-        return {"settings": settings, "opacity": self.opacity, "reading": vars(self.reading)}
+        return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
         """One for all runs that may share an output folder: they make the same of the same scenes."""

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from gsmerge.batch.find import Job
 from gsmerge.batch.options import BatchOptions
-from gsmerge.contents import cameras_of
-from gsmerge.costs import COST_FIXED, work_seconds
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
+from gsmerge.io.content_hash import cameras_of
 from gsmerge.report import human_bytes
-from gsmerge.threads import available_threads
+from gsmerge.runtime.estimate import COST_FIXED, work_seconds
+from gsmerge.runtime.threads import available_threads
 
 SHARE = 0.8  # of the memory that is free, where no limit is told
 

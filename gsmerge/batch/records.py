@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
-from gsmerge.lines import each_line
 from gsmerge.report import document_head, file_sha256
+from gsmerge.runtime.jsonl import each_line
 
 RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
 DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records

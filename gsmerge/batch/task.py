@@ -24,14 +24,14 @@ from gsmerge.batch.records import (
     record,
     written_files,
 )
-from gsmerge.contents import content_hash, digest, filled, read_files
+from gsmerge.compact_file import compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
-from gsmerge.files import compact_files
 from gsmerge.io import SceneFiles, find_scene_files
 from gsmerge.io.atomic import remove_leftovers
-from gsmerge.lines import append_line
+from gsmerge.io.content_hash import content_hash, digest, filled, read_files
 from gsmerge.options import CHECKPOINTS
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
+from gsmerge.runtime.jsonl import append_line
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def _compacted(task: Task, work: Work, files: SceneFiles, key: str) -> dict[str,
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("default")
         document = compact_files(
-            files, options.settings, out, opacity=options.opacity, reading=options.reading, overwrite=True, hashed=True
+            files, options.settings, out, opacity=options.opacity, hints=options.hints, overwrite=True, hashed=True
         )
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in told))
     names = [job.output, *(os.path.relpath(level["path"], work.folder) for level in document["levels"])]

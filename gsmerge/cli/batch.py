@@ -102,7 +102,7 @@ def batch(
     cameras: Cameras = None,
     images: Images = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -145,7 +145,7 @@ def batch(
     """Compact many scenes, each on its own: what fails stops nothing else, what is done is not done again."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"--out: expected a folder, found the file {out}")
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.batch import BatchOptions, find_jobs
     from gsmerge.batch.plan import make_shape
     from gsmerge.batch.records import Index
@@ -154,7 +154,7 @@ def batch(
     given = {name: context.params[name] for name in names} | {"jobs": context.params["jobs"] or None}
     with told_as_usage():
         options = BatchOptions(
-            given_settings(context.params), opacity.value, reading, max_memory=_bytes(max_memory), rerun=not resume,
+            given_settings(context.params), opacity.value, hints, max_memory=_bytes(max_memory), rerun=not resume,
             engine=engine.value, **given,
         )  # fmt: skip
     if options.engine == "ray" and not dry_run:
@@ -173,7 +173,7 @@ def batch(
 
 
 def _bytes(text: str | None) -> int | None:
-    from gsmerge.allocate import parse_bytes
+    from gsmerge.budget import parse_bytes
 
     try:
         return None if text is None else parse_bytes(text)

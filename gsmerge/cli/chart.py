@@ -19,9 +19,9 @@ from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import BatchError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.charts.experiment import Grid
-    from gsmerge.charts.record import RunRecord
-    from gsmerge.charts.run import Plan, RunOptions
+    from gsmerge.research.charts.experiment import Grid
+    from gsmerge.research.charts.record import RunRecord
+    from gsmerge.research.charts.run import Plan, RunOptions
 
 GRID, MEASURING = "Grid: comma-separated lists, whose product is run", "Measuring"
 
@@ -81,7 +81,7 @@ def chart(
     fixed: Fixed = None,
     grid: GridFile = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -107,12 +107,12 @@ def chart(
     if draw_only:
         _tell(_drawn(out, [], 0), 0, as_json=json, quiet=quiet)
         return
-    from gsmerge.charts.run import RunOptions
+    from gsmerge.research.charts.run import RunOptions
 
     lists = {"methods": methods, "k": k, "budgets": budgets, "densities": densities, "segmentations": segmentations}
     lists |= {"fit": fit, "efforts": efforts, "matches": matches, "views": views}
     typed: dict[str, Any] = {**lists, "fixed": fixed, "grid": grid, "targets": targets, "target_images": target_images}
-    read = {"opacity": opacity.value, "dialect": dialect, "quats": quats.value, "order": order.value}
+    read = {"opacity": opacity.value, "exporter": exporter, "quats": quats.value, "order": order.value}
     typed |= {name: value for name, value in read.items() if value != "auto"}
     typed |= {
         "scene_scale": scene_scale,
@@ -124,9 +124,9 @@ def chart(
     command = _command(given, out, {**typed, "seed": seed, "threads": threads})
     nets, missing = networks(lpips)
     with told_as_usage():
-        reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+        hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
         told = RunOptions(
-            nets, lpips_views, seed or 0, threads, proxy_views, rerun, command, reading=reading, opacity=opacity.value
+            nets, lpips_views, seed or 0, threads, proxy_views, rerun, command, hints=hints, opacity=opacity.value
         )
     plan, stored, notes = _planned(given, _grid(grid, lists, fixed), out, targets, target_images, told)
     notes = [*missing, *notes]
@@ -150,7 +150,7 @@ def _check_usage(scenes: Sequence[Path], out: Path, *, draw_only: bool, dry_run:
         raise UsageError("--dry-run: expected something to run, got --draw-only")
     _check_out(out, scenes)
     if not dry_run:
-        from gsmerge.charts.draw import require_matplotlib
+        from gsmerge.research.charts.draw import require_matplotlib
 
         require_matplotlib()
 
@@ -164,7 +164,7 @@ def _check_out(out: Path, scenes: Sequence[Path]) -> None:
 
 
 def _grid(file: Path | None, lists: dict[str, str | None], fixed: Sequence[str] | None) -> Grid:
-    from gsmerge.charts.experiment import Grid, parse_grid, read_grid
+    from gsmerge.research.charts.experiment import Grid, parse_grid, read_grid
 
     base = Grid() if file is None else read_grid(file)
     return parse_grid(lists, replace(base, fixed=tuple(fixed)) if fixed else base)
@@ -182,9 +182,9 @@ def _command(scenes: Sequence[Path], out: Path, told: dict[str, Any]) -> str:
 def _planned(
     scenes: Sequence[Path], grid: Grid, out: Path, targets: str | None, target_images: str | None, options: RunOptions
 ) -> tuple[Plan, dict[str, RunRecord], list[str]]:
-    from gsmerge.charts.experiment import make_experiments
-    from gsmerge.charts.places import find_places
-    from gsmerge.charts.run import make_plan
+    from gsmerge.research.charts.experiment import make_experiments
+    from gsmerge.research.charts.places import find_places
+    from gsmerge.research.charts.run import make_plan
 
     experiments, notes = make_experiments(scenes, grid)
     plan, stored = make_plan(experiments, find_places(scenes, targets, target_images), out, options)
@@ -192,7 +192,7 @@ def _planned(
 
 
 def _run(plan: Plan, out: Path, options: RunOptions, *, quiet: bool) -> tuple[list[RunRecord], list[str]]:
-    from gsmerge.charts.run import run_plan
+    from gsmerge.research.charts.run import run_plan
 
     if plan.total == 0:
         return [], []
@@ -203,10 +203,10 @@ def _run(plan: Plan, out: Path, options: RunOptions, *, quiet: bool) -> tuple[li
 def _print_plan(
     plan: Plan, stored: dict[str, RunRecord], options: RunOptions, out: Path, notes: Sequence[str], *, as_json: bool
 ) -> None:
-    from gsmerge.charts.estimate import estimate_seconds
-    from gsmerge.charts.run import describe
     from gsmerge.report import document_head, to_json
-    from gsmerge.threads import available_threads
+    from gsmerge.research.charts.estimate import estimate_seconds
+    from gsmerge.research.charts.run import describe
+    from gsmerge.runtime.threads import available_threads
 
     runs = [run for run in plan.runs if run[0] in plan.pending]
     threads = options.threads or available_threads()
@@ -238,14 +238,14 @@ def _print_plan(
 
 def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     """Charts and page of everything in the folder; what was made, as a document."""
-    from gsmerge.charts.draw import draw_figures
-    from gsmerge.charts.figures import make_figures, make_verdicts
-    from gsmerge.charts.page import make_page
-    from gsmerge.charts.proxies import read_proxies
-    from gsmerge.charts.series import newest
-    from gsmerge.charts.store import CHARTS, PAGE, read_runs
     from gsmerge.io import atomic_output
     from gsmerge.report import document_head
+    from gsmerge.research.charts.draw import draw_figures
+    from gsmerge.research.charts.figures import make_figures, make_verdicts
+    from gsmerge.research.charts.page import make_page
+    from gsmerge.research.charts.proxies import read_proxies
+    from gsmerge.research.charts.series import newest
+    from gsmerge.research.charts.store import CHARTS, PAGE, read_runs
 
     stored, told = read_runs(out)
     proxies, more = read_proxies(out)

@@ -18,8 +18,8 @@ from gsmerge.cli.settings import given_settings, reading_of, told_as_usage
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
-    from gsmerge.io import Reading, SceneFiles
-    from gsmerge.io.ply import OpacityChoice
+    from gsmerge.io import ReadHints, SceneFiles
+    from gsmerge.io.formats.ply import OpacityChoice
     from gsmerge.options import CompactOptions
 
 
@@ -29,7 +29,7 @@ def compact(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -69,8 +69,8 @@ def compact(
 ) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
-    from gsmerge.files import level_output
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
+    from gsmerge.compact_file import level_output
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)
@@ -84,11 +84,11 @@ def compact(
         check_output(report, (*inputs, *outputs), overwrite=overwrite)
     settings = given_settings(context.params)
     if dry_run:
-        print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
+        print_plan(files, settings, out, opacity=opacity.value, hints=hints, as_json=json)
         return
     warn_of_memory(files, quiet=quiet or json)
     document = _run(
-        files, settings, out, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
+        files, settings, out, opacity=opacity.value, hints=hints, overwrite=overwrite, quiet=quiet or json,
         start=start, hashed=json or report is not None,
     )  # fmt: skip
     _tell(document, report, as_json=json, quiet=quiet, overwrite=overwrite)
@@ -98,9 +98,9 @@ def compact(
 
 def warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
     """Say so before anything is read if the scene is not likely to fit into this machine's memory."""
-    from gsmerge.costs import memory_bytes, memory_problem
-    from gsmerge.io.ply_file import promised
-    from gsmerge.memory import machine_memory
+    from gsmerge.io.formats.ply_file import promised
+    from gsmerge.runtime.estimate import memory_bytes, memory_problem
+    from gsmerge.runtime.memory import machine_memory
 
     count, num_rest = promised(files.ply)
     problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
@@ -114,14 +114,14 @@ def _run(
     out: Path,
     *,
     opacity: OpacityChoice,
-    reading: Reading,
+    hints: ReadHints,
     overwrite: bool,
     quiet: bool,
     start: float,
     hashed: bool,
 ) -> dict[str, Any]:
     """Read, compact and write; returns the report."""
-    from gsmerge.files import compact_files
+    from gsmerge.compact_file import compact_files
 
     imported = perf_counter()
     with (
@@ -136,7 +136,7 @@ def _run(
                 progress(stage, done, total)
 
         return compact_files(
-            files, settings, out, opacity=opacity, reading=reading, overwrite=overwrite, progress=moved,
+            files, settings, out, opacity=opacity, hints=hints, overwrite=overwrite, progress=moved,
             hashed=hashed, seconds_before={"import": imported - start},
         )  # fmt: skip
 
@@ -162,16 +162,16 @@ def _tell(document: Mapping[str, Any], report: Path | None, *, as_json: bool, qu
 
 
 def print_plan(
-    files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, reading: Reading, as_json: bool
+    files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, hints: ReadHints, as_json: bool
 ) -> None:
     """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import check_scene, find_baseline, unused_notes
-    from gsmerge.files import read_input
-    from gsmerge.grouping import asked_per_view, limit_of, usual_count
+    from gsmerge.compact_file import read_input
     from gsmerge.report import plan_document, plan_lines, to_json
-    from gsmerge.threads import available_threads
+    from gsmerge.runtime.threads import available_threads
+    from gsmerge.stages.group import asked_per_view, limit_of, usual_count
 
-    given = read_input(files, settings.segment, opacity=opacity, reading=reading)
+    given = read_input(files, settings.segment, opacity=opacity, hints=hints)
     scene, cameras = given.scene, given.scene.cameras
     baseline, unused = find_baseline(settings.method), []
     with told_as_usage():

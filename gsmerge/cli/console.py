@@ -65,7 +65,7 @@ def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callab
         say("compiling kernels for their first use, up to 30 s", quiet=quiet)
         if share and (os.cpu_count() or 1) > 1:
             silent = subprocess.DEVNULL
-            command = [sys.executable, "-m", "gsmerge.warm"]
+            command = [sys.executable, "-m", "gsmerge.stages.fit.warm"]
             second.append(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
 
     def finish() -> None:

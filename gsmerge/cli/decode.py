@@ -101,11 +101,11 @@ def _run(
     path: Path, out: Path, settings: CompactOptions, params: Mapping[str, Any], start: float, *, quiet: bool
 ) -> dict[str, Any]:
     """Read, decode and write; returns the report."""
+    from gsmerge.encoded.decode import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.file import load_stored
     from gsmerge.online.fitted import as_decoded, check_fit, decode_stored, num_photos, usual_fit
     from gsmerge.report import document_head, seconds_document
-    from gsmerge.stored.decode import plan_decode
 
     imported, wish = perf_counter(), {"k": params["k"], "budget": params["budget"]}
     stored = load_stored(path)

@@ -18,10 +18,10 @@ from gsmerge.cli.paths import check_output, input_files
 from gsmerge.cli.settings import given_settings, reading_of
 
 if TYPE_CHECKING:
-    from gsmerge.io import Reading, SceneFiles
-    from gsmerge.io.ply import OpacityChoice
+    from gsmerge.encoded.encoded import Encoded
+    from gsmerge.io import ReadHints, SceneFiles
+    from gsmerge.io.formats.ply import OpacityChoice
     from gsmerge.options import CompactOptions
-    from gsmerge.stored.encoded import Encoded
 
 MaxKOption = Annotated[
     int | None,
@@ -45,7 +45,7 @@ def encode(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -77,7 +77,7 @@ def encode(
 ) -> None:
     """Keep a scene as merged Feature Gaussians, of which gsmerge decode makes what compact --fit none makes."""
     start = perf_counter()
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files
 
     files = find_scene_files(scene, cameras=cameras, images=images)
@@ -85,10 +85,10 @@ def encode(
     check_output(out, (*input_files(files), *net.checkpoint_files(checkpoint)), overwrite=overwrite)
     settings = given_settings({**context.params, "fit": "none"})
     if dry_run:
-        print_plan(files, settings, out, opacity=opacity.value, reading=reading, as_json=json)
+        print_plan(files, settings, out, opacity=opacity.value, hints=hints, as_json=json)
         return
     document = _run(
-        files, settings, out, max_k, opacity=opacity.value, reading=reading, overwrite=overwrite, quiet=quiet or json,
+        files, settings, out, max_k, opacity=opacity.value, hints=hints, overwrite=overwrite, quiet=quiet or json,
         start=start,
     )  # fmt: skip
     say_notes(document["notes"], quiet=quiet or json)
@@ -107,21 +107,21 @@ def _run(
     max_k: int | None,
     *,
     opacity: OpacityChoice,
-    reading: Reading,
+    hints: ReadHints,
     overwrite: bool,
     quiet: bool,
     start: float,
 ) -> dict[str, Any]:
     """Read, encode and write; returns the report."""
-    from gsmerge.files import read_input
+    from gsmerge.compact_file import read_input
+    from gsmerge.encoded.encode import encode_scene
+    from gsmerge.encoded.file import save_encoded
     from gsmerge.io import atomic_output
     from gsmerge.report import file_sha256
-    from gsmerge.stored.encode import encode_scene
-    from gsmerge.stored.file import save_encoded
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        given = read_input(files, settings.segment, opacity=opacity, reading=reading)
+        given = read_input(files, settings.segment, opacity=opacity, hints=hints)
         read = perf_counter()
         with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
             encoded = encode_scene(given.scene, settings, max_k=max_k, progress=progress)

@@ -17,9 +17,9 @@ from gsmerge.cli.settings import reading_of, told_as_usage
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.evaluate import EvaluateOptions, Evaluation, Views
     from gsmerge.io import PlyInfo
-    from gsmerge.types import Gaussians, LooseScene, PixelScene
+    from gsmerge.measure.evaluate import EvaluateOptions, Evaluation, Views
+    from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 
 def evaluate(
@@ -30,7 +30,7 @@ def evaluate(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -72,11 +72,11 @@ def evaluate(
     debug: opt.DebugOption = False,
 ) -> None:
     """Measure compact scenes against photos: PSNR, SSIM, LPIPS, counts, sizes, render time."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     if not context and targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
-    from gsmerge.evaluate import EvaluateOptions
     from gsmerge.io import find_scene_files, load_files, read_ply
+    from gsmerge.measure.evaluate import EvaluateOptions
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     paths = results or []
@@ -84,7 +84,7 @@ def evaluate(
     nets, missing = networks(lpips)
     with told_as_usage():
         options = EvaluateOptions(nets, lpips_views, context, threads=threads)
-    load = load_files(files, opacity=opacity.value, reading=reading)
+    load = load_files(files, opacity=opacity.value, hints=hints)
     require_views(load)
     measured, held_out, adapted = held_out_views(load, targets, target_images, views)
     plys = {name: read_ply(path) for name, path in zip(file_names(paths), paths, strict=True)}
@@ -101,14 +101,14 @@ def _file(info: PlyInfo) -> dict[str, Any]:
 
 
 def _measure(
-    scene: PixelScene | LooseScene,
+    scene: PixelScene | UnalignedScene,
     held_out: Views | None,
     gaussians: dict[str, Gaussians],
     options: EvaluateOptions,
     *,
     quiet: bool,
 ) -> Evaluation:
-    from gsmerge.evaluate import evaluate as evaluate_scene
+    from gsmerge.measure.evaluate import evaluate as evaluate_scene
 
     with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
         return evaluate_scene(scene, gaussians, held_out, options, progress=progress)
@@ -127,8 +127,8 @@ def _tell(
 ) -> None:
     """The figures where they were asked for: files, stdout, or a table."""
     from gsmerge.io import atomic_output
+    from gsmerge.measure.scores import evaluation_csv, evaluation_document, evaluation_lines
     from gsmerge.report import to_json
-    from gsmerge.scores import evaluation_csv, evaluation_document, evaluation_lines
 
     document = evaluation_document(found, facts, notes)
     for path, text in ((report, to_json(document)), (csv, evaluation_csv(document))):

@@ -79,7 +79,7 @@ def extend(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -109,7 +109,7 @@ def extend(
 ) -> None:
     """Add new views to a state, which gsmerge decode turns into a compact scene at any time."""
     start = perf_counter()
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     if len(scenes) > 1 and (cameras is not None or images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.io import find_scene_files
@@ -126,7 +126,7 @@ def extend(
             before = {"import": perf_counter() - start} if not documents else {}
             with stage_progress(quiet=quiet or json) as progress:
                 document = extend_file(
-                    state, files, settings, opacity=opacity.value, reading=reading, progress=progress,
+                    state, files, settings, opacity=opacity.value, hints=hints, progress=progress,
                     seconds_before=before,
                 )  # fmt: skip
             documents.append(document)

@@ -17,7 +17,7 @@ from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.generate import Generated, GenerateOptions
+    from gsmerge.research.generate import Generated, GenerateOptions
 
 SCENE, ERRORS = "Scenes", "Errors"
 
@@ -91,8 +91,8 @@ def _made(
     quiet: bool,
 ) -> list[Generated]:
     """Make the scenes, or say which there would be."""
-    from gsmerge.generate import generate as make_scenes
-    from gsmerge.generate import plan
+    from gsmerge.research.generate import generate as make_scenes
+    from gsmerge.research.generate import plan
 
     if dry_run:
         return plan(out, scenes, options, **how)
@@ -112,7 +112,7 @@ def _options(views: str, size: str, style: str, path: str, noise: float, ranges:
         UsageError: If a value is none of the possible ones.
         SceneError: If the file of ranges cannot be read.
     """
-    from gsmerge.generate import GenerateOptions, read_ranges
+    from gsmerge.research.generate import GenerateOptions, read_ranges
 
     counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", views)
     if counts is None:

@@ -11,9 +11,9 @@ from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.evaluate import Views
     from gsmerge.io import SceneLoad
-    from gsmerge.types import LooseScene, PixelScene
+    from gsmerge.measure.evaluate import Views
+    from gsmerge.types import PixelScene, UnalignedScene
 
 _NETS = {Lpips.both: ("vgg", "alex"), Lpips.vgg: ("vgg",), Lpips.alex: ("alex",), Lpips.none: ()}
 
@@ -24,7 +24,7 @@ def networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
     Raises:
         UsageError: If somebody did.
     """
-    from gsmerge.perceptual import INSTALL, lpips_available
+    from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if asked is not None:
         if not all(map(lpips_available, _NETS[asked])):
@@ -47,11 +47,11 @@ def require_views(load: SceneLoad) -> None:
 
 def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
-) -> tuple[PixelScene | LooseScene, Views | None, tuple[str, ...]]:
+) -> tuple[PixelScene | UnalignedScene, Views | None, tuple[str, ...]]:
     """The scene with the context views that were asked for, the held-out ones, and notes about those."""
-    from gsmerge.evaluate import Views
     from gsmerge.io import read_targets
-    from gsmerge.sampling import even_views, midpoint_views, subset
+    from gsmerge.measure.evaluate import Views
+    from gsmerge.views import even_views, midpoint_views, subset
 
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")

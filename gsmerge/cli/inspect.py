@@ -14,7 +14,7 @@ def inspect(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -24,11 +24,11 @@ def inspect(
     debug: opt.DebugOption = False,
 ) -> None:
     """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
-    from gsmerge.inspect import inspect as inspect_scene
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
+    from gsmerge.measure.inspect import inspect as inspect_scene
     from gsmerge.report import document_head, inspection_lines, to_json
 
-    found = inspect_scene(scene, cameras=cameras, images=images, opacity=opacity.value, **vars(reading)).to_dict()
+    found = inspect_scene(scene, cameras=cameras, images=images, opacity=opacity.value, **vars(hints)).to_dict()
     if json:
         sys.stdout.write(to_json({**document_head(), **found}))
     elif not quiet:

@@ -67,7 +67,7 @@ def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
 
 
 def _is_photo(path: Path) -> bool:
-    from gsmerge.io.images import IMAGE_SUFFIXES
+    from gsmerge.io.photos import IMAGE_SUFFIXES
 
     return path.suffix.lower() in IMAGE_SUFFIXES and path.exists()
 

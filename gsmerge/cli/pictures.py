@@ -12,7 +12,7 @@ from gsmerge.cli.console import say
 from gsmerge.errors import SceneError
 
 if TYPE_CHECKING:
-    from gsmerge.preview import Picture
+    from gsmerge.measure.preview import Picture
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
@@ -24,7 +24,7 @@ def picture_stems(names: Sequence[str]) -> list[str]:
     Args:
         names: Image names as camera files give them, with or without folders and extension.
     """
-    from gsmerge.io.images import IMAGE_SUFFIXES
+    from gsmerge.io.photos import IMAGE_SUFFIXES
 
     paths = []
     for name in names:

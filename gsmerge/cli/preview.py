@@ -21,7 +21,7 @@ def preview(
     images: opt.ImagesOption = None,
     views: Annotated[int, typer.Option(min=1, help="Views at most.", rich_help_panel=opt.OUTPUT)] = 4,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -34,19 +34,19 @@ def preview(
     debug: opt.DebugOption = False,
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
-    from gsmerge.io import find_scene_files, place_views, ply_notes, read_ply, read_told
-    from gsmerge.preview import contact_sheet
-    from gsmerge.sampling import pick_views
-    from gsmerge.threads import use_threads
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
+    from gsmerge.io import find_scene_files, place_views, ply_notes, read_ply, read_ply_with_hints
+    from gsmerge.measure.preview import contact_sheet
+    from gsmerge.runtime.threads import use_threads
+    from gsmerge.views import pick_views
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     check_output(output, (*scenes, *input_files(files)), overwrite=overwrite)
     check_picture(output)
     check_cameras(files)
-    plys = [read_told(files.ply, opacity=opacity.value, reading=reading)]
+    plys = [read_ply_with_hints(files.ply, opacity=opacity.value, hints=hints)]
     plys += [read_ply(path, opacity=opacity.value) for path in scenes[1:]]
-    placed = place_views(plys[0], files, reading=reading)
+    placed = place_views(plys[0], files, hints=hints)
     used = list(placed.views.used)
     seen_from, photos = placed.views.cameras[used], placed.views.images
     photos = None if photos is None else photos[used]

@@ -74,12 +74,12 @@ def render(
 
 def _placed(ply: PlyScene, like: SceneFiles) -> Placed:
     """The Gaussians, and the cameras as they stand for the scene of ``like``."""
-    from gsmerge.io import Reading, place_views, ply_notes, read_ply
+    from gsmerge.io import ReadHints, place_views, ply_notes, read_ply
 
-    reading = Reading(max_side=MAX_SIDE)
+    hints = ReadHints(max_side=MAX_SIDE)
     if str(like.ply) == ply.info.path:
-        return place_views(ply, like, reading=reading, photos=False)
-    placed = place_views(read_ply(like.ply), like, reading=reading, photos=False)
+        return place_views(ply, like, hints=hints, photos=False)
+    placed = place_views(read_ply(like.ply), like, hints=hints, photos=False)
     return replace(placed, gaussians=ply.gaussians, notes=(*ply_notes(ply.info), *placed.notes))
 
 
@@ -94,9 +94,9 @@ def _write_renders(
     quiet: bool,
 ) -> None:
     """Render and write, as many views at once as there are threads, which keeps the memory low."""
-    from gsmerge.preview import to_picture
+    from gsmerge.measure.preview import to_picture
     from gsmerge.render import render as render_views
-    from gsmerge.threads import use_threads
+    from gsmerge.runtime.threads import use_threads
 
     with use_threads(threads) as count, announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
         for first in range(0, len(views), count):

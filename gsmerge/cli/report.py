@@ -17,9 +17,9 @@ from gsmerge.cli.settings import reading_of
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.compare import Storage
     from gsmerge.io import PlyInfo
-    from gsmerge.types import Gaussians, LooseScene, PixelScene
+    from gsmerge.measure.compare import Storage
+    from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 SUFFIXES = (".md", ".html", ".json")
 
@@ -44,7 +44,7 @@ def report(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -79,12 +79,12 @@ def report(
     debug: opt.DebugOption = False,
 ) -> None:
     """Compare a scene with its compact versions: bytes, render time, overdraw, quality, break-even frames."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
-    from gsmerge.before_after import comparison_document
-    from gsmerge.compare import compare
-    from gsmerge.evaluate import INPUT, EvaluateOptions
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files, load_files, read_ply
-    from gsmerge.unaligned import with_views
+    from gsmerge.measure.before_after import comparison_document
+    from gsmerge.measure.compare import compare
+    from gsmerge.measure.evaluate import INPUT, EvaluateOptions
+    from gsmerge.stages.unaligned import with_views
 
     files = find_scene_files(before, cameras=cameras, images=images)
     for path in output or []:
@@ -94,7 +94,7 @@ def report(
     check_outputs(output or [], inputs, overwrite=overwrite)
     seconds = _merge_seconds(after, merge_seconds, compact_report)
     nets, missing = networks(lpips)
-    load = load_files(files, opacity=opacity.value, reading=reading)
+    load = load_files(files, opacity=opacity.value, hints=hints)
     scene, held_out, adapted = held_out_views(load, targets, target_images, None)
     scene, placed = with_views(scene)
     plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
@@ -136,7 +136,7 @@ def _seconds_of(path: Path) -> float:
 
 
 def _storage(info: PlyInfo) -> Storage:
-    from gsmerge.compare import Storage
+    from gsmerge.measure.compare import Storage
 
     return Storage(info.path, info.count, info.file_bytes, info.bytes_by_attribute)
 
@@ -144,16 +144,16 @@ def _storage(info: PlyInfo) -> Storage:
 def _write(
     path: Path,
     document: Mapping[str, Any],
-    scene: PixelScene | LooseScene,
+    scene: PixelScene | UnalignedScene,
     gaussians: Mapping[str, Gaussians],
     *,
     overwrite: bool,
 ) -> None:
-    from gsmerge.before_after import comparison_html, comparison_markdown
     from gsmerge.cli.pictures import png_bytes
-    from gsmerge.evaluate import near_plane
     from gsmerge.io import atomic_output
-    from gsmerge.preview import contact_sheet
+    from gsmerge.measure.before_after import comparison_html, comparison_markdown
+    from gsmerge.measure.evaluate import near_plane
+    from gsmerge.measure.preview import contact_sheet
     from gsmerge.report import to_json
 
     if path.suffix == ".html":
@@ -167,7 +167,7 @@ def _write(
 
 
 def _tell(document: Mapping[str, Any], notes: Sequence[str], *, written: bool, as_json: bool, quiet: bool) -> None:
-    from gsmerge.before_after import comparison_markdown
+    from gsmerge.measure.before_after import comparison_markdown
     from gsmerge.report import to_json
 
     if as_json:

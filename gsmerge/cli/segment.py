@@ -15,7 +15,7 @@ from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 from gsmerge.cli.settings import reading_of, told_as_usage
 
 if TYPE_CHECKING:
-    from gsmerge.segment import SegmentOptions
+    from gsmerge.stages.segment import SegmentOptions
     from gsmerge.types import PixelScene
 
 KINDS = ("borders", "means", "saliency")
@@ -33,7 +33,7 @@ def segment(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -45,11 +45,11 @@ def segment(
     debug: opt.DebugOption = False,
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale)
-    from gsmerge.files import superpixels_per_view
+    hints = reading_of(exporter, quats.value, order.value, scene_scale)
+    from gsmerge.compact_file import superpixels_per_view
     from gsmerge.io import find_scene_files, load_files
-    from gsmerge.segment import SegmentOptions
-    from gsmerge.threads import use_threads
+    from gsmerge.runtime.threads import use_threads
+    from gsmerge.stages.segment import SegmentOptions
 
     chosen: dict[str, Any] = {"superpixels": superpixels, "density": density}
     chosen |= {"segmentation": segmentation and segmentation.value, "effort": effort and effort.value}
@@ -57,7 +57,7 @@ def segment(
         options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
     files = find_scene_files(scene, cameras=cameras, images=images)
     check_folder(output, input_files(files), overwrite=overwrite)
-    loaded = load_files(files, opacity=opacity.value, reading=reading)
+    loaded = load_files(files, opacity=opacity.value, hints=hints)
     pixel_scene = loaded.pixel_scene()
     per_view = superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
     say_notes(loaded.notes, quiet=quiet or json)
@@ -76,10 +76,10 @@ def _write_overlays(
     scene: PixelScene, options: SegmentOptions, pictures: Sequence[Path], *, overwrite: bool
 ) -> Sequence[int]:
     """Segment and draw; returns the number of superpixels of every view."""
-    from gsmerge.photos import scene_pictures
-    from gsmerge.preview import draw_borders, draw_heat, draw_means
-    from gsmerge.segment import saliency
-    from gsmerge.segment import segment as segment_images
+    from gsmerge.measure.preview import draw_borders, draw_heat, draw_means
+    from gsmerge.render.photos import scene_pictures
+    from gsmerge.stages.segment import saliency
+    from gsmerge.stages.segment import segment as segment_images
 
     images = scene_pictures(scene)
     groups = segment_images(images, options)

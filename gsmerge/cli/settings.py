@@ -11,26 +11,26 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import Reading
-    from gsmerge.io.layouts import Order
-    from gsmerge.io.reading import QuatChoice
+    from gsmerge.io import ReadHints
+    from gsmerge.io.alignment.layouts import Order
+    from gsmerge.io.hints import QuatChoice
     from gsmerge.options import CompactOptions
 
 
 def reading_of(
-    dialect: str, quats: QuatChoice, order: Order, scene_scale: float | None, max_side: int | None = None
-) -> Reading:
+    exporter: str, quats: QuatChoice, order: Order, scene_scale: float | None, max_side: int | None = None
+) -> ReadHints:
     """What the command line tells about the file.
 
     Raises:
         UsageError: If a value is none of the possible ones.
     """
-    from gsmerge.io import Reading
-    from gsmerge.io.dialects import find_dialect
+    from gsmerge.io import ReadHints
+    from gsmerge.io.exporters import find_exporter
 
     with told_as_usage():
-        find_dialect(dialect)
-        found = Reading(dialect=dialect, quats=quats, order=order, scene_scale=scene_scale)
+        find_exporter(exporter)
+        found = ReadHints(exporter=exporter, quats=quats, order=order, scene_scale=scene_scale)
         return found if max_side is None else replace(found, max_side=max_side)
 
 

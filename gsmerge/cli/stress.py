@@ -16,7 +16,7 @@ from gsmerge.cli.settings import reading_of, settings_of
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
-    from gsmerge.stress import StressOutcome
+    from gsmerge.research.stress import StressOutcome
 
 
 def stress(
@@ -24,7 +24,7 @@ def stress(
     cameras: opt.CamerasOption = None,
     images: opt.ImagesOption = None,
     opacity: opt.OpacityOption = opt.Opacity.auto,
-    dialect: opt.DialectOption = "auto",
+    exporter: opt.DialectOption = "auto",
     quats: opt.QuatsOption = opt.Quats.auto,
     order: opt.OrderOption = opt.Order.auto,
     scene_scale: opt.SceneScaleOption = None,
@@ -50,23 +50,23 @@ def stress(
     debug: opt.DebugOption = False,
 ) -> None:
     """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
-    reading = reading_of(dialect, quats.value, order.value, scene_scale, max_side)
+    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import atomic_output, find_scene_files, load_files
     from gsmerge.report import document_head, to_json
-    from gsmerge.stress import stress as stress_scene
+    from gsmerge.research.stress import stress as stress_scene
 
     files = find_scene_files(scene, cameras=cameras, images=images)
     check_outputs([report], (*input_files(files), targets, target_images), overwrite=overwrite)
     chosen = {"effort": effort, "k": k, "density": density, "budget": budget, "fit": fit, "fit_steps": fit_steps}
     settings = settings_of({**chosen, "seed": seed, "threads": threads})
-    load = load_files(files, opacity=opacity.value, reading=reading)
+    load = load_files(files, opacity=opacity.value, hints=hints)
     require_views(load)
     _, held_out, adapted = held_out_views(load, targets, target_images, None)
     notes = [*load.notes, *adapted]
     say_notes(notes, quiet=quiet or json)
     names = None if cases is None else [name.strip() for name in cases.split(",")]
     with announce_compilation(quiet=quiet or json), stage_progress(quiet=quiet or json) as progress:
-        found = stress_scene(load, settings, targets=held_out, cases=names, reading=reading, progress=progress)
+        found = stress_scene(load, settings, targets=held_out, cases=names, hints=hints, progress=progress)
     document = {
         **document_head(),
         "input": str(files.ply),

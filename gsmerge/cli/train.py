@@ -18,8 +18,8 @@ from gsmerge.cli.console import announce_compilation, one_line, say_notes, stage
 from gsmerge.cli.settings import told_as_usage
 
 if TYPE_CHECKING:
-    from gsmerge.journal import Progress
-    from gsmerge.training import Example, TrainOptions
+    from gsmerge.research.training import Example, TrainOptions
+    from gsmerge.runtime.run_log import Progress
 
 
 class TrainPreset(str, Enum):
@@ -72,9 +72,9 @@ def train(
 ) -> None:
     """Train networks on what the fit changes in scenes and on photos; interrupted, the same call goes on."""
     from gsmerge.report import document_head, to_json
-    from gsmerge.threads import use_threads
-    from gsmerge.training import network_device, preset_options, read_config
-    from gsmerge.training import train as train_networks
+    from gsmerge.research.training import network_device, preset_options, read_config
+    from gsmerge.research.training import train as train_networks
+    from gsmerge.runtime.threads import use_threads
 
     options = preset_options(preset.value)
     if config is not None:
@@ -136,7 +136,7 @@ def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Pat
 
 def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:
     """One scene at all densities, fitted or from the cache."""
-    from gsmerge.training import read_examples
+    from gsmerge.research.training import read_examples
 
     def told(step: int, steps: int) -> None:
         if progress is not None:

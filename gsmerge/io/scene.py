@@ -13,31 +13,31 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment import Alignment, check_alignment, explain_misalignment
+from gsmerge.io.alignment.fill import fill_from_depths
+from gsmerge.io.alignment.fit_cameras import fit_cameras
+from gsmerge.io.alignment.grid import as_pinholes
+from gsmerge.io.alignment.layouts import MAY_BE_LOOSE
+from gsmerge.io.alignment.mismatch import count_problem, misaligned, other_grid
+from gsmerge.io.alignment.poses import poses_note, reread, seen_poses, with_poses
+from gsmerge.io.alignment.recover import Recovery, recover
+from gsmerge.io.alignment.rotations import from_xyzw, likely_rotations, read_rotations
+from gsmerge.io.alignment.scatter import to_grid
+from gsmerge.io.alignment.score import Clues
+from gsmerge.io.alignment.similarity import SAME, Frame
+from gsmerge.io.alignment.unaligned import looks_like_a_grid
+from gsmerge.io.alignment.verify import Alignment, check_alignment, explain_misalignment
 from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.cameras.estimate import SOURCE as ESTIMATED
-from gsmerge.io.dialects import Dialect, find_dialect, recognise
-from gsmerge.io.dialects.voxels import is_padding
-from gsmerge.io.evidence import Clues
-from gsmerge.io.fill import fill_from_depths
-from gsmerge.io.fitting import fit_cameras
-from gsmerge.io.frame import SAME, Frame
-from gsmerge.io.grid import as_pinholes
-from gsmerge.io.large import lighter_photos, lighter_views
-from gsmerge.io.layouts import MAY_BE_LOOSE
-from gsmerge.io.loose import looks_like_a_grid
-from gsmerge.io.mismatch import count_problem, misaligned, other_grid
-from gsmerge.io.nerfstudio import seen_in_dataparser
-from gsmerge.io.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
-from gsmerge.io.poses import poses_note, reread, seen_poses, with_poses
-from gsmerge.io.reading import AUTO, Reading, make_reading
-from gsmerge.io.recover import Recovery, recover
-from gsmerge.io.rotations import from_xyzw, likely_rotations, read_rotations
-from gsmerge.io.scatter import to_grid
+from gsmerge.io.cameras.nerfstudio import seen_in_dataparser
+from gsmerge.io.exporters import Exporter, find_exporter, recognise
+from gsmerge.io.exporters.voxels import is_padding
+from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
+from gsmerge.io.hints import AUTO, ReadHints, make_hints
+from gsmerge.io.photo_size import lighter_photos, lighter_views
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.views import cameras_of, stored_photos
-from gsmerge.threads import use_threads
-from gsmerge.types import Cameras, Gaussians, LooseScene, PixelScene
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 _MIN_CORRELATION = 0.5
 
@@ -71,19 +71,19 @@ class SceneLoad:
         alignment: How well every view's Gaussians project into their own pixels; None for a loose scene.
         recovery: Which reading of the rows won, and by how much; None for a loose scene.
         problem: Why no pixels were found, in one sentence; None where they were.
-        dialects: The exporters that may have written the file, or the one that was told.
+        exporters: The exporters that may have written the file, or the one that was told.
         notes: What was adapted or looks odd, one sentence each, without a full stop.
         views: All views that there are cameras of, also those that the scene does not have.
     """
 
-    scene: PixelScene | LooseScene
+    scene: PixelScene | UnalignedScene
     ply: PlyInfo
     files: SceneFiles
     cameras: CameraFile | None
     alignment: Alignment | None
     recovery: Recovery | None
     problem: str | None
-    dialects: tuple[Dialect, ...]
+    exporters: tuple[Exporter, ...]
     notes: tuple[str, ...]
     views: Views
 
@@ -104,22 +104,22 @@ def read_scene(
     cameras: str | os.PathLike[str] | None = None,
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
-    **reading: Any,
-) -> PixelScene | LooseScene:
+    **hints: Any,
+) -> PixelScene | UnalignedScene:
     """Read a scene: ``.ply``, cameras, and images where there are any.
 
-    Which row belongs to which pixel is found by measuring (docs/dialects.md).
+    Which row belongs to which pixel is found by measuring (docs/exporters.md).
 
     Args:
         path: The ``.ply``, or a folder that has it.
         cameras: Camera file or folder; None looks beside the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks beside the ``.ply``.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
-        **reading: Fields of :class:`gsmerge.io.Reading`: ``dialect``, ``quats``, ``order``, ``scene_scale``,
+        **reading: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
             ``max_side``.
 
     Returns:
-        One Gaussian per pixel; a :class:`gsmerge.types.LooseScene` where the rows belong to no pixels.
+        One Gaussian per pixel; a :class:`gsmerge.types.UnalignedScene` where the rows belong to no pixels.
 
     Raises:
         SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' views.
@@ -128,7 +128,7 @@ def read_scene(
     Example:
         >>> scene = read_scene("scene.ply")  # doctest: +SKIP
     """
-    return load_scene(path, cameras=cameras, images=images, opacity=opacity, **reading).scene
+    return load_scene(path, cameras=cameras, images=images, opacity=opacity, **hints).scene
 
 
 def load_scene(
@@ -137,22 +137,22 @@ def load_scene(
     cameras: str | os.PathLike[str] | None = None,
     images: str | os.PathLike[str] | None = None,
     opacity: OpacityChoice = "auto",
-    **reading: Any,
+    **hints: Any,
 ) -> SceneLoad:
     """:func:`read_scene` with everything that was found on the way."""
-    chosen = make_reading(reading)
-    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, reading=chosen)
+    chosen = make_hints(hints)
+    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=chosen)
 
 
-def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", reading: Reading = AUTO) -> SceneLoad:
+def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
     """:func:`load_scene` for files that are found already."""
     with use_threads():  # torch's own threads wait for one another, on a busy machine for longer than they work
-        return align_scene(read_told(files.ply, opacity=opacity, reading=reading), files, reading=reading)
+        return align_scene(read_ply_with_hints(files.ply, opacity=opacity, hints=hints), files, hints=hints)
 
 
-def read_told(path: Path, *, opacity: OpacityChoice, reading: Reading) -> PlyScene:
+def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
     """The file's rows, with opacities as told, or as the told exporter stores them."""
-    told = find_dialect(reading.dialect)
+    told = find_exporter(hints.exporter)
     return read_ply(path, opacity=opacity if told is None or opacity != "auto" else told.opacity)
 
 
@@ -161,7 +161,7 @@ def align_scene(
     files: SceneFiles,
     camera_file: CameraFile | None = None,
     *,
-    reading: Reading = AUTO,
+    hints: ReadHints = AUTO,
     photos: bool = True,
 ) -> SceneLoad:
     """Put Gaussians, cameras and images together and find out which row belongs to which pixel.
@@ -170,33 +170,33 @@ def align_scene(
         ply: The Gaussians.
         files: Where the cameras and images are.
         camera_file: The cameras, if they are read already.
-        reading: What is told instead of found.
+        hints: What is told instead of found.
         photos: Whether to look for photos.
 
     Raises:
         SceneError: As :func:`read_scene`.
     """
-    if camera_file is None and files.cameras is None and reading.order == "none":
-        return _without_cameras(ply, files, reading)
+    if camera_file is None and files.cameras is None and hints.order == "none":
+        return _without_cameras(ply, files, hints)
     read = cameras_of(ply, files) if camera_file is None else camera_file
-    told = find_dialect(reading.dialect)
+    told = find_exporter(hints.exporter)
     known = told.order if told is not None else read.order
-    order = known if reading.order == "auto" else reading.order
+    order = known if hints.order == "auto" else hints.order
     read, pictures, notes = as_pinholes(read, stored_photos(files, read) if photos else None)
-    pictures, smaller = lighter_photos(pictures, len(ply.gaussians), reading.max_side, loose=order == "none")
+    pictures, smaller = lighter_photos(pictures, len(ply.gaussians), hints.max_side, loose=order == "none")
     notes += smaller
-    fitted = fit_cameras(ply, read, pictures, order=order, scale=reading.scene_scale)
+    fitted = fit_cameras(ply, read, pictures, order=order, scale=hints.scene_scale)
     clues, recovery, read = fitted.clues, fitted.recovery, fitted.camera_file
     notes += fitted.notes
     if recovery is None:
-        return _loose(ply, files, read, clues, reading, (*ply_notes(ply.info), *notes))
+        return _loose(ply, files, read, clues, hints, (*ply_notes(ply.info), *notes))
     best = recovery.best
-    dialects = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
+    exporters = (told,) if told is not None else recognise(ply.info, best.layout, best.frame, read.source)
     moved = with_poses(clues.cameras, best.frame.move_cameras(clues.viewmats))
     in_frame = clues.cameras if best.frame is SAME else moved
     scene = to_grid(ply.gaussians, ply.valid, best.layout, in_frame, clues.images, read.names)
     scene, filled = _filled(scene, recovery, clues.depths)
-    scene, turned = _with_rotations(scene, reading, dialects)
+    scene, turned = _with_rotations(scene, hints, exporters)
     views = Views(in_frame, clues.images, read.names, tuple(dict.fromkeys(best.layout.views)))
     if best.layout.per_pixel == 1:
         read = select_views(read, best.layout.views)
@@ -205,7 +205,7 @@ def align_scene(
     notes += _layout_notes(recovery, clues) + filled + turned + _colour_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
     said = (*ply_notes(ply.info), *notes)
-    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, dialects, said, views)
+    return SceneLoad(scene, ply.info, files, read, alignment, recovery, None, exporters, said, views)
 
 
 def _filled(
@@ -221,13 +221,13 @@ def _filled(
     return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] if count else []
 
 
-def _with_rotations(scene: PixelScene, reading: Reading, dialects: Sequence[Dialect]) -> tuple[PixelScene, list[str]]:
+def _with_rotations(scene: PixelScene, hints: ReadHints, exporters: Sequence[Exporter]) -> tuple[PixelScene, list[str]]:
     """Rotations as told, as the told exporter stores them, or as the surface says; and a note where that was it."""
-    if reading.quats != "auto":
-        return read_rotations(scene, reading.quats), []
-    if reading.dialect != "auto":
-        return read_rotations(scene, dialects[0].quats), []
-    if any(not dialect.check_rotations for dialect in dialects):
+    if hints.quats != "auto":
+        return read_rotations(scene, hints.quats), []
+    if hints.exporter != "auto":
+        return read_rotations(scene, exporters[0].quats), []
+    if any(not exporter.check_rotations for exporter in exporters):
         return scene, []
     choice, words = likely_rotations(scene)
     return read_rotations(scene, choice), [words] if words else []
@@ -247,7 +247,7 @@ def _layout_notes(recovery: Recovery, clues: Clues) -> list[str]:
 
 
 def _loose(
-    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, clues: Clues, reading: Reading, notes: tuple[str, ...]
+    ply: PlyScene, files: SceneFiles, camera_file: CameraFile, clues: Clues, hints: ReadHints, notes: tuple[str, ...]
 ) -> SceneLoad:
     """The scene without pixels, if the cameras see it.
 
@@ -271,27 +271,27 @@ def _loose(
         cameras = with_poses(cameras, scaled.move_cameras(clues.viewmats))
     cameras, camera_file, said = _seen(ply, files, camera_file, cameras, images, (problem, remedy))
     notes += said
-    told = find_dialect(reading.dialect)
-    dialects = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
-    gaussians, padding = _loose_rows(ply, reading)
-    cameras, images, smaller = lighter_views(cameras, images, reading.max_side)
+    told = find_exporter(hints.exporter)
+    exporters = (told,) if told is not None else recognise(ply.info, None, None, camera_file.source)
+    gaussians, padding = _loose_rows(ply, hints)
+    cameras, images, smaller = lighter_views(cameras, images, hints.max_side)
     notes += tuple(smaller)
-    scene = LooseScene(gaussians, cameras, images, camera_file.names)
+    scene = UnalignedScene(gaussians, cameras, images, camera_file.names)
     lost = "the rows belong to no pixels that could be found: unaligned"
     if told is not None:
-        lost += f"; only those of {told.name} were looked for, as told; --dialect auto looks for all"
+        lost += f"; only those of {told.name} were looked for, as told; --exporter auto looks for all"
     all_views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
     return SceneLoad(
-        scene, ply.info, files, camera_file, None, None, problem, dialects, (*notes, *padding, lost), all_views
+        scene, ply.info, files, camera_file, None, None, problem, exporters, (*notes, *padding, lost), all_views
     )
 
 
-def _loose_rows(ply: PlyScene, reading: Reading) -> tuple[Gaussians, list[str]]:
+def _loose_rows(ply: PlyScene, hints: ReadHints) -> tuple[Gaussians, list[str]]:
     """The finite rows without those that only fill a file up to its size; and a note of these."""
     keep = ply.valid & ~is_padding(ply.gaussians)
     count = int(ply.valid.sum()) - int(keep.sum())
     gaussians = ply.gaussians[keep]
-    if reading.quats == "xyzw":
+    if hints.quats == "xyzw":
         gaussians = replace(gaussians, quats=from_xyzw(gaussians.quats))
     return gaussians, [f"{count:,} rows that only fill the file up are left out"] if count else []
 
@@ -322,16 +322,16 @@ def _seen(
     return with_poses(cameras, poses.viewmats), reread(camera_file, poses.convention), (note,)
 
 
-def _without_cameras(ply: PlyScene, files: SceneFiles, reading: Reading) -> SceneLoad:
+def _without_cameras(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> SceneLoad:
     """Gaussians alone: views are placed later."""
     none = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
-    told = find_dialect(reading.dialect)
-    dialects = (told,) if told is not None else recognise(ply.info, None, None, "")
-    gaussians, padding = _loose_rows(ply, reading)
-    scene = LooseScene(gaussians, none, None, ())
+    told = find_exporter(hints.exporter)
+    exporters = (told,) if told is not None else recognise(ply.info, None, None, "")
+    gaussians, padding = _loose_rows(ply, hints)
+    scene = UnalignedScene(gaussians, none, None, ())
     problem = "expected one Gaussian per pixel, found no cameras that have any"
     said = (*ply_notes(ply.info), *padding)
-    return SceneLoad(scene, ply.info, files, None, None, None, problem, dialects, said, Views(none, None, (), ()))
+    return SceneLoad(scene, ply.info, files, None, None, None, problem, exporters, said, Views(none, None, (), ()))
 
 
 def _lacks_cameras(clues: Clues) -> bool:

@@ -12,7 +12,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.da3 import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras
-from gsmerge.io.images import list_images
+from gsmerge.io.photos import list_images
 
 # The first that exists wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")

@@ -8,16 +8,16 @@ from pathlib import Path
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.alignment.crop import stretch
+from gsmerge.io.alignment.grid import Photos, photo_size
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.estimate import estimate_cameras
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
 from gsmerge.io.cameras.sharp import SOURCE as SHARP
 from gsmerge.io.cameras.sharp import read_sharp
-from gsmerge.io.grid import Photos, photo_size
-from gsmerge.io.images import as_tensor, decode_images, find_image, image_size, list_images
-from gsmerge.io.mapping import stretch
-from gsmerge.io.ply import PlyScene
+from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.photos import as_tensor, decode_images, find_image, image_size, list_images
 from gsmerge.io.scene_files import SceneFiles
 
 

@@ -15,7 +15,7 @@ from gsmerge.networks.modules import SLOTS, Networks
 from gsmerge.networks.residuals import HALF, RESIDUAL, bounded, move_features, move_gaussians, squashed
 from gsmerge.networks.subsets import choose, point_dice, runs, tables
 from gsmerge.networks.tokens import Described, describe, member_tokens, part_tokens
-from gsmerge.threads import parallel_map, use_threads
+from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 Work = Callable[[np.ndarray, int], Tensor]  # rows of a table and its width -> [rows, columns]

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.kernels.evidence import COLUMNS, look_around
+from gsmerge.kernels.gaussians.evidence import COLUMNS, look_around
 from gsmerge.moments import Members
-from gsmerge.threads import parallel_map
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import SH_C0, Cameras
 
 EVIDENCE = COLUMNS + 1

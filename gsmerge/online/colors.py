@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsmerge.fit import FitReport
-from gsmerge.fit.color import draw, fit_colors
-from gsmerge.fit.options import FitOptions
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.cover import rows_in_view
 from gsmerge.online.pictures import Shots
 from gsmerge.online.state import Parts, pick, swapped
-from gsmerge.weights import apply_transposed
+from gsmerge.render.weights import apply_transposed
+from gsmerge.stages.fit import FitReport
+from gsmerge.stages.fit.color import draw, fit_colors
+from gsmerge.stages.fit.options import FitOptions
 
 
 def solve_colors(parts: Parts, shots: Shots, options: FitOptions, seed: int = 0) -> tuple[Parts, FitReport]:

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
-from gsmerge.fit import FitOptions
-from gsmerge.journal import Progress
 from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.fitted import decode_stored
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import OnlineState
 from gsmerge.options import CompactOptions
-from gsmerge.types import Gaussians, LooseScene, PixelScene
+from gsmerge.runtime.run_log import Progress
+from gsmerge.stages.fit import FitOptions
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 
 class Compactor:
@@ -66,7 +66,7 @@ class Compactor:
         """Numbers of every batch so far, see :class:`gsmerge.online.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
-    def extend(self, scene: PixelScene | LooseScene, *, progress: Progress | None = None) -> BatchReport:
+    def extend(self, scene: PixelScene | UnalignedScene, *, progress: Progress | None = None) -> BatchReport:
         """Add a batch of views, see :func:`gsmerge.online.extend.extend`."""
         self._state, report = extend(self._state, scene, self._options, self._online, progress=progress)
         return report

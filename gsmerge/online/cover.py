@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from gsmerge.moments import Members
-from gsmerge.photos import Photos
 from gsmerge.render import composite, plan_view, prepare
-from gsmerge.threads import parallel_map
+from gsmerge.render.photos import Photos
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 REACH = 3.34  # standard deviations to where a solid Gaussian adds 1/255

@@ -11,10 +11,8 @@ import torch
 
 from gsmerge import __version__
 from gsmerge.build import Merged, merged_groups
+from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
-from gsmerge.fit import shown
-from gsmerge.journal import Journal, Progress
-from gsmerge.merge import take
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.colors import solve_colors
 from gsmerge.online.cover import group_errors, pixel_errors, rows_in_view
@@ -23,11 +21,13 @@ from gsmerge.online.options import OnlineOptions
 from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
 from gsmerge.online.state import OnlineState, Parts, baked, joined, no_photos, pick, with_solved
 from gsmerge.options import CompactOptions
-from gsmerge.photos import scene_pictures
 from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
-from gsmerge.stored.encoded import StoredSettings
-from gsmerge.threads import use_threads
-from gsmerge.types import Gaussians, LooseScene, PixelScene
+from gsmerge.render.photos import scene_pictures
+from gsmerge.runtime.run_log import Progress, RunLog
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.fit import shown
+from gsmerge.stages.merge import take
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class BatchReport:
 
 def extend(
     state: OnlineState | None,
-    scene: PixelScene | LooseScene,
+    scene: PixelScene | UnalignedScene,
     options: CompactOptions | None = None,
     online: OnlineOptions | None = None,
     *,
@@ -87,45 +87,45 @@ def extend(
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
     _check(state, scene, options, online.max_k if state is None else state.settings.most)
-    journal = Journal(progress)
+    log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, journal, None if state is None else state.frame)
+        work = begin(scene, options, log, None if state is None else state.frame)
         work = replace(work, canvas=replace(work.canvas, share=1.0))  # nothing grows here
-        count = decide(work, journal)
+        count = decide(work, log)
         if keeps_all(work, count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        grouping = choose_groups(work, count, journal)
-        merged = merged_groups(work.source, grouping, work.options, journal)
+        grouping = choose_groups(work, count, log)
+        merged = merged_groups(work.source, grouping, work.options, log)
         shots = _shots(state, work)
         counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
         rows = torch.zeros(0, dtype=torch.int64)
         if state is not None:
-            with journal.stage("cover"):
+            with log.stage("cover"):
                 rows = rows_in_view(state.parts.features, shots.cameras)
                 fresh = _uncovered(pick(state.parts, rows), merged, shots, work.source.scene, online)
                 counts["num_covered"] = len(merged.features) - len(fresh)
                 merged = replace(merged, features=take(merged.features, fresh))
         most = online.max_k if state is None else state.settings.most
         places = np.arange(len(shots)) if state is None else view_places(state.cameras, shots.cameras)
-        with journal.stage("decode"):
+        with log.stage("decode"):
             new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
-        with journal.stage("join"):
+        with log.stage("join"):
             state, found = _entered(state, new, work, (shots, places, rows), online)
             counts |= found
         if work.scene.images is not None:
-            state = _with_photos(state, (shots, places), work.options, online, journal)
+            state = _with_photos(state, (shots, places), work.options, online, log)
     numbers = {"num_views": len(work.source.scene), "num_input": scene.num_gaussians, **counts}
     told = options.to_dict() | asdict(online)
     done = BatchReport(
-        **numbers, num_groups=len(state), seconds=journal.seconds, choices=journal.choices,
-        notes=tuple(journal.notes), options=told,
+        **numbers, num_groups=len(state), seconds=log.seconds, choices=log.choices,
+        notes=tuple(log.notes), options=told,
     )  # fmt: skip
     batches = [*state.about.get("batches", []), numbers | {"num_groups": len(state)}]
     about = {"gsmerge": __version__, "options": _lasting(told), "batches": batches}
     return replace(state, about=about), done
 
 
-def _check(state: OnlineState | None, scene: PixelScene | LooseScene, options: CompactOptions, most: int) -> None:
+def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, options: CompactOptions, most: int) -> None:
     """Refuse what no state can have; ``most``: children of a group."""
     for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
@@ -146,14 +146,14 @@ def _with_photos(
     seen: tuple[Shots, np.ndarray],
     options: CompactOptions,
     online: OnlineOptions,
-    journal: Journal,
+    log: RunLog,
 ) -> OnlineState:
     """The state after its newest photos were looked at, with some of them among those that are kept."""
     parts, (shots, places) = state.parts, seen
     if options.fit.fit == "color":
-        with journal.stage("fit"):
+        with log.stage("fit"):
             parts, report = solve_colors(parts, shots, options.fit, options.seed)
-            journal.choices["fit"] = asdict(report)
+            log.choices["fit"] = asdict(report)
     replay = kept_photos(state.replay, shots, places, len(state.cameras), online.replay)
     return replace(state, parts=parts, replay=replay)
 
@@ -171,7 +171,7 @@ def _shots(state: OnlineState | None, work: Work) -> Shots:
 
 
 def _uncovered(
-    parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | LooseScene, online: OnlineOptions
+    parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | UnalignedScene, online: OnlineOptions
 ) -> torch.Tensor:
     """Rows of the batch's groups that show something which the groups in view do not show as well."""
     features, members = batch.features, batch.members

@@ -12,14 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.canonical import Frame
-from gsmerge.errors import SceneError
-from gsmerge.io.atomic import atomic_output
-from gsmerge.online.state import OnlineState, Parts, Replay, from_encoded, owning
-from gsmerge.stored.encoded import Encoded
-from gsmerge.stored.file import FORMAT as ENCODED
-from gsmerge.stored.file import load_encoded
-from gsmerge.stored.parts import (
+from gsmerge.encoded.encoded import Encoded
+from gsmerge.encoded.file import FORMAT as ENCODED
+from gsmerge.encoded.file import load_encoded
+from gsmerge.encoded.parts import (
     REMEDY,
     Take,
     camera_tensors,
@@ -35,6 +31,10 @@ from gsmerge.stored.parts import (
     taker,
     to_bytes,
 )
+from gsmerge.errors import SceneError
+from gsmerge.io.atomic import atomic_output
+from gsmerge.online.state import OnlineState, Parts, Replay, from_encoded, owning
+from gsmerge.stages.prepare import Frame
 
 MINOR = 0  # what was added since the first files of the schema
 FORMAT = "gsmerge-state"

@@ -9,16 +9,16 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from gsmerge.compact_file import read_input
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.files import read_input
-from gsmerge.io import AUTO, Reading, SceneFiles, atomic_output
-from gsmerge.io.ply import OpacityChoice
-from gsmerge.journal import Progress
-from gsmerge.memory import peak_memory
+from gsmerge.io import AUTO, ReadHints, SceneFiles, atomic_output
+from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.online.compactor import settled
 from gsmerge.online.extend import extend
 from gsmerge.online.file import load_state, save_state
 from gsmerge.report import document_head, seconds_document
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.run_log import Progress
 
 Mark = tuple[int, int, int] | None
 
@@ -29,7 +29,7 @@ def extend_file(
     settings: Mapping[str, Any],
     *,
     opacity: OpacityChoice = "auto",
-    reading: Reading = AUTO,
+    hints: ReadHints = AUTO,
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def extend_file(
         files: The new views.
         settings: As of :class:`gsmerge.Compactor`; what is not given is as the state has it.
         opacity: How opacities are stored.
-        reading: What is told of the batch's file instead of found.
+        hints: What is told of the batch's file instead of found.
         progress: See :func:`gsmerge.compact`.
         seconds_before: Wall time by name of what the caller did before.
 
@@ -61,7 +61,7 @@ def extend_file(
         raise UsageError(str(error)) from error
     with atomic_output(path, overwrite=mark is not None) as temporary:
         loaded = perf_counter()
-        given = read_input(files, options.segment, opacity=opacity, reading=reading)
+        given = read_input(files, options.segment, opacity=opacity, hints=hints)
         read = perf_counter()
         state, report = extend(state, given.scene, options, online, progress=progress)
         done = perf_counter()

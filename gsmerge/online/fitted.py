@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from gsmerge.canonical import Frame
+from gsmerge.encoded.decode import decode_scene, plan_decode
+from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
-from gsmerge.fit import FitOptions, FitReport, fit, start_share
-from gsmerge.journal import Journal, Progress
 from gsmerge.online.pictures import Shots
 from gsmerge.online.state import OnlineState, as_encoded
-from gsmerge.stored.decode import decode_scene, plan_decode
-from gsmerge.stored.encoded import Encoded
-from gsmerge.threads import use_threads
+from gsmerge.runtime.run_log import Progress, RunLog
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.fit import FitOptions, FitReport, fit, start_share
+from gsmerge.stages.prepare import Frame
 from gsmerge.types import Gaussians
 
 
@@ -84,7 +84,7 @@ def decode_stored(
         notes = plan_decode(encoded, k=k, budget=budget).notes
         return Decoded(decode_scene(encoded, k=k, budget=budget, threads=threads), None, notes)
     assert isinstance(stored, OnlineState)
-    journal = Journal(progress)
+    log = RunLog(progress)
     plan = plan_decode(encoded, k=k, budget=budget)
     wanted = int(plan.counts.sum())
     begun = max(len(encoded), int(start_share(options) * wanted)) + encoded.num_kept
@@ -93,10 +93,8 @@ def decode_stored(
         gaussians = decode_scene(plain, budget=begun, threads=threads)
         images = stored.replay.images.astype(np.float32) / np.float32(255)
         shots = Shots(images, stored.cameras[torch.from_numpy(stored.replay.views)])
-        with journal.stage("fit"):
-            fitted, report = fit(
-                gaussians, (shots.photos(), shots.photos(2)), options, wanted, seed, journal.fit_progress
-            )
+        with log.stage("fit"):
+            fitted, report = fit(gaussians, (shots.photos(), shots.photos(2)), options, wanted, seed, log.fit_progress)
     if report is not None and not report.accepted:  # the colours that were solved batch by batch are better than none
         held = "the fit was not accepted: held-out parts of the photos did not get better"
         plain_colors = decode_scene(as_encoded(stored), k=k, budget=budget, threads=threads)

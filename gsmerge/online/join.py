@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsmerge.match import MatchOptions, match
-from gsmerge.merge import merge
 from gsmerge.online.state import Parts, joined, pick, swapped, thinned
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.merge import merge
 from gsmerge.types import FeatureGaussians, Matches
 
 

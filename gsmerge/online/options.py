@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmerge.decode import MAX_CHILDREN
+from gsmerge.stages.decode import MAX_CHILDREN
 
 
 @dataclass(frozen=True)

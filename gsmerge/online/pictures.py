@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from gsmerge.online.state import Replay
-from gsmerge.photos import Photos, photos_of
-from gsmerge.threads import parallel_map
+from gsmerge.render.photos import Photos, photos_of
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
 

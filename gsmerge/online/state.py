@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
-from gsmerge.canonical import Frame
-from gsmerge.decode import divide
+from gsmerge.encoded.decode import children_of
+from gsmerge.encoded.divide import divide_all
+from gsmerge.encoded.encoded import Encoded, StoredSettings, without_members
 from gsmerge.geometry import covariances
-from gsmerge.merge import take
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
 from gsmerge.networks import Learned, decode_gaussians
-from gsmerge.stored.decode import children_of
-from gsmerge.stored.divide import divide_all
-from gsmerge.stored.encoded import Encoded, StoredSettings, without_members
+from gsmerge.stages.decode import divide
+from gsmerge.stages.merge import take
+from gsmerge.stages.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 POOLED: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by

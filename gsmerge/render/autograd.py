@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsmerge.kernels.project_backward import add_rows
+from gsmerge.kernels.raster.project_backward import add_rows
 from gsmerge.render.blend import view_colors
 from gsmerge.render.gradient import ColorGradients, color_gradients, gradients_of
 from gsmerge.render.images import Rendering, draw_views, prepare_views

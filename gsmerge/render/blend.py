@@ -7,9 +7,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsmerge.kernels import harmonics, raster
+from gsmerge.kernels.raster import blend as kernels
+from gsmerge.kernels.raster import harmonics
 from gsmerge.render.plan import Array, ViewPlan, pieces
-from gsmerge.threads import parallel_map, use_threads
+from gsmerge.runtime.threads import parallel_map, use_threads
 
 
 def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
@@ -45,7 +46,7 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
     transmittance = np.empty((plan.height, plan.width), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        raster.blend(
+        kernels.blend(
             plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span, background, image, transmittance
         )
 
@@ -94,16 +95,16 @@ def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
     if image.ndim != 3 or image.shape[:2] != (plan.height, plan.width):
         raise ValueError(f"image: expected shape {[plan.height, plan.width, 'c']}, got {list(image.shape)}")
     sums = np.zeros((len(plan.splats), image.shape[2]), np.float32)
-    slots = np.empty((len(plan.members), raster.CHANNELS), np.float32)
+    slots = np.empty((len(plan.members), kernels.CHANNELS), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        raster.weighted_sums(plan.footprints, plan.members, plan.offsets, plan.columns, *span, part, slots)
+        kernels.weighted_sums(plan.footprints, plan.members, plan.offsets, plan.columns, *span, part, slots)
 
     with use_threads() as threads:
-        for first in range(0, image.shape[2], raster.CHANNELS):
-            part = np.ascontiguousarray(image[..., first : first + raster.CHANNELS], np.float32)
+        for first in range(0, image.shape[2], kernels.CHANNELS):
+            part = np.ascontiguousarray(image[..., first : first + kernels.CHANNELS], np.float32)
             parallel_map(tiles, _tile_ranges(plan, threads))
-            raster.add_slots(plan.members, slots, plan.ids, first, sums)
+            kernels.add_slots(plan.members, slots, plan.ids, first, sums)
     return sums
 
 
@@ -117,7 +118,7 @@ def contributions(plan: ViewPlan) -> tuple[Array, Array]:
         ``[n]`` sums (pixels) and ``[n]`` maxima, float32; 0 for Gaussians that are not seen.
     """
     totals = np.zeros((len(plan.ids), 2), np.float32)
-    raster.contributions(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, totals)
+    kernels.contributions(plan.footprints, plan.members, plan.offsets, plan.columns, plan.height, plan.width, totals)
     mass, peak = np.zeros((2, len(plan.splats)), np.float32)
     mass[plan.ids], peak[plan.ids] = totals.T
     return mass, peak

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsmerge.kernels import harmonics
+from gsmerge.kernels.raster import harmonics
 from gsmerge.render.blend import composite
 from gsmerge.render.gradient import plan_gradients
 from gsmerge.render.plan import Splats, plan_view
@@ -57,7 +57,7 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
     Args:
         shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
         colors: ``[n,3]``, any sign, float32.
-        camera: As :meth:`gsmerge.photos.Photos.camera` gives it.
+        camera: As :meth:`gsmerge.render.photos.Photos.camera` gives it.
         background: ``[3]`` float32.
 
     Returns:

@@ -18,10 +18,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.kernels import harmonics_backward, project_backward, raster_backward
+from gsmerge.kernels.raster import blend_backward, harmonics_backward, project_backward
 from gsmerge.render.blend import view_colors
 from gsmerge.render.plan import Array, ViewPlan, pieces
-from gsmerge.threads import parallel_map, use_threads
+from gsmerge.runtime.threads import parallel_map, use_threads
 
 WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
 
@@ -101,21 +101,21 @@ def gradients_of(
 ) -> Gradients:
     """:func:`plan_gradients` of contiguous float32 arrays, unchecked; colours ``[m,3]`` of the plan's Gaussians."""
     m, splats = len(plan.ids), plan.splats
-    slots = np.empty((len(plan.members), raster_backward.SUMS), np.float32)
-    sums = np.zeros((m, raster_backward.SUMS), np.float32)
+    slots = np.empty((len(plan.members), blend_backward.SUMS), np.float32)
+    sums = np.zeros((m, blend_backward.SUMS), np.float32)
     means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
     opacities = np.empty(m, np.float32)
     num_blocks = -(-m // project_backward.BLOCK)
     poses = np.empty((num_blocks if with_viewmat else 0, project_backward.POSE), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        raster_backward.blend_backward(
+        blend_backward.blend_backward(
             plan.footprints, colors, plan.members, plan.offsets, plan.columns, *span,
             image, transmittance, grad_image, grad_left, slots,
         )  # fmt: skip
 
     def project(span: tuple[int, int]) -> None:
-        raster_backward.gather_slots(plan.members, slots, *span, sums)
+        blend_backward.gather_slots(plan.members, slots, *span, sums)
         project_backward.project_backward(
             splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera, *span,
             means, quats, scales, opacities, poses,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsmerge.render.blend import background_color, blend, view_colors
 from gsmerge.render.plan import Array, Splats, ViewPlan, plan_view, prepare
-from gsmerge.threads import parallel_map
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
 

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from gsmerge.kernels import binning
-from gsmerge.kernels import project as projection
-from gsmerge.threads import parallel_map, use_threads
+from gsmerge.kernels.raster import binning
+from gsmerge.kernels.raster import project as projection
+from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
@@ -55,13 +55,13 @@ class ViewPlan:
     Args:
         splats: The Gaussians.
         ids: ``[m]`` int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
-        footprints: ``[m,8]`` float32, see :mod:`gsmerge.kernels.project`.
+        footprints: ``[m,8]`` float32, see :mod:`gsmerge.kernels.raster.project`.
         depths: ``[m]`` float32, camera z.
         members: ``[intersections]`` int32 rows of ``ids``, tile after tile, nearest first.
         offsets: ``[tiles+1]`` int64 starts of the tiles' lists.
         eye: ``[3]`` float32, the camera's centre less ``splats.origin``.
         opacities: ``[n]`` float32, those that are drawn.
-        camera: The view's numbers in the order of :mod:`gsmerge.kernels.project`, float32.
+        camera: The view's numbers in the order of :mod:`gsmerge.kernels.raster.project`, float32.
         viewmat: ``[4,4]`` float64, world to camera.
         width: Image width, pixels.
         height: Image height, pixels.

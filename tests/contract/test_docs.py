@@ -15,7 +15,7 @@ import typer.main
 import gsmerge
 from gsmerge.cli.app import app
 from gsmerge.cli.network_options import Precision
-from gsmerge.io import Reading
+from gsmerge.io import ReadHints
 from gsmerge.options import METHODS, PRECISIONS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -122,8 +122,8 @@ def test_told_defaults_are_the_library_s() -> None:
 
 def test_told_sizes_are_the_readers_own(root: Path) -> None:
     (param,) = (p for p in COMMANDS["compact"].params if p.name == "max_side")
-    assert param.show_default == str(Reading().max_side)
-    assert f"| `--max-side` | {Reading().max_side} |" in (root / "README.md").read_text()
+    assert param.show_default == str(ReadHints().max_side)
+    assert f"| `--max-side` | {ReadHints().max_side} |" in (root / "README.md").read_text()
 
 
 def test_readme_s_defaults_are_the_library_s(root: Path) -> None:
@@ -142,7 +142,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
     """Merging and segmentation options carry the API's names."""
     fields = set(gsmerge.CompactOptions().to_dict())
     own = {"output", "overwrite", "report", "json", "quiet", "dry-run", "debug", "cameras", "images", "opacity"}
-    own |= {"dialect", "quats", "order", "scene-scale", "max-side"}
+    own |= {"exporter", "quats", "order", "scene-scale", "max-side"}
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
     assert {name.replace("-", "_") for name in names} - fields == set()
 
@@ -194,9 +194,9 @@ def test_stability_cases_name_tests_that_are_there(root: Path) -> None:
 
 
 def test_generator_names_every_range_style_and_path(root: Path) -> None:
-    from gsmerge.generate import NoiseOptions
-    from gsmerge.generate.paths import PATHS
-    from gsmerge.generate.styles import STYLES
+    from gsmerge.research.generate import NoiseOptions
+    from gsmerge.research.generate.paths import PATHS
+    from gsmerge.research.generate.styles import STYLES
 
     text = (root / "docs" / "generator.md").read_text()
     names = [f.name for f in fields(NoiseOptions)] + [*STYLES, *PATHS]

@@ -31,7 +31,7 @@ print(hashlib.sha256(sums.tobytes()).hexdigest())
 
 def kernels(root: Path) -> Iterator[tuple[str, ast.FunctionDef, str]]:
     """Name, definition and decorator of every kernel."""
-    for path in sorted((root / "gsmerge" / "kernels").glob("*.py")):
+    for path in sorted((root / "gsmerge" / "kernels").rglob("*.py")):
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.FunctionDef):
                 for decorator in map(ast.unparse, node.decorator_list):

@@ -145,7 +145,7 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
         (("--output", "{stem}.spz", "--max-bytes", "1MB"), 2, "max bytes: expected an output as .ply"),
         (("--output", "same.ply"), 2, "a file of its own for each scene"),
         (("--address", "auto"), 2, "address: expected engine ray"),
-        (("--dialect", "nobody"), 2, "nobody"),
+        (("--exporter", "nobody"), 2, "nobody"),
     ],
 )
 def test_wrong_usage_is_told_at_once(

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import gsmerge
-from gsmerge.charts import run as running
-from gsmerge.charts.store import read_runs
+from gsmerge.research.charts import run as running
+from gsmerge.research.charts.store import read_runs
 
 from .conftest import Outcome, Run, listing
 
@@ -266,7 +266,7 @@ def test_wrong_usage(
 def test_missing_matplotlib_is_told_before_anything_is_run(
     copied: Path, merges: list[dict[str, Any]], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.charts.draw.find_spec", lambda name: None)
+    monkeypatch.setattr("gsmerge.research.charts.draw.find_spec", lambda name: None)
     outcome = again(run, copied, "--rerun")
     assert (outcome.code, merges) == (1, [])
     assert outcome.err == (

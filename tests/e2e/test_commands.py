@@ -12,7 +12,7 @@ import pytest
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.files import NO_PHOTOS
+from gsmerge.compact_file import NO_PHOTOS
 
 from .conftest import Run, listing
 
@@ -82,7 +82,7 @@ def test_a_scene_too_large_for_the_machine_is_told_before_it_is_read(
 ) -> None:
     said = "this machine has 0.1 GB: use fewer views"
     assert said not in run("inspect", scene_copy).out
-    for module in ("gsmerge.memory", "gsmerge.report"):
+    for module in ("gsmerge.runtime.memory", "gsmerge.report"):
         monkeypatch.setattr(f"{module}.machine_memory", lambda: 10**8)
     outcome = run("compact", scene_copy, *SMALL, "--fit", "none", "--effort", "draft", "--overwrite")
     assert outcome.code == 0

@@ -32,7 +32,7 @@ class Broken:
 def test_failures_inside_the_work(
     error: BaseException, code: int, line: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.files.compact", Broken(error))
+    monkeypatch.setattr("gsmerge.compact_file.compact", Broken(error))
     before = listing(scene_copy)
     outcome = run("compact", scene_copy, "--quiet")
     assert (outcome.code, outcome.err, outcome.out) == (code, line, "")
@@ -40,7 +40,7 @@ def test_failures_inside_the_work(
 
 
 def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.files.compact", Broken(KeyError("lost")))
+    monkeypatch.setattr("gsmerge.compact_file.compact", Broken(KeyError("lost")))
     outcome = run("compact", scene_copy, "--quiet", "--debug")
     assert outcome.code == 1
     assert outcome.err.startswith("Traceback (most recent call last):")
@@ -60,9 +60,9 @@ def test_failures_while_writing_leave_nothing(
     if command == "decode":
         given = scene_copy / "kept.gsm"
         assert run("encode", scene_copy, "-o", given, *quick).code == 0
-    for place in ("gsmerge.files", "gsmerge.io"):
+    for place in ("gsmerge.compact_file", "gsmerge.io"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
-    monkeypatch.setattr("gsmerge.stored.file.save_encoded", half)
+    monkeypatch.setattr("gsmerge.encoded.file.save_encoded", half)
     before = listing(scene_copy)
     more = {"compact": (*quick, "--fit", "none"), "encode": quick, "decode": ()}[command]
     outcome = run(command, given, "--quiet", *more)

@@ -89,7 +89,7 @@ def test_no_input_is_replaced(given: str, scene_copy: Path, run: Run) -> None:
 def test_networks_that_are_not_installed(
     command: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.perceptual.lpips_available", lambda net: False)
+    monkeypatch.setattr("gsmerge.measure.lpips.lpips_available", lambda net: False)
     outcome = run(command, scene_copy, scene_copy / "scene.ply", "--lpips", "vgg")
     assert outcome.code == 2
     assert "weights are not installed" in outcome.err

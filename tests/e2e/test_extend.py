@@ -245,7 +245,7 @@ def test_an_encoded_scene_has_no_photos(fit: str, encoded: Path, tmp_path: Path,
         (("--replay", "-1"), "--replay"),
         (("--density", "0"), "density"),
         (("--budget", "many"), "budget"),
-        (("--dialect", "nobody"), "dialect"),
+        (("--exporter", "nobody"), "exporter"),
     ],
 )
 def test_wrong_usage_is_one_line(

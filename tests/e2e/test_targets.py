@@ -91,7 +91,7 @@ def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> N
 
 def test_a_device_is_a_limit(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scenes.identical(compact(scene, fit="none", preset="quest3").gaussians, compact(scene, fit="none").gaussians)
-    monkeypatch.setitem(__import__("gsmerge.allocate").allocate.PRESETS, "quest3", 200)
+    monkeypatch.setitem(__import__("gsmerge.budget").budget.PRESETS, "quest3", 200)
     assert len(compact(scene, fit_steps=12, preset="quest3").gaussians) == 200
 
 

@@ -12,9 +12,9 @@ from learned import SMALL, noisy, written
 
 from gsmerge.cli.train import find_training_scenes
 from gsmerge.networks import load_checkpoint
-from gsmerge.training import TrainOptions, read_examples
-from gsmerge.training.photometric import window_psnr
-from gsmerge.training.windows import whole_photo
+from gsmerge.research.training import TrainOptions, read_examples
+from gsmerge.research.training.photometric import window_psnr
+from gsmerge.research.training.windows import whole_photo
 
 from .conftest import Run, listing
 

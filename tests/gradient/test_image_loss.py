@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from gsmerge.fit.loss import image_gradient
-from gsmerge.kernels.optimise import C1, C2, similarity_terms
+from gsmerge.kernels.gaussians.optimise import C1, C2, similarity_terms
+from gsmerge.stages.fit.loss import image_gradient
 
 SIZES = [(20, 17), (7, 7), (3, 5), (1, 9)]
 

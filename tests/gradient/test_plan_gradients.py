@@ -20,7 +20,7 @@ from gsmerge.render.gradient import (
     color_gradients,
     plan_gradients,
 )
-from gsmerge.threads import use_threads
+from gsmerge.runtime.threads import use_threads
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 

@@ -19,11 +19,11 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsmerge import Cameras, Gaussians, render
 from gsmerge.errors import GsmergeError
-from gsmerge.fit import FitOptions
 from gsmerge.render import Rendering
 from gsmerge.render import cuda as adapter
 from gsmerge.render.colored import draw_colored, seen_colors
 from gsmerge.render.cuda import harmonic_colors, rasterize, render_cuda, usable_device
+from gsmerge.stages.fit import FitOptions
 
 Calls = list[dict[str, Any]]
 DEFAULTS: dict[str, Any] = {"antialiased": False, "near": 0.01, "far": 1e10, "with_depths": False}

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scenes import make_features
 from skimage.measure import label as connected_parts
 
-from gsmerge.allocate import RegionTree, cut_tree, region_tree, split_counts
 from gsmerge.moments import Members
-from gsmerge.segment import SegmentOptions, segment
-from gsmerge.threads import use_threads
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.region_tree import RegionTree, cut_tree, region_tree, split_counts
+from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import FeatureGaussians, Groups
 
 FEW = settings(max_examples=25, deadline=None, derandomize=True)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import assert_same_set, make_features, move_gaussians, random_rotation, rotmat_to_quat
 
-from gsmerge.decode import DecodeOptions, decode
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import Members
+from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.types import FeatureGaussians
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)

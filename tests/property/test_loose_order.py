@@ -15,11 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsmerge import PixelScene, compact
-from gsmerge.contribution import Owners, find_owners, owner_pixels
-from gsmerge.encode import member_rows
-from gsmerge.moments import loose_members
-from gsmerge.segment import SegmentOptions, segment
-from gsmerge.threads import use_threads
+from gsmerge.moments import unaligned_members
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.assign import Owners, find_owners, owner_pixels
+from gsmerge.stages.encode import member_rows
+from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Groups
 
 FEW = settings(max_examples=8, deadline=None, derandomize=True)
@@ -53,7 +53,7 @@ def test_permuted_gaussians_have_permuted_owners(seed: int, count: int, scene: P
 def test_each_gaussian_is_in_at_most_one_superpixel(count: int, least: float) -> None:
     scene = loose.loosened(TURNED)
     owners = find_owners(scene, groups(count))
-    members = loose_members(scene, owner_pixels(owners, groups(count), least))
+    members = unaligned_members(scene, owner_pixels(owners, groups(count), least))
     starts, ids, views = member_rows(scene, members, groups(count))
     assert len(np.unique(ids)) == len(ids)
     assert set(ids) == set(np.flatnonzero((owners.values >= least) & (owners.labels >= 0)))

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import make_features, random_rotation
 
-from gsmerge.match import MatchOptions, match
-from gsmerge.merge import merge, take
 from gsmerge.moments import Members, pool_members
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Matches
 
 FEW = settings(max_examples=20, deadline=None, derandomize=True)

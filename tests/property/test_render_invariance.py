@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.metrics import psnr
 from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
-from gsmerge.threads import use_threads
+from gsmerge.render.metrics import psnr
+from gsmerge.runtime.threads import use_threads
 
 WIDTH, HEIGHT = 70, 50
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.measure import label as connected_parts
 
-from gsmerge.segment import superpixels
+from gsmerge.stages.segment import superpixels
 
 SEGMENTATIONS = [
     ("rdseg", "fast"),

@@ -31,7 +31,7 @@ def test_one_view_at_a_time_or_all(
 ) -> None:
     found = []
     for at_once in (1, 2, 100):
-        monkeypatch.setattr("gsmerge.threads.AT_ONCE", at_once)
+        monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
         found.append(scenes.compacted(scene, **settings).gaussians)
     assert scenes.identical(found[0], found[1])
     assert scenes.identical(found[0], found[2])
@@ -47,6 +47,6 @@ def test_higher_harmonics_are_not_copied() -> None:
 def test_of_many_gaussians_one_view_at_a_time(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for many in (0, 10**9):
-        monkeypatch.setattr("gsmerge.contribution.ONE_AT_A_TIME", many)
+        monkeypatch.setattr("gsmerge.stages.assign.ONE_AT_A_TIME", many)
         found.append(compact(loose.loosened(scene), fit="none", density=0.1, unseen="keep").gaussians)
     assert scenes.identical(found[0], found[1])

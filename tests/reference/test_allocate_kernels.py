@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
-from gsmerge.kernels import allocate as kernels
-from gsmerge.kernels.bisect import bisect, split_errors
-from gsmerge.kernels.regions import pad_labels
-from gsmerge.kernels.seeds import hexagonal_seeds, voronoi
-from gsmerge.kernels.ward import adjacent_pairs
+from gsmerge.kernels.gaussians.bisect import bisect, split_errors
+from gsmerge.kernels.superpixels import region_tree as kernels
+from gsmerge.kernels.superpixels.regions import pad_labels
+from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, voronoi
+from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.types import SH_C0
 
 HEIGHT, WIDTH, COUNT = 18, 25, 40

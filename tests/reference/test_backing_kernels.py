@@ -9,7 +9,7 @@ import pytest
 from renderer import footprints as project_footprints
 from torch import from_numpy
 
-from gsmerge.kernels.backing import draw_in, image_extinctions
+from gsmerge.kernels.gaussians.backing import draw_in, image_extinctions
 
 
 def draw_in_reference(groups: list[np.ndarray], depths: np.ndarray, pixel: float) -> np.ndarray:

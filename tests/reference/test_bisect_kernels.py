@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from gsmerge.kernels.bisect import bisect
+from gsmerge.kernels.gaussians.bisect import bisect
 from gsmerge.types import SH_C0
 
 

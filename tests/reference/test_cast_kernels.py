@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.generate.shapes import NO_WAVES, Look, Packed, Shape, packed
-from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET, cast, light_seen
+from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET, cast, light_seen
+from gsmerge.research.generate.shapes import NO_WAVES, Look, Packed, Shape, packed
 
 FAR, STEPS = 12.0, 60_000
 KINDS = {"quad": QUAD, "box": BOX, "ellipsoid": ELLIPSOID, "cone": CONE, "leaf": LEAF, "blob": BLOB, "sheet": SHEET}

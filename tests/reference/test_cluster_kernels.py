@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_matrix, csgraph
 
-from gsmerge.kernels.cluster import bhattacharyya, box_overlap, connected_components, edge_scores, leader_clusters
+from gsmerge.kernels.gaussians.cluster import (
+    bhattacharyya,
+    box_overlap,
+    connected_components,
+    edge_scores,
+    leader_clusters,
+)
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 

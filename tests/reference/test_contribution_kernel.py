@@ -10,10 +10,10 @@ import torch
 from numpy.testing import assert_allclose
 from renderer import render_reference
 
-from gsmerge.contribution import FIRST_PAIRS, find_owners, view_owners
 from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.segment import superpixels
-from gsmerge.types import Cameras, Gaussians, Groups, LooseScene
+from gsmerge.stages.assign import FIRST_PAIRS, find_owners, view_owners
+from gsmerge.stages.segment import superpixels
+from gsmerge.types import Cameras, Gaussians, Groups, UnalignedScene
 
 WIDTH, HEIGHT = 75, 53  # not multiples of a tile
 K = np.array([[60.0, 0, 36.3], [0, 62.0, 27.1], [0, 0, 1]])
@@ -113,7 +113,7 @@ def test_the_best_of_all_views(seed: int) -> None:
     viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
     cameras = Cameras(viewmats, torch.from_numpy(K).repeat(3, 1, 1), WIDTH, HEIGHT)
     labels = np.stack([some_labels(60, view) for view in range(3)])
-    scene = LooseScene(gaussians, cameras, None, ("a", "b", "c"))
+    scene = UnalignedScene(gaussians, cameras, None, ("a", "b", "c"))
     owners = find_owners(scene, Groups(torch.from_numpy(labels), (60,) * 3))
     sums = np.stack([superpixel_sums(gaussians, labels[v], viewmats[v]) for v in range(3)], 1)
     assert_allclose(owners.values, sums.max((1, 2)), rtol=1e-3, atol=1e-4)
@@ -128,5 +128,5 @@ def test_of_equal_views_the_first() -> None:
         torch.eye(4, dtype=torch.float64).repeat(4, 1, 1), torch.from_numpy(K).repeat(4, 1, 1), WIDTH, HEIGHT
     )
     labels = torch.from_numpy(some_labels(30)).repeat(4, 1, 1)
-    owners = find_owners(LooseScene(gaussians, cameras, None, tuple("abcd")), Groups(labels, (30,) * 4))
+    owners = find_owners(UnalignedScene(gaussians, cameras, None, tuple("abcd")), Groups(labels, (30,) * 4))
     assert set(owners.views.tolist()) <= {-1, 0}

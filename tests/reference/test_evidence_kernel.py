@@ -10,7 +10,7 @@ from scenes import arc, make_scene, room
 from gsmerge.geometry import project
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.evidence import FAR, LEAST, NEAR, evidence
-from gsmerge.threads import use_threads
+from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, PixelScene
 
 

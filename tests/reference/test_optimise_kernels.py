@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gsmerge.kernels.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE, adam
+from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE, adam
 
 RATES = np.array([0.1] * 3 + [0.2] * 3 + [0.03] * 4 + [0.3] + [0.03] * 3)
 LIMITS, BETAS = np.array([2.0, 2.5, 4.0]), np.array([0.7, 0.99])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.pool import decompose, group_members, pool
+from gsmerge.kernels.gaussians.pool import decompose, group_members, pool
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:

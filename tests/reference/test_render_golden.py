@@ -17,8 +17,8 @@ import pytest
 import torch
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.metrics import psnr
 from gsmerge.render import render
+from gsmerge.render.metrics import psnr
 
 SHARED = Path(os.environ.get("GSMERGE_SHARED", Path(__file__).resolve().parents[3] / "shared"))
 GOLDEN = SHARED / "golden"

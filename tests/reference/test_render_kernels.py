@@ -8,7 +8,7 @@ import torch
 from renderer import footprints, view_colors
 
 from gsmerge import Gaussians
-from gsmerge.kernels import binning, harmonics
+from gsmerge.kernels.raster import binning, harmonics
 from gsmerge.render import plan_view, prepare
 
 RNG = np.random.default_rng(0)

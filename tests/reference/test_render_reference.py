@@ -8,8 +8,8 @@ import torch
 from renderer import Reference, render_reference, view_colors
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.metrics import psnr
 from gsmerge.render import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.render.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
 

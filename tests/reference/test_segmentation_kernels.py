@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from skimage.measure import label as connected_parts
 
-from gsmerge.kernels import bass, kd, seeds, sweeps, ward
-from gsmerge.kernels.regions import pad_labels, region_rows
+from gsmerge.kernels.superpixels import bass, kd, seeds, sweeps, ward
+from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
 
 RING = ((0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0))  # N, NE, E, SE, S, SW, W, NW of 3 x 3
 COMPACTNESS = 1e-3

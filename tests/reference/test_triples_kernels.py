@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.harmonics_backward import view_colors_backward
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.triples import spread_triples, turn, weigh_triples
+from gsmerge.kernels.raster.harmonics_backward import view_colors_backward
+from gsmerge.kernels.raster.triples import spread_triples, turn, weigh_triples
 
 
 @kernel

@@ -10,8 +10,8 @@ from renderer import render_reference
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.render import ViewPlan, composite, contributions, plan_view, prepare, splat_adjoint
+from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.types import Gaussians
-from gsmerge.weights import ViewWeights, apply, apply_transposed, view_weights
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
 K = np.array([[40.0, 0, 21.3], [0, 42.0, 19.1], [0, 0, 1]])

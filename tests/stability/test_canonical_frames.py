@@ -10,8 +10,8 @@ import scenes
 import torch
 
 from gsmerge import PixelScene
-from gsmerge.canonical import find_frame
 from gsmerge.moments import scene_members
+from gsmerge.stages.prepare import find_frame
 
 UTM = np.array([4e5, 5e6, 120.0])
 

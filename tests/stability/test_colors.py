@@ -10,9 +10,9 @@ import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.fit import FitOptions
-from gsmerge.fit.color import draw, fit_colors
-from gsmerge.photos import scene_photos
+from gsmerge.render.photos import scene_photos
+from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.types import SH_C0
 
 

@@ -9,7 +9,7 @@ import pytest
 import scenes
 import torch
 
-from gsmerge import Gaussians, LooseScene, PixelScene, compact
+from gsmerge import Gaussians, PixelScene, UnalignedScene, compact
 
 SCENES = {"wall": scenes.wall, "planes": scenes.two_planes, "room": scenes.room}
 
@@ -131,7 +131,7 @@ def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None
 @pytest.mark.parametrize("settings", [{}, {"fit": "color"}], ids=str)
 def test_a_second_pass_neither_blurs_nor_darkens(scene: PixelScene, settings: dict) -> None:
     once = scenes.compacted(scene, density=0.044, **settings).gaussians
-    loose = LooseScene(once, scene.cameras, scene.images, scene.names)
+    loose = UnalignedScene(once, scene.cameras, scene.images, scene.names)
     twice = compact(loose, budget=len(once), **settings).gaussians
     assert 0.99 * len(once) <= len(twice) <= len(once)  # what no photo shows goes
     assert scenes.psnr_of(twice, scene) > scenes.psnr_of(once, scene) - 0.2

@@ -10,9 +10,9 @@ import scenes
 import torch
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.encode import EncodeOptions, encode
 from gsmerge.geometry import covariances, project, quat_to_rotmat
 from gsmerge.moments import feature_to_gaussians, scene_members
+from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.types import FeatureGaussians, Groups
 
 

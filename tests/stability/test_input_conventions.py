@@ -36,7 +36,7 @@ def with_values(folder: Path, change: Callable[[dict], dict]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "reading"),
+    ("change", "hints"),
     [
         (lambda m: m @ FLIP, "camera-to-world matrices with OpenCV axes"),
         (lambda m: FLIP @ np.linalg.inv(m), "world-to-camera matrices with OpenCV axes"),
@@ -44,14 +44,14 @@ def with_values(folder: Path, change: Callable[[dict], dict]) -> None:
     ],
 )
 def test_a_swapped_convention_is_read_and_named(
-    scene_copy: Path, change: Callable[[np.ndarray], np.ndarray], reading: str
+    scene_copy: Path, change: Callable[[np.ndarray], np.ndarray], hints: str
 ) -> None:
     # world-to-camera with OpenCV axes is FLIP inv(c2w OpenGL); the made scene's own is camera-to-world with OpenGL axes
     usual = read_scene(scene_copy).cameras.viewmats
     with_poses(scene_copy, change)
     loaded = load_scene(scene_copy)
     assert np.allclose(loaded.scene.cameras.viewmats, usual)
-    assert any(f"the poses fit when read as {reading}" in note for note in loaded.notes)
+    assert any(f"the poses fit when read as {hints}" in note for note in loaded.notes)
 
 
 def test_wrong_poses_are_measured(scene_copy: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import scenes
 import torch
 
-from gsmerge import Gaussians, LooseScene, PixelScene, compact, render
+from gsmerge import Gaussians, PixelScene, UnalignedScene, compact, render
 from gsmerge.pipeline import CompactResult
 
 
@@ -20,7 +20,7 @@ def room() -> PixelScene:
     return scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
 
 
-def compacted(scene: LooseScene, **settings: Any) -> CompactResult:
+def compacted(scene: UnalignedScene, **settings: Any) -> CompactResult:
     """A tenth of the pixels, with what must hold of every result checked."""
     result = compact(scene, **{"density": 0.1, "fit": "color", **settings})
     for name in scenes.FIELDS:
@@ -54,7 +54,7 @@ def test_values_that_are_not_finite(room: PixelScene) -> None:
     columns["quats"][2::50] = torch.nan
     columns["opacities"][3::50] = torch.nan
     columns["sh0"][4::50] = -torch.inf
-    spoilt = LooseScene(Gaussians(**columns), room.cameras, room.images, room.names)
+    spoilt = UnalignedScene(Gaussians(**columns), room.cameras, room.images, room.names)
     result = compacted(spoilt)
     assert any("not finite" in note for note in result.report.notes)
     assert (
@@ -104,7 +104,7 @@ def test_without_images(room: PixelScene, fit: str) -> None:
 
 
 def test_without_cameras(room: PixelScene) -> None:
-    blind = LooseScene(loose.shuffled(room).gaussians, loose.NO_CAMERAS, None, ())
+    blind = UnalignedScene(loose.shuffled(room).gaussians, loose.NO_CAMERAS, None, ())
     result = compacted(blind, fit="full", fit_steps=60)
     assert any("no cameras" in note for note in result.report.notes)
     own = render(room.gaussians, room.cameras).images.clamp(0, 1)
@@ -116,7 +116,7 @@ def test_far_from_the_origin_without_cameras(room: PixelScene, shift: list[float
     """In geographic coordinates cameras are placed as well as at home."""
     g = room.gaussians
     there = replace(g, means=g.means.double() + torch.tensor(shift, dtype=torch.float64))
-    one, other = (compacted(LooseScene(x, loose.NO_CAMERAS, None, ()), fit="none") for x in (g, there))
+    one, other = (compacted(UnalignedScene(x, loose.NO_CAMERAS, None, ()), fit="none") for x in (g, there))
     assert abs(len(one.gaussians) - len(other.gaussians)) <= 0.1 * len(one.gaussians)
     middle = other.gaussians.means.double().mean(0) - torch.tensor(shift, dtype=torch.float64)
     assert (middle - one.gaussians.means.double().mean(0)).abs().max() < 0.3

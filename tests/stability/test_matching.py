@@ -8,9 +8,9 @@ import scenes
 import torch
 
 from gsmerge import Cameras
-from gsmerge.match import MatchOptions, match
-from gsmerge.merge import merge
 from gsmerge.moments import feature_to_gaussians
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.merge import merge
 from gsmerge.types import FeatureGaussians
 
 SIZE = 0.05

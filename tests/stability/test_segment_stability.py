@@ -7,10 +7,10 @@ import pytest
 import torch
 from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_psnr
 
-from gsmerge.kernels.regions import pad_labels, region_rows
-from gsmerge.kernels.sweeps import refine
-from gsmerge.segment import SEGMENTATIONS, SegmentOptions, segment, superpixels
-from gsmerge.threads import use_threads
+from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
+from gsmerge.kernels.superpixels.sweeps import refine
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.segment import SEGMENTATIONS, SegmentOptions, segment, superpixels
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)

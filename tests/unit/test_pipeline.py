@@ -7,8 +7,8 @@ import scenes
 import torch
 
 from gsmerge import CompactOptions, PixelScene, compact
-from gsmerge.journal import STAGES
-from gsmerge.segment import SEGMENTATIONS
+from gsmerge.runtime.run_log import STAGES
+from gsmerge.stages.segment import SEGMENTATIONS
 
 USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "cover", "choose", "join")]
 
@@ -45,7 +45,7 @@ def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
 
 def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of both the same ones, and it is said."""
-    monkeypatch.setattr("gsmerge.sampling.MOST_JUDGED", 2)
+    monkeypatch.setattr("gsmerge.views.MOST_JUDGED", 2)
     result = scenes.compacted(scene, fit="none")
     some = scenes.take_views(scene, [0, 2])
     assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)

@@ -9,7 +9,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_pixels
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.npz import array_names, read_arrays
+from gsmerge.io.formats.npz import array_names, read_arrays
 
 _EXTRINSICS, _INTRINSICS = ("extrinsics", "exts"), ("intrinsics", "ixts")
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")

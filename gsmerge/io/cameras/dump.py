@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.io.alignment.layouts import ORDERS
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, CameraFile, make_camera_file
 from gsmerge.io.cameras.da3 import as_images, check_poses
-from gsmerge.io.layouts import ORDERS
-from gsmerge.io.npz import array_names, read_arrays
+from gsmerge.io.formats.npz import array_names, read_arrays
 
 SOURCE = "dump of a model"
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmerge.io.alignment import pixel_limit
+from gsmerge.io.alignment.layouts import Layout, exact_layouts, thinned
+from gsmerge.io.alignment.verify import pixel_limit
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.layouts import Layout, exact_layouts, thinned
 from gsmerge.types import Gaussians
 
 SOURCE = "estimated from the grid"

@@ -9,7 +9,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from gsmerge.threads import parallel_map
+from gsmerge.runtime.threads import parallel_map
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.images import decode_photos
+from gsmerge.io.photos import decode_photos
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4

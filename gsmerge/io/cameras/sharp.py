@@ -9,7 +9,7 @@ from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.ply_file import open_ply
+from gsmerge.io.formats.ply_file import open_ply
 
 SOURCE = "SHARP"
 _ELEMENTS = ("extrinsic", "intrinsic", "image_size")

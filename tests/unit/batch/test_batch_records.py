@@ -20,10 +20,10 @@ from gsmerge.batch.locks import LOCKS, BusyError, run_lock, scene_lock
 from gsmerge.batch.plan import estimate_seconds, make_shape
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, Index, Known, check_folder, record
 from gsmerge.batch.summary import COLUMNS, SHOWN, Totals, summary_lines, write_summary
-from gsmerge.costs import memory_bytes
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.lines import append_line, each_line, read_lines
 from gsmerge.options import CompactOptions
+from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.runtime.jsonl import append_line, each_line, read_lines
 
 SHA = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of abc
 
@@ -118,7 +118,7 @@ def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path: Path) -> N
     code = f"""
 import resource, pathlib
 from gsmerge.errors import SceneError
-from gsmerge.lines import append_line
+from gsmerge.runtime.jsonl import append_line
 resource.setrlimit(resource.RLIMIT_FSIZE, ({len(whole) + 20}, {len(whole) + 20}))
 try:
     append_line(pathlib.Path({str(path)!r}), {{"text": "x" * 100}})

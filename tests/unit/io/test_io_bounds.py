@@ -11,9 +11,9 @@ import pytest
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file, check_pixels, read_text
+from gsmerge.io.formats.npz import array_names, read_arrays
 from gsmerge.io.image_header import stored_size
-from gsmerge.io.images import natural_key
-from gsmerge.io.npz import array_names, read_arrays
+from gsmerge.io.photos import natural_key
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm", ".pgm"])

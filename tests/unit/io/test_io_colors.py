@@ -12,8 +12,8 @@ from exports import Smooth, export_rows, save_export, smooth_scene, write_transf
 from tiny_scene import make_tiny, write_images
 
 from gsmerge.io import load_scene
-from gsmerge.io.evidence import Clues
-from gsmerge.io.recover import COLOR_MARGIN, Recovery, recover
+from gsmerge.io.alignment.recover import COLOR_MARGIN, Recovery, recover
+from gsmerge.io.alignment.score import Clues
 from gsmerge.types import SH_C0, Cameras
 
 

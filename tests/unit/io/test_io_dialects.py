@@ -25,8 +25,8 @@ from tiny_scene import Tiny, make_tiny, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_ply, read_scene
-from gsmerge.io.dialects import DIALECTS
-from gsmerge.types import LooseScene, PixelScene
+from gsmerge.io.exporters import EXPORTERS
+from gsmerge.types import PixelScene, UnalignedScene
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_depthsplat(tmp_path: Path, smooth: Tiny) -> None:
     loaded = load_scene(save_export(tmp_path, smooth, turned(rows, turn)))
     scene = loaded.pixel_scene()
     assert home(scene, smooth) == 1
-    assert [d.name for d in loaded.dialects] == ["depthsplat"]
+    assert [d.name for d in loaded.exporters] == ["depthsplat"]
     assert loaded.recovery is not None
     assert loaded.recovery.best.frame.kind == "first"
     assert scene.num_gaussians == int(scene.valid.sum()) == inner.size
@@ -84,7 +84,7 @@ def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
     assert loaded.recovery is not None
     assert loaded.recovery.best.layout.kind in (("box", "box+depth") if ties else ("box+depth",))
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=1e-3)
-    assert [d.name for d in loaded.dialects] == ["da3"]
+    assert [d.name for d in loaded.exporters] == ["da3"]
     scene = loaded.pixel_scene()
     assert home(scene, tiny, kept) == 1
     assert scene.num_gaussians == len(kept)
@@ -198,7 +198,7 @@ def test_the_pixelsplat_world(tmp_path: Path, smooth: Tiny) -> None:
     loaded = load_scene(save_export(tmp_path, tiny, rows))
     assert loaded.recovery is not None
     assert loaded.recovery.best.frame.kind == "upright"
-    assert "pixelsplat" in [d.name for d in loaded.dialects]
+    assert "pixelsplat" in [d.name for d in loaded.exporters]
     assert any("relative to each view's camera" in note for note in loaded.notes)
     assert home(loaded.pixel_scene(), tiny) == 1
 
@@ -212,8 +212,8 @@ def test_rotations(tmp_path: Path, smooth: Tiny, stored: str) -> None:
         rows["rot_0"], rows["rot_1"], rows["rot_2"], rows["rot_3"] = x, y, z, w
     path = save_export(tmp_path, smooth, rows)
     # the cameras differ by a few degrees only: not enough to tell from the surface
-    for reading in (stored,) if stored == "camera" else ("auto", stored):
-        quats = read_scene(path, quats=reading).gaussians.quats
+    for hints in (stored,) if stored == "camera" else ("auto", stored):
+        quats = read_scene(path, quats=hints).gaussians.quats
         agree = (quats * true.gaussians.quats).sum(1).abs()
         assert agree.min() > 0.9999
     loaded = load_scene(path)
@@ -225,7 +225,7 @@ def test_raw_opacities(tmp_path: Path, smooth: Tiny) -> None:
     rows["opacity"] = smooth.gaussians.opacities.numpy()
     path = save_export(tmp_path, smooth, rows)
     assert home(read_scene(path), smooth) == 1
-    logit = read_scene(path, dialect="splatter-image", order="view-major").gaussians.opacities
+    logit = read_scene(path, exporter="splatter-image", order="view-major").gaussians.opacities
     assert torch.allclose(logit, torch.sigmoid(smooth.gaussians.opacities), atol=1e-5)
 
 
@@ -246,7 +246,7 @@ def test_infinite_opacities_and_nan_scales(tmp_path: Path, smooth: Tiny) -> None
 def test_byte_normals_are_long_lrm(tmp_path: Path, smooth: Tiny) -> None:
     rows = export_rows(smooth, rest=45, normals="u1")
     loaded = load_scene(save_export(tmp_path, smooth, rows))
-    assert [d.name for d in loaded.dialects] == ["longlrm"]
+    assert [d.name for d in loaded.exporters] == ["longlrm"]
     assert home(loaded.pixel_scene(), smooth) == 1
 
 
@@ -263,18 +263,18 @@ def test_voxels_are_loose(tmp_path: Path, smooth: Tiny) -> None:
     rows = export_rows(smooth, np.lexsort(smooth.gaussians.means.numpy().round(1).T)[::2])
     rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
     loaded = load_scene(save_export(tmp_path, smooth, rows))
-    assert isinstance(loaded.scene, LooseScene)
+    assert isinstance(loaded.scene, UnalignedScene)
     assert len(loaded.scene.gaussians) == len(rows)
     assert loaded.scene.images is not None
-    assert {d.name for d in loaded.dialects} == {"anysplat", "worldmirror"}
+    assert {d.name for d in loaded.exporters} == {"anysplat", "worldmirror"}
     assert loaded.alignment is None
     assert loaded.problem is not None
 
 
 def test_a_scene_can_be_told_to_be_loose(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, smooth, export_rows(smooth))
-    assert isinstance(read_scene(path, order="none"), LooseScene)
-    assert isinstance(read_scene(path, dialect="volsplat"), LooseScene)
+    assert isinstance(read_scene(path, order="none"), UnalignedScene)
+    assert isinstance(read_scene(path, exporter="volsplat"), UnalignedScene)
 
 
 def test_a_told_scale(tmp_path: Path, smooth: Tiny) -> None:
@@ -283,11 +283,11 @@ def test_a_told_scale(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, replace(smooth, c2w=c2w), export_rows(smooth))
     scene = read_scene(path, scene_scale=0.5)
     assert np.allclose(scene.cameras.viewmats, smooth.w2c)
-    assert not isinstance(read_scene(path), LooseScene)
+    assert not isinstance(read_scene(path), UnalignedScene)
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("order", "spiral"), ("quats", "zyxw"), ("scene_scale", 0.0), ("dialect", "x"), ("magic", 1)]
+    ("name", "value"), [("order", "spiral"), ("quats", "zyxw"), ("scene_scale", 0.0), ("exporter", "x"), ("magic", 1)]
 )
 def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object) -> None:
     path = save_export(tmp_path, smooth, export_rows(smooth))
@@ -296,8 +296,8 @@ def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object)
 
 
 def test_the_documented_dialects(root: Path) -> None:
-    text = (root / "docs" / "dialects.md").read_text()
-    assert [name for name in DIALECTS if f"| `{name}` |" not in text] == []
+    text = (root / "docs" / "exporters.md").read_text()
+    assert [name for name in EXPORTERS if f"| `{name}` |" not in text] == []
 
 
 def dump_script(root: Path) -> Any:
@@ -333,7 +333,7 @@ def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> 
         assert loaded.cameras.source == "dump of a model"
         assert np.allclose(scene.cameras.Ks, smooth.K)
         assert np.array_equal((scene.images.numpy() * 255).round(), smooth.images)
-    assert isinstance(read_scene(dump_of(smooth, tmp_path / "none", root, order="none")), LooseScene)
+    assert isinstance(read_scene(dump_of(smooth, tmp_path / "none", root, order="none")), UnalignedScene)
 
 
 def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
@@ -372,7 +372,7 @@ def test_the_camera_inside_a_sharp_file(tmp_path: Path, smooth: Tiny) -> None:
     loaded = load_scene(tmp_path / "photo.ply")
     scene = loaded.pixel_scene()
     assert scene.valid.shape == (2, side, side)
-    assert [d.name for d in loaded.dialects] == ["sharp"]
+    assert [d.name for d in loaded.exporters] == ["sharp"]
     assert np.allclose(scene.cameras.Ks[0], square.K, atol=1e-4)
     assert scene.images.shape == (2, side, side, 3)
     assert torch.allclose(scene.gaussians.opacities[side * side :], torch.sigmoid(torch.tensor(-2.0)))

@@ -10,7 +10,7 @@ from tiny_scene import Tiny, write_images
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_images
-from gsmerge.io.images import match_images, natural_key
+from gsmerge.io.photos import match_images, natural_key
 
 
 def touch(folder: Path, *names: str) -> Path:

@@ -11,9 +11,9 @@ from tiny_scene import Tiny
 
 from gsmerge import compact, read_scene
 from gsmerge.errors import SceneError
-from gsmerge.extents import extents
-from gsmerge.inspect import inspect
 from gsmerge.io import write_ply
+from gsmerge.measure.extents import extents
+from gsmerge.measure.inspect import inspect
 from gsmerge.report import inspection_lines
 
 

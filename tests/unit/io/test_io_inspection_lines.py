@@ -10,8 +10,8 @@ from exports import depth_map_mask, export_rows, save_export, smooth_scene
 from plyfile import PlyData, PlyElement
 from tiny_scene import write_npz
 
-from gsmerge.inspect import inspect
 from gsmerge.io import read_ply, write_ply
+from gsmerge.measure.inspect import inspect
 from gsmerge.report import inspection_lines
 
 SMOOTH = smooth_scene(48, 36)

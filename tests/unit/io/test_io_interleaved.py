@@ -10,7 +10,7 @@ import torch
 from exports import Smooth, export_rows, save_export, smooth_scene
 
 from gsmerge.io import load_scene
-from gsmerge.types import LooseScene
+from gsmerge.types import UnalignedScene
 
 
 @pytest.fixture(scope="module")
@@ -44,4 +44,4 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
 
 def test_rows_in_no_order_stay_loose(tmp_path: Path, smooth: Smooth) -> None:
     kept = np.random.default_rng(1).permutation(view_fastest(smooth, 0.3))
-    assert isinstance(load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene, LooseScene)
+    assert isinstance(load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene, UnalignedScene)

@@ -12,7 +12,7 @@ from exports import export_rows, save_export, smooth_scene
 from tiny_scene import Tiny
 
 from gsmerge.io import load_scene
-from gsmerge.types import LooseScene, PixelScene
+from gsmerge.types import PixelScene, UnalignedScene
 
 SMOOTH = smooth_scene(48, 36)
 LARGE = replace(
@@ -34,7 +34,7 @@ def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
 def test_views_of_loose_scenes_are_resized(tmp_path: Path, order: str) -> None:
     loaded = load_scene(save(tmp_path), order=order, max_side=96)
     scene = loaded.scene
-    assert isinstance(scene, LooseScene)
+    assert isinstance(scene, UnalignedScene)
     assert NOTE in loaded.notes
     assert scene.images is not None
     assert scene.images.shape == (3, 72, 96, 3)
@@ -72,16 +72,16 @@ def test_memory_is_bounded_before_pixels_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
 ) -> None:
     """More photos than fit are resized first; a grid that they were resized to is found all the same."""
-    monkeypatch.setattr("gsmerge.io.large._MAX_BYTES", 3 * 100 * 75 * 12)
+    monkeypatch.setattr("gsmerge.io.photo_size._MAX_BYTES", 3 * 100 * 75 * 12)
     loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
     assert NOTE in loaded.notes
-    assert isinstance(loaded.scene, LooseScene) == shuffled
+    assert isinstance(loaded.scene, UnalignedScene) == shuffled
     size = (96, 72) if shuffled else (48, 36)
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == size
 
 
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.io.large._MAX_BYTES", 0)
+    monkeypatch.setattr("gsmerge.io.photo_size._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
     assert loaded.pixel_scene().valid.all()
     assert loaded.notes == ()

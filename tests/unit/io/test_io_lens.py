@@ -13,10 +13,10 @@ from exports import smooth_scene
 from tiny_scene import Tiny, frames_of, write_colmap_binary, write_colmap_text, write_images, write_transforms
 
 from gsmerge.errors import SceneError
-from gsmerge.inspect import inspect
 from gsmerge.io import load_scene, read_cameras, to_cameras
 from gsmerge.io.cameras import select_views
 from gsmerge.io.cameras.lens import fisheye, perspective, undistorted
+from gsmerge.measure.inspect import inspect
 
 SMOOTH = smooth_scene(60, 45)
 K = np.array([[180.0, 0, 96], [0, 170, 77], [0, 0, 1]])

@@ -9,8 +9,8 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply, write_ply
-from gsmerge.io.ply_file import let_go, open_ply, promised
-from gsmerge.threads import use_threads
+from gsmerge.io.formats.ply_file import let_go, open_ply, promised
+from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
 
 NAMES = (

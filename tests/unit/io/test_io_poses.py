@@ -14,9 +14,9 @@ from tiny_scene import Tiny, make_tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
+from gsmerge.io.alignment.poses import other_readings, seen_poses
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
-from gsmerge.io.poses import other_readings, seen_poses
-from gsmerge.types import Cameras, LooseScene
+from gsmerge.types import Cameras, UnalignedScene
 
 SMOOTH = smooth_scene(40, 30)
 
@@ -54,7 +54,7 @@ def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, true)
     loaded = load_scene(folder)
-    assert isinstance(loaded.scene, LooseScene)
+    assert isinstance(loaded.scene, UnalignedScene)
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
     assert any(f"when read as {true[0]} matrices with {true[1]} axes" in note for note in loaded.notes)
 
@@ -95,7 +95,7 @@ def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.M
     rewrite_poses(folder, SMOOTH, W2C_OPENCV)
     true = other_readings(SMOOTH.w2c, C2W_OPENGL)[0]
     same = replace(true, viewmats=SMOOTH.w2c)
-    monkeypatch.setattr("gsmerge.io.poses.other_readings", lambda *_: [same, replace(same, words="another")])
+    monkeypatch.setattr("gsmerge.io.alignment.poses.other_readings", lambda *_: [same, replace(same, words="another")])
     with pytest.raises(SceneError, match=r"expected poses that fit in one reading, found that they fit as .* another"):
         load_scene(folder)
 

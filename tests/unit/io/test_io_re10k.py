@@ -17,7 +17,7 @@ from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files, load_scene, read_cameras
-from gsmerge.io.mapping import cover
+from gsmerge.io.alignment.crop import cover
 
 SMOOTH = smooth_scene(48, 36)
 
@@ -91,7 +91,7 @@ def test_photos_that_were_cropped(tmp_path: Path) -> None:
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
     assert np.allclose(loaded.scene.cameras.Ks, tiny.K, atol=1e-3)
-    assert [d.name for d in loaded.dialects] == ["depthsplat"]
+    assert [d.name for d in loaded.exporters] == ["depthsplat"]
 
 
 def test_some_views_of_many(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from tiny_scene import Tiny
 
 from gsmerge.geometry import covariances, quat_to_rotmat
 from gsmerge.io import load_scene, read_scene
-from gsmerge.io.rotations import square_roots
+from gsmerge.io.alignment.rotations import square_roots
 
 Q = torch.nn.functional.normalize
 
@@ -75,7 +75,7 @@ def test_it_can_be_told(tmp_path: Path) -> None:
     rows = applied_twice(tiny)
     rows["opacity"] = tiny.gaussians.opacities.numpy()
     folder = save_export(tmp_path, tiny, rows)
-    for told in ({"quats": "xyzw-root"}, {"dialect": "splatt3r"}):
+    for told in ({"quats": "xyzw-root"}, {"exporter": "splatt3r"}):
         assert covariance_error(read_scene(folder, **told).gaussians.quats, tiny).median() < 0.01
 
 

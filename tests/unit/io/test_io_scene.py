@@ -21,7 +21,7 @@ from tiny_scene import (
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files, load_scene, read_photos, read_scene
 from gsmerge.io.cameras import read_cameras
-from gsmerge.threads import use_threads
+from gsmerge.runtime.threads import use_threads
 
 
 def rewrite(path: Path, change: Callable[[dict], None]) -> None:

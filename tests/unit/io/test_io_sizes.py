@@ -14,8 +14,8 @@ from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
+from gsmerge.io.alignment.crop import Mapping, counted, cover, patched, stretch
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats, make_camera_file
-from gsmerge.io.mapping import Mapping, counted, cover, patched, stretch
 from gsmerge.types import PixelScene
 
 SMOOTH = smooth_scene(48, 36)

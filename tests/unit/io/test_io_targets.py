@@ -14,9 +14,9 @@ from tiny_scene import FLIP, Tiny, make_tiny, rotation
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io import large, load_scene, read_cameras, read_targets
-from gsmerge.io.targets import similarity
-from gsmerge.types import LooseScene
+from gsmerge.io import load_scene, photo_size, read_cameras, read_targets
+from gsmerge.io.held_out import similarity
+from gsmerge.types import UnalignedScene
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_no_such_file(tiny: Tiny, tmp_path: Path) -> None:
 
 def test_targets_of_a_scene_without_views(tiny: Tiny, tmp_path: Path) -> None:
     load = load_scene(tiny.save(tmp_path / "scene"))
-    bare = replace(load, scene=LooseScene(load.scene.gaussians, load.scene.cameras[[]], None, ()))
+    bare = replace(load, scene=UnalignedScene(load.scene.gaussians, load.scene.cameras[[]], None, ()))
     targets = read_targets(bare, write_views(tmp_path / "held", {"q": between(tiny)}, tiny))
     assert (len(targets), targets.context_places) == (1, None)
 
@@ -190,7 +190,7 @@ def test_photos_beyond_all_memory_are_made_smaller(tiny: Tiny, tmp_path: Path, m
     load = load_scene(tiny.save(tmp_path / "scene"))
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (1600, 1200))
     assert read_targets(load, cameras).images.shape[2] == 1600
-    monkeypatch.setattr(large, "_MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(photo_size, "_MAX_BYTES", 1 << 20)
     targets = read_targets(load, cameras)
     assert targets.images.shape[2] == targets.cameras.width == 1200
     assert np.allclose(targets.cameras.Ks[0].numpy()[:2], 1200 / tiny.width * tiny.K[:2])

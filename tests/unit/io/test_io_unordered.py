@@ -12,8 +12,8 @@ from exports import export_rows, save_export, turned
 from tiny_scene import Tiny, make_tiny, rotation
 
 from gsmerge.io import load_scene
-from gsmerge.io.frame import SAME
-from gsmerge.types import SH_C0, LooseScene
+from gsmerge.io.alignment.similarity import SAME
+from gsmerge.types import SH_C0, UnalignedScene
 
 
 def scene_on_rays(views: int, jitter: float = 0.0, size: tuple[int, int] = (64, 48)) -> Tiny:
@@ -73,7 +73,7 @@ def test_rows_sorted_by_opacity_come_to_their_pixels(tmp_path: Path, views: int,
     assert share_at_home(loaded, tiny, kept) >= 0.99
     assert loaded.recovery is not None
     assert loaded.recovery.best.layout.order == "unordered"
-    assert [d.name for d in loaded.dialects] == ["vicasplat"]
+    assert [d.name for d in loaded.exporters] == ["vicasplat"]
     assert any("in no order" in note for note in loaded.notes)
     scene = loaded.pixel_scene()
     assert scene.num_gaussians == len(kept)
@@ -83,7 +83,7 @@ def test_colours_decide_between_near_views() -> None:
     """Two hundredths of a pixel off, eight views: some rows are nearer to a centre of another view."""
     from functools import partial
 
-    from gsmerge.io.unordered import unordered_layout
+    from gsmerge.io.alignment.unordered import unordered_layout
 
     tiny = scene_on_rays(8, 0.02)
     tiny = replace(tiny, images=np.random.default_rng(0).integers(0, 256, tiny.images.shape, np.uint8))
@@ -119,14 +119,14 @@ def test_rows_anywhere_in_their_pixels_stay_loose(tmp_path: Path, views: int, ji
     tiny = scene_on_rays(views, jitter)
     folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.3)))
     for order in ("auto", "unordered"):
-        assert isinstance(load_scene(folder, order=order).scene, LooseScene)
+        assert isinstance(load_scene(folder, order=order).scene, UnalignedScene)
 
 
 def test_many_views_make_chance(tmp_path: Path) -> None:
     """Sixty views: most rows are within a twentieth of a pixel of some view's centre."""
     tiny = scene_on_rays(60, 0.5, (32, 24))
     folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.5)))
-    assert isinstance(load_scene(folder, dialect="vicasplat").scene, LooseScene)
+    assert isinstance(load_scene(folder, exporter="vicasplat").scene, UnalignedScene)
 
 
 def test_the_told_order_and_dialect(tmp_path: Path) -> None:
@@ -134,13 +134,13 @@ def test_the_told_order_and_dialect(tmp_path: Path) -> None:
     kept = by_opacity(tiny, 0.3)
     rows = export_rows(tiny, kept, rest=45, normals="u1")
     folder = save_export(tmp_path, tiny, rows)
-    for told in ({"order": "unordered"}, {"dialect": "longlrm-sorted"}, {"scene_scale": 1.0}):
+    for told in ({"order": "unordered"}, {"exporter": "longlrm-sorted"}, {"scene_scale": 1.0}):
         loaded = load_scene(folder, **told)
         assert share_at_home(loaded, tiny, kept) >= 0.99
-        assert [d.name for d in loaded.dialects] == ["longlrm-sorted"]
+        assert [d.name for d in loaded.exporters] == ["longlrm-sorted"]
     assert loaded.recovery is not None
     assert loaded.recovery.best.frame.scale == SAME.scale
-    assert isinstance(load_scene(folder, order="view-major").scene, LooseScene)
+    assert isinstance(load_scene(folder, order="view-major").scene, UnalignedScene)
 
 
 def test_rows_without_finite_positions(tmp_path: Path) -> None:

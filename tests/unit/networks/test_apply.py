@@ -8,9 +8,6 @@ import pytest
 import torch
 from learned import SMALL, Made, made, noisy
 
-from gsmerge.decode import DecodeOptions, decode, divide
-from gsmerge.match import MatchOptions, match
-from gsmerge.merge import merge, take
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import (
     Learned,
@@ -22,8 +19,11 @@ from gsmerge.networks import (
     refine_features,
 )
 from gsmerge.networks.apply import encoder_outputs, head_residuals, nearest
-from gsmerge.refine import refine
-from gsmerge.threads import use_threads
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.decode import DecodeOptions, decode, divide
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.merge import merge, take
+from gsmerge.stages.refine import refine
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.moments import feature_to_gaussians, loose_members, scene_members
+from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
 from gsmerge.online.cover import MARGIN, REACH, group_errors, in_view, pixel_errors
 from gsmerge.online.state import moments_of
-from gsmerge.photos import photos_of
 from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render.photos import photos_of
 from gsmerge.types import FeatureGaussians
 
 
@@ -147,7 +147,7 @@ def test_members_of_no_pixel_count_as_fully_wrong() -> None:
     pixels = np.array([-1, 5, -1, -1, 7, 40] + [0] * (len(loose.gaussians) - 6))
     from loose import loosened
 
-    members = loose_members(loosened(loose), pixels)
+    members = unaligned_members(loosened(loose), pixels)
     errors = np.zeros((2, 24, 36), np.float32)
     errors[0, 0, 5] = 0.5
     found = group_errors(grouped([2, 2, 2], np.arange(6)), members, errors)

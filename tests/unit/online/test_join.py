@@ -10,11 +10,11 @@ import scenes
 import torch
 from arriving import FAST, fed, group, parts_of, room, same_group, state_of
 
-from gsmerge.decode import DecodeOptions
-from gsmerge.match import MatchOptions
+from gsmerge.encoded.divide import divide_all
 from gsmerge.online.join import absorb, partners
 from gsmerge.online.state import Parts, part_members, pick, thinned
-from gsmerge.stored.divide import divide_all
+from gsmerge.stages.decode import DecodeOptions
+from gsmerge.stages.match import MatchOptions
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,16 @@ import torch
 from arriving import fed, room, same_group, state_of
 
 from gsmerge import Gaussians, PixelScene
-from gsmerge.fit import FitOptions
-from gsmerge.fit.color import Drawn, draw, fit_colors
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.colors import solve_colors
 from gsmerge.online.cover import in_view
 from gsmerge.online.pictures import Shots
 from gsmerge.online.state import Parts
-from gsmerge.photos import Photos, scene_photos
+from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.render.weights import apply
+from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.fit.color import Drawn, draw, fit_colors
 from gsmerge.types import SH_C0
-from gsmerge.weights import apply
 
 FEW = FitOptions(fit="color", holdout=0.05)
 
@@ -171,7 +171,7 @@ def test_one_batch_after_the_other_is_near_all_at_once(
 
 
 def test_the_threads_do_not_matter(parts: Parts, shots: Shots) -> None:
-    from gsmerge.threads import use_threads
+    from gsmerge.runtime.threads import use_threads
 
     found = []
     for threads in (1, 3):

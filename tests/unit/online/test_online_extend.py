@@ -14,15 +14,15 @@ from arriving import FAST, counts, fed, parts_of, room, same_parts, same_state, 
 from learned import noisy, written
 from loose import NO_CAMERAS, far_behind, loosened, shuffled
 
-from gsmerge import Compactor, Gaussians, LooseScene, PixelScene, decode_scene, encode_scene
+from gsmerge import Compactor, Gaussians, PixelScene, UnalignedScene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
-from gsmerge.fit import FitOptions, FitReport
 from gsmerge.online.extend import extend
 from gsmerge.online.fitted import decode_stored
 from gsmerge.online.state import OnlineState, from_encoded
 from gsmerge.options import CompactOptions
+from gsmerge.stages.fit import FitOptions, FitReport
 
-Change = Callable[[PixelScene], PixelScene | LooseScene]
+Change = Callable[[PixelScene], PixelScene | UnalignedScene]
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
     assert abs(one - other) < 0.2
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=["loosened", "shuffled"])
 def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
     states, found = [], []
     for threads in (1, 2, 8):
@@ -192,7 +192,7 @@ def test_photos_of_some_batches(bare: int, pairs: list[PixelScene]) -> None:
     assert len(compactor.decode(fit="full", fit_steps=4)) > 50
 
 
-@pytest.mark.parametrize("change", [loosened, shuffled], ids=str)
+@pytest.mark.parametrize("change", [loosened, shuffled], ids=["loosened", "shuffled"])
 def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene]) -> None:
     for batches in ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]]):
         compactor = fed(batches)  # type: ignore[arg-type]
@@ -212,7 +212,7 @@ def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
 @pytest.mark.parametrize("first", [True, False])
 def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene]) -> None:
     """Views are placed for them."""
-    bare = LooseScene(pairs[0].gaussians, NO_CAMERAS, None, ())
+    bare = UnalignedScene(pairs[0].gaussians, NO_CAMERAS, None, ())
     compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
     assert compactor.batches[1]["num_covered"] > 0
     assert len(state_of(compactor).replay) == 2
@@ -344,7 +344,7 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkey
     assert scenes.identical(found.gaussians, compactor.decode(k=1, fit="none"))
 
 
-@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"max_bytes": "20KB"}], ids=str)
+@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"max_bytes": "20KB"}], ids=["loosened", "shuffled"])
 def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
     compactor = fed(pairs[:2], **settings)
     own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))

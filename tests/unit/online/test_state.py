@@ -14,7 +14,6 @@ from learned import SMALL, Made, made, noisy, written
 from loose import far_behind, shuffled, voxels
 
 from gsmerge import Gaussians, PixelScene, decode_scene, encode_scene
-from gsmerge.decode import DecodeOptions, decode
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks import encode_features
@@ -32,6 +31,7 @@ from gsmerge.online.state import (
     thinned,
     with_solved,
 )
+from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.types import SH_C0, FeatureGaussians
 
 ALL = DecodeOptions(min_opacity=0.0)

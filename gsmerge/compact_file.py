@@ -1,0 +1,167 @@
+"""From a scene's files to the compact file: read, compact, write, report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import (
+    AUTO,
+    ReadHints,
+    SceneFiles,
+    SceneLoad,
+    atomic_output,
+    kept_comments,
+    load_files,
+    lost_harmonics,
+    output_format,
+    write_gaussians,
+)
+from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.options import CompactOptions
+from gsmerge.pipeline import compact
+from gsmerge.report import report_document
+from gsmerge.runtime.memory import release_memory
+from gsmerge.runtime.run_log import Progress
+from gsmerge.stages.segment import SegmentOptions, count_for
+from gsmerge.types import PixelScene, UnalignedScene
+
+NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneInput:
+    """A scene as it is worked on, without what only its reading needs.
+
+    Args:
+        scene: The scene.
+        recognised: What the report says about the input.
+        comments: Of its header, those that are passed on.
+        notes: What the reader had to say.
+    """
+
+    scene: PixelScene | UnalignedScene
+    recognised: dict[str, Any]
+    comments: Sequence[str]
+    notes: Sequence[str]
+
+
+def compact_files(
+    files: SceneFiles,
+    settings: CompactOptions,
+    out: Path,
+    *,
+    opacity: OpacityChoice = "auto",
+    hints: ReadHints = AUTO,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    hashed: bool = False,
+    seconds_before: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Read a scene, compact it and write the result, and its further levels of detail beside it.
+
+    Args:
+        files: The scene.
+        settings: Of all stages.
+        out: What to write, in the format that its name asks for; its folder must exist.
+        opacity: How opacities are stored.
+        hints: What is told of the file instead of found.
+        overwrite: Replace files that are there.
+        progress: See :func:`gsmerge.compact`.
+        hashed: Hash the input for the report.
+        seconds_before: Wall time by name of what the caller did before.
+
+    Returns:
+        The report, see :func:`gsmerge.report.report_document`.
+
+    Raises:
+        SceneError: If the scene cannot be read or the result cannot be written.
+        UsageError: If the settings ask for what the scene does not have, or the name for no format.
+    """
+    start, ending = perf_counter(), output_format(out)
+    with atomic_output(out, overwrite=overwrite) as temporary:
+        given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+        read = perf_counter()
+        result = compact(given.scene, settings, progress=progress)
+        if len(result.gaussians) == 0:
+            problem = "expected Gaussians that show something, found none that is left once they are merged"
+            raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
+        compacted = perf_counter()
+        write_gaussians(temporary, result.gaussians, overwrite=True, comments=given.comments, ending=ending)
+    lost = lost_harmonics(out, result.gaussians.sh_degree)
+    coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
+    for path, level in coarser:
+        with atomic_output(path, overwrite=overwrite) as temporary:
+            write_gaussians(temporary, level.gaussians, overwrite=True, comments=given.comments, ending=ending)
+    return report_document(
+        result.report,
+        input_path=files.ply,
+        output_path=out,
+        seconds_before={**(seconds_before or {}), "read": read - start},
+        seconds_after={"write": perf_counter() - compacted},
+        coarser=[(path, level.report) for path, level in coarser],
+        recognised=given.recognised,
+        notes=[*given.notes, *([lost] if lost else [])],
+        hashed=hashed,
+    )
+
+
+def read_input(
+    files: SceneFiles, segment: SegmentOptions, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO
+) -> SceneInput:
+    """Read a scene that is to be cut into superpixels.
+
+    Args:
+        files: The scene.
+        segment: How; not more superpixels than pixels.
+        opacity: How opacities are stored.
+        hints: What is told of the file instead of found.
+
+    Raises:
+        SceneError: If the scene cannot be read.
+        UsageError: If there are fewer pixels than superpixels.
+    """
+    loaded = load_files(files, opacity=opacity, hints=hints)
+    bare = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
+    notes = (*loaded.notes, *([NO_PHOTOS] if bare else []))
+    given = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
+    del loaded  # which knows the row of every pixel
+    release_memory()
+    if len(given.scene):
+        superpixels_per_view(segment, given.scene.cameras.width, given.scene.cameras.height)
+    return given
+
+
+def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
+    """What the report says about the input."""
+    names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
+    cameras, recovery = loaded.scene.cameras, loaded.recovery
+    views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+    views |= {"dialects": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.words}
+    return views | {name: getattr(loaded.ply, name) for name in names}
+
+
+def level_output(output: Path, level: int) -> Path:
+    """``out.ply`` -> ``out.level1.ply``: where a further level of detail goes, counted from 1."""
+    compressed = output.name.lower().endswith(".compressed.ply")
+    length = len(".compressed.ply" if compressed else output.suffix)
+    cut = len(output.name) - length
+    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
+
+
+def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> int:
+    """Superpixels that each view will get.
+
+    Raises:
+        UsageError: If there are more than pixels.
+    """
+    count = count_for(options, height, width)
+    if count > width * height:
+        raise UsageError(
+            f"--superpixels: expected at most {width * height}, one per pixel of {width} x {height}, got {count}"
+        )
+    return count

@@ -1,7 +1,0 @@
-"""gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
-
-from gsmerge.fit.options import Fit, FitOptions, Rates
-from gsmerge.fit.report import FitReport
-from gsmerge.fit.stage import fit, shown, start_share
-
-__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit", "shown", "start_share"]

@@ -1,7 +1,0 @@
-"""Scenes made from random numbers alone, as a feed-forward network would export them: to train on and to test with."""
-
-from gsmerge.generate.options import GenerateOptions, NoiseOptions, read_ranges
-from gsmerge.generate.run import Generated, generate, plan
-from gsmerge.generate.scene import MadeScene, make_scene
-
-__all__ = ["GenerateOptions", "Generated", "MadeScene", "NoiseOptions", "generate", "make_scene", "plan", "read_ranges"]

@@ -1,0 +1,1 @@
+"""Which row of a file belongs to which pixel of which view."""

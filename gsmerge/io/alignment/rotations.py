@@ -1,0 +1,215 @@
+"""Rotations that an exporter stored in another order, or left in the camera's frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.io.hints import QuatChoice
+from gsmerge.types import PixelScene
+
+_SAMPLES = 3000  # pixels per view whose surface is looked at
+_STEP = 2  # pixels to the neighbours that span the surface
+_FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian says which way its surface faces
+_MIN_TESTED = 300
+_MIN_COSINE, _MIN_GAIN = 0.6, 0.15  # of the mean cosine between thinnest axis and normal, for another reading
+_AROUND = 5  # pixels of the square over which means are averaged where roots are looked at
+_FOLLOWS = 0.95  # cosine above which an axis follows the surface
+_MAX_LEFT = 0.5  # share of Gaussians that follow under no root, over that under any other reading
+_READINGS: tuple[QuatChoice, ...] = ("wxyz", "xyzw", "camera")
+_WORDS = {
+    "xyzw": "stored with w last",
+    "camera": "relative to each view's camera",
+    "xyzw-root": "stored with w last and each applied twice",
+}
+
+
+def read_rotations(scene: PixelScene, hints: QuatChoice) -> PixelScene:
+    """The scene with its stored rotations read in another way.
+
+    Args:
+        scene: Rotations as they stand in the file, read as wxyz, local to world.
+        hints: "wxyz": as they are; "xyzw": w comes last; "xyzw-root": w comes last, and each is applied
+            twice: of its two square roots, the one whose thinnest axis follows the surface better; "camera": wxyz,
+            relative to the camera of the own view.
+    """
+    if hints in ("auto", "wxyz"):
+        return scene
+    quats = scene.gaussians.quats
+    if hints == "xyzw":
+        turned = from_xyzw(quats)
+    elif hints == "xyzw-root":
+        normals, thinnest = _smooth_normals(scene), scene.gaussians.scales.argmin(1)
+        roots = square_roots(from_xyzw(quats))
+        first, second = (_cosines(quat_to_rotmat(root), thinnest, normals) for root in roots)
+        turned = torch.where((second > first)[:, None], roots[1], roots[0])
+    else:
+        pose = _quats_of(scene.cameras.viewmats[:, :3, :3].transpose(1, 2)).float()
+        turned = _multiply(pose.repeat_interleave(scene.pixels_per_view, 0), quats)
+    return replace(scene, gaussians=replace(scene.gaussians, quats=turned))
+
+
+def from_xyzw(quats: Tensor) -> Tensor:
+    """``[n,4]`` xyzw -> wxyz."""
+    return quats[:, [3, 0, 1, 2]]
+
+
+def square_roots(quats: Tensor) -> tuple[Tensor, Tensor]:
+    """The two rotations that give those of ``quats [n,4]`` wxyz when applied twice: half the angle; half a turn more.
+
+    Where there is no angle, the second is half a turn about an arbitrary axis.
+    """
+    unit = torch.nn.functional.normalize(quats, dim=1)
+    unit = torch.where(unit[:, :1] < 0, -unit, unit)
+    half = torch.nn.functional.normalize(unit + unit.new_tensor([1.0, 0, 0, 0]), dim=1)
+    return half, _half_a_turn_more(half)
+
+
+def likely_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
+    """How the rotations are to be read: the way that turns the thinnest axes towards the surface's normals.
+
+    Args:
+        scene: Rotations as they stand in the file, read as wxyz.
+
+    Returns:
+        The reading, and a sentence about it; "wxyz" and "" unless another one is better by a large margin.
+    """
+    normals, rows, views = _normals(scene)
+    scales = scene.gaussians.scales[rows]
+    ordered = scales.sort(1).values
+    flat = ordered[:, 0] < _FLAT * ordered[:, 1]
+    normals, rows, views = normals[flat], rows[flat], views[flat]
+    if len(rows) < _MIN_TESTED:
+        return "wxyz", ""
+    thinnest, quats = scene.gaussians.scales[rows].argmin(1), scene.gaussians.quats[rows]
+    poses = scene.cameras.viewmats[:, :3, :3].transpose(1, 2)
+    in_world = _multiply(_quats_of(poses).float()[views], quats)
+    as_xyzw = from_xyzw(quats)
+    turns = {
+        "wxyz": quat_to_rotmat(quats),
+        "xyzw": quat_to_rotmat(as_xyzw),
+        "camera": quat_to_rotmat(in_world),
+    }
+    cosine: dict[QuatChoice, float] = {
+        name: float(_cosines(turns[name], thinnest, normals).mean()) for name in _READINGS
+    }
+    best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
+    if _is_root(scene, rows, [quats, as_xyzw, in_world], thinnest, normals):
+        best, cosine["xyzw-root"] = "xyzw-root", _better_of(square_roots(as_xyzw), thinnest, normals, 0.0)
+    elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + _MIN_GAIN):
+        return "wxyz", ""
+    return best, (
+        f"rotations are {_WORDS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the surface"
+        f" then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
+    )
+
+
+def _cosines(turns: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
+    """``[n]`` between the thinnest axes of Gaussians turned by ``[n,3,3]`` and the normals, 0 to 1."""
+    axes = turns.gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    return (axes * normals).sum(1).abs()
+
+
+def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Tensor, normals: Tensor) -> bool:
+    """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
+
+    The better of two is better by chance as well: every other reading is given a second rotation as the roots have it,
+    half a turn more about the same axis.
+
+    Args:
+        scene: As it stands.
+        rows: ``[t]`` Gaussians that are looked at.
+        single: ``[t,4]`` their rotations as read otherwise; as stored first, as xyzw next.
+        thinnest: ``[t]`` their thinnest axes.
+        normals: ``[t,3]`` of the surface there, roughly: a first look, which takes little time.
+    """
+    others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
+    roots = square_roots(single[1])
+    if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in others):
+        return False
+    smooth = _smooth_normals(scene)[rows]
+    rival = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in others)
+    return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - rival)
+
+
+def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor, least: float) -> float:
+    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``; share above ``least`` if not 0."""
+    first, second = (_cosines(quat_to_rotmat(quats), thinnest, normals) for quats in pair)
+    better = torch.maximum(first, second)
+    return float((better > least).float().mean() if least else better.mean())
+
+
+def _half_a_turn_more(quats: Tensor) -> Tensor:
+    """Rotations ``[n,4]`` with half a turn more about their own axes."""
+    length = quats[:, 1:].norm(dim=1, keepdim=True)
+    axis = torch.where(length > 0, quats[:, 1:] / length, quats.new_tensor([0.0, 0, 1]))
+    return torch.cat([-length, quats[:, :1] * axis], 1)
+
+
+def _smooth_normals(scene: PixelScene) -> Tensor:
+    """``[n,3]`` normals of the surface at all pixels, of means averaged over some pixels around."""
+    v, h, w = scene.valid.shape
+    weights = scene.valid.reshape(v, 1, h, w).float()
+    means = torch.where(weights > 0, scene.gaussians.means.reshape(v, h, w, 3).permute(0, 3, 1, 2).float(), 0.0)
+    middle = means.sum((0, 2, 3), keepdim=True) / weights.sum().clamp(min=1)
+    both = torch.cat([(means - middle) * weights, weights], 1)
+    around = torch.nn.functional.avg_pool2d(both, _AROUND, 1, _AROUND // 2)
+    grid = (around[:, :3] / around[:, 3:].clamp(min=1e-6)).permute(0, 2, 3, 1)
+    x, y = torch.arange(w), torch.arange(h)
+    across = grid[:, :, (x + _STEP).clamp(max=w - 1)] - grid[:, :, (x - _STEP).clamp(min=0)]
+    down = grid[:, (y + _STEP).clamp(max=h - 1)] - grid[:, (y - _STEP).clamp(min=0)]
+    return torch.nn.functional.normalize(torch.linalg.cross(across, down).reshape(-1, 3), dim=1)
+
+
+def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals ``[t,3]`` of some pixels' surface, their rows and their views."""
+    v, h, w = scene.valid.shape
+    if min(h, w) <= 2 * _STEP:
+        empty = torch.zeros(0, dtype=torch.int64)
+        return torch.zeros(0, 3), empty, empty
+    inner = torch.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
+    step = max(1, inner.shape[1] // _SAMPLES)
+    while step > 1 and np.gcd(step, w - 2 * _STEP) > 1:
+        step += 1
+    rows = inner[:, ::step].reshape(-1)
+    valid, means = scene.valid.reshape(-1), scene.gaussians.means
+    good = valid[rows]
+    for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):
+        good = good & valid[rows + offset]
+    rows = rows[good]
+    across = (means[rows + _STEP] - means[rows - _STEP]).float()
+    down = (means[rows + _STEP * w] - means[rows - _STEP * w]).float()
+    normals = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=1)
+    return normals, rows, rows.div(h * w, rounding_mode="floor")
+
+
+def _quats_of(rotations: Tensor) -> Tensor:
+    """``[c,3,3]`` rotations -> ``[c,4]`` unit quaternions wxyz."""
+    r = rotations.double()
+    trace = r.diagonal(dim1=1, dim2=2)
+    m = torch.zeros(len(r), 4, 4, dtype=torch.float64)
+    m[:, 0, 0] = trace.sum(1)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        m[:, i + 1, i + 1] = trace[:, i] - trace[:, j] - trace[:, k]
+        m[:, 0, i + 1] = m[:, i + 1, 0] = r[:, k, j] - r[:, j, k]
+        m[:, i + 1, j + 1] = m[:, j + 1, i + 1] = r[:, i, j] + r[:, j, i]
+    return torch.linalg.eigh(m).eigenvectors[:, :, -1]  # of the largest eigenvalue, 3
+
+
+def _multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Products of quaternions wxyz: first ``b``, then ``a``."""
+    aw, ax, ay, az = a.unbind(1)
+    bw, bx, by, bz = b.unbind(1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        1,
+    )

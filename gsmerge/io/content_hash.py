@@ -1,0 +1,87 @@
+"""Scenes by what is in their files: hashes of everything that is read, and names made of a scene's own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import CameraFile, SceneFiles, read_cameras
+from gsmerge.io.cameras.long_lrm import CHOSEN, MOVED, SCALED
+from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
+from gsmerge.io.cameras.trajectory import INTRINSICS
+from gsmerge.io.scene_files import IMAGE_PLACES
+
+BESIDE = (DATAPARSER, *INTRINSICS, CHOSEN, MOVED, SCALED)  # small files that some camera files are read with
+
+
+def digest(value: Mapping[str, Any]) -> str:
+    """SHA-256 of plain JSON types; the order of the keys does not matter."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def content_hash(files: Sequence[Path]) -> str:
+    """SHA-256 over the names and contents of files; of folders, over everything in them."""
+    state = hashlib.sha256()
+    for given in files:
+        inside = sorted(p for p in given.rglob("*") if p.is_file()) if given.is_dir() else [given]
+        for path in inside:
+            name = path.relative_to(given).as_posix() if given.is_dir() else path.name
+            try:
+                with path.open("rb") as file:
+                    state.update(f"{len(name)}:{name}:{path.stat().st_size}:".encode())
+                    while block := file.read(1 << 20):
+                        state.update(block)
+            except OSError as error:
+                raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    return state.hexdigest()
+
+
+def read_files(files: SceneFiles) -> list[Path]:
+    """Everything that is read of a scene, each once: files, and folders of which everything is."""
+    read = [path for path in (files.ply, files.cameras, files.images) if path is not None]
+    if files.cameras is not None:
+        root = files.cameras if files.cameras.is_dir() else files.cameras.parent
+        read += [root / name for name in BESIDE if (root / name).is_file()]
+        read += photos_of(files.cameras)
+    return list(dict.fromkeys(read))
+
+
+def photos_of(cameras: Path) -> list[Path]:
+    """Where the photos of a camera file may be found by its names or beside it."""
+    read = cameras_of(cameras)
+    root = cameras if cameras.is_dir() else cameras.parent
+    named = [root / name for name in (() if read is None else read.names) if (root / name).is_file()]
+    return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
+
+
+def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
+    """The cameras of a file; None where it cannot be read, which is told when the scene is."""
+    try:
+        return read_cameras(path, scene=scene)
+    except SceneError:
+        return None
+
+
+def stem_of(scene: Path) -> str:
+    """A scene's name; of a file without the extension. Folders may have dots in theirs."""
+    return scene.stem if scene.suffix == ".ply" else scene.name
+
+
+def filled(template: str | None, scene: Path) -> Path | None:
+    """A path with ``{scene}`` (the scene as given), ``{parent}`` (its folder) and ``{stem}`` (its name) filled in.
+
+    Raises:
+        UsageError: If the template holds another name.
+    """
+    if template is None:
+        return None
+    parent = scene if scene.is_dir() else scene.parent
+    try:
+        return Path(template.format(scene=scene, parent=parent, stem=stem_of(scene)))
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise UsageError(f"expected {{scene}}, {{parent}} or {{stem}} in braces, got {template}") from error

@@ -1,0 +1,77 @@
+"""Gaussians as float64 arrays in the units of most file formats, for the writers that quantise them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gsmerge.io.formats.ply_layout import MAX_LOG_SCALE
+from gsmerge.types import SH_C0, Gaussians
+
+
+@dataclass(frozen=True)
+class Columns:
+    """n Gaussians: ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]`` in [0, 1],
+    ``colors [n,3]`` (0.5 + 0.2821 sh0) and ``harmonics [n,k-1,3]``.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+    harmonics: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def taken(self, order: np.ndarray) -> Columns:
+        """The rows in another order."""
+        return Columns(*(column[order] for column in vars(self).values()))
+
+
+def columns_of(gaussians: Gaussians, max_degree: int) -> Columns:
+    """Finite Gaussians as arrays, without harmonics above a degree.
+
+    Raises:
+        ValueError: If there is NaN or inf.
+    """
+
+    def array(tensor: Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:
+        values = tensor.detach().cpu().double().numpy()
+        if not np.isfinite(values).all():
+            raise ValueError("expected finite Gaussians, got NaN or inf")
+        return values
+
+    degree = min(max_degree, gaussians.sh_degree)
+    quats = array(gaussians.quats)
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
+    with np.errstate(divide="ignore"):  # scales of 0 are clipped
+        log_scales = np.clip(np.log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
+    return Columns(
+        means=array(gaussians.means),
+        quats=quats,
+        log_scales=log_scales,
+        opacities=array(gaussians.opacities).clip(0, 1),
+        colors=0.5 + SH_C0 * array(gaussians.sh0)[:, 0],
+        harmonics=array(gaussians.shN)[:, : (degree + 1) ** 2 - 1],
+    )
+
+
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """The nearest of 0 to 255, uint8."""
+    return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
+
+
+def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index ``[n]`` of the largest component of unit quaternions ``[n,4]``, and the other three ``[n,3]`` in order.
+
+    The sign is chosen so that the largest one is positive, which makes it the one that need not be stored.
+    """
+    largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
+    quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+    return largest, quats[np.arange(4) != largest[:, None]].reshape(-1, 3)

@@ -1,0 +1,121 @@
+"""Compressed PLY (PlayCanvas, SuperSplat, gsplat): four packed words per Gaussian, ranges per chunk of 256.
+
+The layout is that of PlayCanvas' reader: positions and scales 11-10-11 bits between a chunk's minimum and maximum,
+rotations as their three smaller components at 10 bits, colours and opacity at 8 bits; higher harmonics, where there are
+any, as bytes in an element ``sh``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyListProperty
+
+from gsmerge.errors import SceneError
+from gsmerge.io.formats.ply_layout import MEANS, QUATS, REQUIRED, SCALES, SH0
+from gsmerge.types import SH_C0
+
+CHUNK = 256  # Gaussians that share a range
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+RANGES = (
+    *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
+    *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"),
+)
+COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
+SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
+
+
+def is_compressed(data: PlyData) -> bool:
+    """Whether a PLY holds packed Gaussians."""
+    return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
+
+
+def unpack(path: Path, data: PlyData) -> np.ndarray:
+    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_layout`, opacities as logits.
+
+    Raises:
+        SceneError: If chunks are missing or lack a column.
+    """
+    vertex, chunk = data["vertex"], data["chunk"]
+    for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
+        found = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
+        odd = next((name for name in needed if found.get(name) not in types), None)
+        if odd is not None:
+            where, kind = f"in element '{element.name}' of a compressed file", found.get(odd, "none")
+            raise SceneError(path, f"expected {odd} {where} as {types[0]}, found {kind}")
+    count = vertex.count
+    if count == 0:
+        raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
+    if chunk.count < -(-count // CHUNK):
+        raise SceneError(
+            path, f"expected {-(-count // CHUNK)} chunks for {count} Gaussians, found {chunk.count}", "export it again"
+        )
+    ids = np.arange(count) // CHUNK
+    colors = [p.name for p in chunk.properties if p.name in COLORS and p.val_dtype in ("f4", "f8")]
+    with np.errstate(all="ignore"):  # what is not finite is set aside later
+        ranges = {name: np.asarray(chunk[name], np.float32)[ids] for name in (*RANGES, *colors)}
+    num_rest = _num_rest(path, data, count)
+    names = [*REQUIRED, *(f"f_rest_{i}" for i in range(num_rest))]
+    rows = np.empty(count, [(name, "<f4") for name in names])
+    words = {name: np.asarray(vertex[name]).astype(np.uint32) for name in PACKED}
+    _fill_vectors(rows, MEANS, words["packed_position"], ranges, "")
+    _fill_vectors(rows, SCALES, words["packed_scale"], ranges, "scale_")
+    _fill_rotations(rows, words["packed_rotation"])
+    _fill_colors(rows, words["packed_color"], ranges)
+    for i in range(num_rest):
+        stored = np.asarray(data["sh"][f"f_rest_{i}"], np.float32)
+        share = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
+        rows[f"f_rest_{i}"] = (share - 0.5) * SH_RANGE
+    return rows
+
+
+def _num_rest(path: Path, data: PlyData, count: int) -> int:
+    if "sh" not in data:
+        return 0
+    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}
+    number = len(names)
+    if number not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(number)} or data["sh"].count != count:
+        raise SceneError(path, f"expected 9, 24 or 45 harmonics for {count} Gaussians in element 'sh', found others")
+    return number
+
+
+def _fill_vectors(
+    rows: np.ndarray, names: tuple[str, ...], words: np.ndarray, ranges: dict[str, np.ndarray], prefix: str
+) -> None:
+    """Three numbers of 11, 10 and 11 bits, between the chunk's minimum and maximum."""
+    for name, axis, shift, bits in zip(names, "xyz", (21, 11, 0), (11, 10, 11), strict=True):
+        part = ((words >> np.uint32(shift)) & np.uint32(2**bits - 1)) / np.float32(2**bits - 1)
+        low, high = ranges[f"min_{prefix}{axis}"], ranges[f"max_{prefix}{axis}"]
+        with np.errstate(all="ignore"):
+            rows[name] = low * (1 - part) + high * part
+
+
+def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
+    """Two bits name the largest component of wxyz; the others follow at 10 bits each, over +-sqrt(1/2)."""
+    largest = (words >> np.uint32(30)).astype(np.int64)
+    norm = np.sqrt(2.0)
+    parts = [(((words >> np.uint32(s)) & np.uint32(1023)) / 1023.0 - 0.5) * norm for s in (20, 10, 0)]
+    missing = np.sqrt(np.clip(1 - sum(part**2 for part in parts), 0, None))
+    quats = np.empty((len(words), 4))
+    for which in range(4):
+        mine = largest == which
+        others = iter(parts)
+        for i in range(4):
+            quats[mine, i] = missing[mine] if i == which else next(others)[mine]
+    for i, name in enumerate(QUATS):
+        rows[name] = quats[:, i]
+
+
+def _fill_colors(rows: np.ndarray, words: np.ndarray, ranges: dict[str, np.ndarray]) -> None:
+    """Red, green, blue and opacity in [0, 1] at 8 bits each; newer files give colours a range per chunk."""
+    with np.errstate(divide="ignore"):
+        alpha = (words & np.uint32(255)) / 255.0
+        rows["opacity"] = np.log(alpha) - np.log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
+    for name, channel, shift in zip(SH0, "rgb", (24, 16, 8), strict=True):
+        color = ((words >> np.uint32(shift)) & np.uint32(255)) / 255.0
+        if all(key in ranges for key in COLORS):
+            low, high = ranges[f"min_{channel}"], ranges[f"max_{channel}"]
+            with np.errstate(all="ignore"):
+                color = low * (1 - color) + high * color
+        rows[name] = (color - 0.5) / SH_C0

@@ -1,0 +1,353 @@
+"""Reading Gaussian splats from PLY: log scales, logits and channel-major harmonics end here."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+from gsmerge.errors import SceneError
+from gsmerge.io.formats.compressed import is_compressed, unpack
+from gsmerge.io.formats.ply_file import let_go, open_ply
+from gsmerge.io.formats.ply_layout import (
+    BLOCK_BYTES,
+    LOGIT_COMMENT,
+    MAX_HARMONIC,
+    MAX_LOG_SCALE,
+    MEANS,
+    NORMALS,
+    QUATS,
+    REQUIRED,
+    RGB,
+    SCALES,
+    SH0,
+    bytes_by_attribute,
+    color_columns,
+    layout_name,
+    sh_degree,
+    spread_low_degree,
+)
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import SH_C0, Gaussians
+
+RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+
+OpacityChoice = Literal["auto", "logit", "raw"]
+
+
+@dataclass(frozen=True)
+class PlyInfo:
+    """What was found in a PLY file.
+
+    Args:
+        path: The file.
+        layout: Name of the column layout, as "17-column export" or "INRIA, SH degree 3".
+        format: "ascii", "binary little-endian" or "binary big-endian".
+        count: Gaussians, the set-aside ones included.
+        file_bytes: Size of the file.
+        bytes_by_attribute: Bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats,
+            extra); of the values' binary types for an ascii file.
+        columns: All columns of the vertex element, in the file's order.
+        extra_columns: Those that mean nothing here.
+        extra_elements: Elements beside ``vertex``.
+        byte_columns: Columns stored as bytes.
+        comments: Of the header.
+        sh_degree: 0 to 4.
+        opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
+        opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
+        num_nonfinite: Rows with NaN or inf, set aside.
+        num_clipped_scales: Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped.
+        num_zero_quats: Gaussians without a rotation, taken as the identity.
+    """
+
+    path: str
+    layout: str
+    format: str
+    count: int
+    file_bytes: int
+    bytes_by_attribute: dict[str, int]
+    columns: tuple[str, ...]
+    extra_columns: tuple[str, ...]
+    extra_elements: tuple[str, ...]
+    byte_columns: tuple[str, ...]
+    comments: tuple[str, ...]
+    sh_degree: int
+    opacity_encoding: str
+    opacity_guessed: bool
+    num_nonfinite: int
+    num_clipped_scales: int
+    num_zero_quats: int
+
+
+@dataclass(frozen=True)
+class PlyScene:
+    """The Gaussians of a PLY file, row by row.
+
+    Args:
+        gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
+            fully transparent and grey, and has the position and scales of the finite row before it.
+        valid: ``[n]`` bool, False for the rows that were not finite.
+        info: What was found.
+    """
+
+    gaussians: Gaussians
+    valid: torch.Tensor
+    info: PlyInfo
+
+
+def kept_comments(info: PlyInfo) -> tuple[str, ...]:
+    """Comments of a file's header that say how its Gaussians are to be rendered, to be passed on."""
+    lines = (comment for comment in info.comments if comment.isascii() and comment.isprintable())
+    return tuple(comment for comment in lines if comment.startswith(RENDER_COMMENT))
+
+
+def ply_notes(info: PlyInfo) -> tuple[str, ...]:
+    """What was adapted or looks odd in a PLY file, one sentence each, without a full stop."""
+    counted = {
+        "row(s) with NaN or inf, set aside": info.num_nonfinite,
+        "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
+        "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
+    }
+    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
+    notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
+    return (*notes, *(f"{count:,} {what}" for what, count in counted.items() if count))
+
+
+def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
+    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
+
+    Args:
+        path: The file.
+        opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
+            as logits. Infinite logits are opacities of 0 and 1.
+
+    Colours may stand as red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+
+    Raises:
+        SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
+        ValueError: If ``opacity`` is none of the three.
+    """
+    if opacity not in ("auto", "logit", "raw"):
+        raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
+    path = Path(path)
+    data = open_ply(path)
+    compressed = is_compressed(data)
+    stored = unpack(path, data) if compressed else _vertex(path, data).data
+    rows = np.asarray(stored)
+    names = tuple(rows.dtype.names or ())
+    num_rest = _num_rest(path, names)
+    out = _allocate(rows, num_rest // 3)
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+    blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
+
+    def convert(block: slice) -> _Converted:
+        found = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        let_go(stored, block)
+        return found
+
+    done = parallel_map(convert, blocks)
+    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
+    named = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
+    encoding = named or _likely_encoding(done)
+    _activate(out["opacities"], out["valid"], encoding)
+    num_bad = _set_aside(path, out)
+    byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
+    if byte_columns == NORMALS:
+        spread_low_degree(out["shN"])
+    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    extra = tuple(name for name in names if name not in used)
+    info = PlyInfo(
+        path=str(path),
+        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
+        format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
+        count=len(rows),
+        file_bytes=path.stat().st_size,
+        bytes_by_attribute=bytes_by_attribute(rows, extra),
+        columns=names,
+        extra_columns=extra,
+        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+        byte_columns=byte_columns,
+        comments=comments,
+        sh_degree=sh_degree(num_rest),
+        opacity_encoding=encoding,
+        opacity_guessed=named is None,
+        num_nonfinite=num_bad,
+        num_clipped_scales=sum(d.num_clipped for d in done),
+        num_zero_quats=sum(d.num_zero_quats for d in done),
+    )
+    tensors = {k: torch.from_numpy(v) for k, v in out.items()}
+    return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
+
+
+def _vertex(path: Path, data: PlyData) -> PlyElement:
+    if "vertex" not in data:
+        found = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
+        raise SceneError(path, f"expected an element 'vertex', found {found}")
+    vertex = data["vertex"]
+    columns = {p.name for p in vertex.properties}
+    missing = [name for name in REQUIRED if name not in columns]
+    if columns.issuperset(RGB):
+        missing = [name for name in missing if name not in SH0]
+    if missing:
+        remedy = "this is no Gaussian splat"
+        if any(name.startswith("packed_") for name in columns):
+            remedy = "it is compressed, but lacks its element 'chunk'"
+        elif missing == ["scale_2"]:
+            remedy = "flat 2D Gaussians need a scale_2 column of their own"
+        elif len(missing) < len(REQUIRED) // 2:
+            remedy = "export it again with them"
+        raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
+    if vertex.count == 0:
+        raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
+    return vertex
+
+
+def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
+    names = [name for name in columns if name.startswith("f_rest_")]
+    if len(names) not in (0, 9, 24, 45, 72) or set(names) != {f"f_rest_{i}" for i in range(len(names))}:
+        raise SceneError(
+            path,
+            "expected columns f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4) or none, "
+            f"found {len(names)} f_rest columns",
+        )
+    return len(names)
+
+
+def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
+    n = len(rows)
+    wide = any(rows.dtype[name] in (np.dtype("<f8"), np.dtype(">f8")) for name in MEANS)
+    shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
+    out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
+    return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+
+
+@dataclass(frozen=True)
+class _Converted:
+    """What one block of rows had."""
+
+    num_clipped: int
+    num_zero_quats: int
+    any_finite_opacity: bool
+    unit_opacities: bool  # all finite ones in [0, 1]
+
+
+def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
+    """Fill the arrays of one block of rows, column by column; opacities are copied as they are."""
+    with np.errstate(all="ignore"):
+        total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
+
+        def take(name: str) -> np.ndarray:
+            column = rows[name].astype(np.float32)
+            np.add(total, column, out=total)
+            return column
+
+        for j, name in enumerate(MEANS):
+            column = take(name)
+            out["means"][:, j] = column if out["means"].dtype == np.float32 else rows[name]
+        clipped = np.zeros(len(rows), np.bool_)
+
+        def take_harmonic(name: str) -> np.ndarray:
+            column = take(name)
+            size = np.abs(column)
+            if not size.max() <= MAX_HARMONIC:
+                np.logical_or(clipped, size > MAX_HARMONIC, out=clipped)
+                np.clip(column, -MAX_HARMONIC, MAX_HARMONIC, out=column)
+            return column
+
+        for j, name in enumerate(color_columns(rows.dtype.names)):
+            column = take_harmonic(name)
+            if name in RGB:
+                column = (column / (255 if rows.dtype[name].kind == "u" else 1) - 0.5) / SH_C0
+            out["sh0"][:, 0, j] = column
+        num_higher = out["shN"].shape[1]
+        for channel in range(3):
+            for j in range(num_higher):
+                out["shN"][:, j, channel] = take_harmonic(f"f_rest_{channel * num_higher + j}")
+        for j, name in enumerate(SCALES):
+            column = take(name)
+            clipped |= np.abs(column) > MAX_LOG_SCALE
+            np.clip(column, -MAX_LOG_SCALE, MAX_LOG_SCALE, out=column)
+            out["scales"][:, j] = np.exp(column, out=column)
+        quats = [take(name) for name in QUATS]
+        zero = _normalise(quats, out["quats"])
+        out["opacities"][:] = take("opacity")
+        valid = np.isfinite(total, out=out["valid"])
+        doubtful = np.flatnonzero(~valid)
+        if len(doubtful):
+            valid[doubtful] = _exactly_valid(rows[doubtful], num_higher)
+    finite = out["opacities"][np.isfinite(out["opacities"])] if len(doubtful) else out["opacities"]
+    return _Converted(
+        num_clipped=int((clipped & valid).sum()),
+        num_zero_quats=int((zero & valid).sum()),
+        any_finite_opacity=len(finite) > 0,
+        unit_opacities=bool(len(finite) == 0 or (finite.min() >= 0 and finite.max() <= 1)),
+    )
+
+
+def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
+    """Whether rows are usable: all finite, but an infinite logit or a scale of exactly zero is a value."""
+    valid = ~np.isnan(rows["opacity"].astype(np.float32))
+    colors = color_columns(rows.dtype.names)
+    for name in (*MEANS, *colors, *QUATS, *(f"f_rest_{i}" for i in range(3 * num_higher))):
+        valid &= np.isfinite(rows[name].astype(np.float32))
+    for name in SCALES:
+        column = rows[name].astype(np.float32)
+        valid &= np.isfinite(column) | (column == -np.inf)
+    return valid
+
+
+def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
+    """Write unit quaternions; returns the mask of the zero ones, which become the identity."""
+    w, x, y, z = quats
+    squared = w * w + x * x + y * y + z * z
+    inverse = 1 / np.sqrt(squared)
+    for j, column in enumerate(quats):
+        np.multiply(column, inverse, out=out[:, j])
+    zero = np.zeros(len(w), np.bool_)
+    extreme = np.flatnonzero(~((squared > 1e-30) & (squared < 1e30)))  # float32 squares under- or overflow
+    if len(extreme):
+        exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
+        length = np.linalg.norm(exact, axis=1)
+        zero[extreme] = length == 0
+        exact[length == 0] = (1, 0, 0, 0)
+        out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
+    return zero
+
+
+def _likely_encoding(done: list[_Converted]) -> str:
+    finite = any(d.any_finite_opacity for d in done)
+    return "raw" if finite and all(d.unit_opacities for d in done) else "logit"
+
+
+def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
+    """Turn stored opacities into [0, 1], in place; an infinite activated one makes its row invalid."""
+    if encoding == "raw":
+        valid &= np.isfinite(opacities)
+        np.clip(opacities, 0, 1, out=opacities)
+        return
+    with np.errstate(all="ignore"):
+        np.exp(np.negative(opacities, out=opacities), out=opacities)
+        np.add(opacities, 1, out=opacities)
+        np.reciprocal(opacities, out=opacities)
+
+
+def _set_aside(path: Path, out: dict[str, np.ndarray]) -> int:
+    """Make the invalid rows transparent, in place; returns their number."""
+    valid = out["valid"]
+    bad = np.flatnonzero(~valid)
+    if len(bad) == 0:
+        return 0
+    good = np.flatnonzero(valid)
+    if len(good) == 0:
+        raise SceneError(path, f"expected finite Gaussians, found NaN or inf in all {len(valid)} rows")
+    before = good[np.maximum(np.searchsorted(good, bad) - 1, 0)]
+    for name in ("means", "scales"):
+        out[name][bad] = out[name][before]
+    for name, value in {"quats": (1, 0, 0, 0), "opacities": 0, "sh0": 0, "shN": 0}.items():
+        out[name][bad] = value
+    return len(bad)

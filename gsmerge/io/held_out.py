@@ -1,0 +1,201 @@
+"""Held-out photos with their cameras, in the frame of a scene: what its renders are judged by."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from torch import Tensor
+
+from gsmerge.errors import SceneError
+from gsmerge.io.alignment.grid import as_pinholes, photo_size
+from gsmerge.io.alignment.poses import reread, with_poses
+from gsmerge.io.alignment.similarity import SAME, Frame
+from gsmerge.io.cameras import read_cameras, to_cameras
+from gsmerge.io.cameras.camera_file import CameraFile, select_views
+from gsmerge.io.hints import AUTO
+from gsmerge.io.photo_size import lighter_photos
+from gsmerge.io.photos import as_tensor, find_image
+from gsmerge.io.scene import SceneLoad
+from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
+from gsmerge.io.views import stored_photos
+from gsmerge.types import Cameras, PixelScene, UnalignedScene
+
+_MAX_TURN = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
+_MAX_SHIFT = 0.005  # of the distance between the views
+_MIN_SHARED = 3  # views that tell how two worlds lie to one another
+_SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotation: the very same view
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Views that were no input.
+
+    Args:
+        cameras: Their cameras, in the frame of the scene's Gaussians.
+        images: ``[t,h,w,3]`` photos, sRGB in [0, 1], float32.
+        names: As their camera file has them.
+        places: Of each along the trajectory: its index in the camera file.
+        context_places: The same of the scene's views; None where they are not all in the file.
+        notes: What was adapted, one sentence each.
+    """
+
+    cameras: Cameras
+    images: Tensor
+    names: tuple[str, ...]
+    places: tuple[int, ...]
+    context_places: tuple[int, ...] | None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+def read_targets(
+    load: SceneLoad, cameras: str | os.PathLike[str], images: str | os.PathLike[str] | None = None
+) -> Targets:
+    """Read held-out photos and their cameras.
+
+    Views that the scene was made of are left out. Where the file has those too, under the same names, their poses tell
+    how its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras. Poses
+    that the scene's cameras have in another convention than their format are read in that one here, too.
+
+    Args:
+        load: The scene, with what was found on reading it.
+        cameras: Any camera file or folder that scenes may have.
+        images: Folder of the photos; None: where the camera file says.
+
+    Raises:
+        SceneError: If a file is missing or damaged, or no view is left.
+    """
+    path = Path(cameras)
+    if not path.exists():
+        raise SceneError(path, "expected cameras of held-out views, found nothing")
+    read = read_cameras(path, scene=load.files.ply.stem)
+    tried = [(one, *_world(one, _shared_views(one, load.scene.names), load)) for one in _readings(read, load)]
+    read, world, shared = next((found for found in tried if found[2]), tried[0])
+    moved = world.move_cameras(read.viewmats.numpy())
+    shared |= _repeated(moved, load.scene)
+    places = [i for i in range(len(read)) if i not in shared]
+    if not places:
+        raise SceneError(path, "expected views that the scene was not made of, found none")
+    chosen = select_views(read, places)
+    photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
+    if photos is None:
+        raise SceneError(path, f"no photo found for {_missing(path, chosen)}", "name their folder with --target-images")
+    straight, photos, _ = as_pinholes(chosen, photos)
+    photos, notes = lighter_photos(photos, 0, AUTO.max_side, loose=False)
+    assert photos is not None
+    at_size = to_cameras(straight, photo_size(photos))
+    inverse = {view: place for place, view in shared.items()}
+    return Targets(
+        with_poses(at_size, moved[places]),
+        as_tensor(photos),
+        chosen.names,
+        tuple(places),
+        tuple(inverse[view] for view in range(len(load.scene))) if 0 < len(inverse) == len(load.scene) else None,
+        tuple(notes),
+    )
+
+
+def _readings(read: CameraFile, load: SceneLoad) -> list[CameraFile]:
+    """The file as it may be meant, the likeliest first: as the scene's cameras of the same format had to be read."""
+    own = load.cameras
+    if own is None or own.source != read.source or own.convention == read.convention:
+        return [read]
+    return [reread(read, own.convention), read]
+
+
+def _missing(path: Path, cameras: CameraFile) -> str:
+    """The first view that has no photo where the camera file says."""
+    root = path if path.is_dir() else path.parent
+    return next((name for name in cameras.names if find_image(root, name) is None), cameras.names[0])
+
+
+def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | None) -> Path | None:
+    """Where the photos are: as told, or in a folder beside cameras that do not say it."""
+    if images is not None:
+        if not Path(images).is_dir():
+            raise SceneError(images, "expected a folder of photos")
+        return Path(images)
+    if cameras.images is not None:
+        return path
+    root = path if path.is_dir() else path.parent
+    if any((root / name).is_file() for name in cameras.names):
+        return None
+    return next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
+
+
+def _shared_views(read: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
+    """Index in the file -> view of the scene, for views that both name; empty if stems are not unique."""
+    stems = [PurePosixPath(name.replace("\\", "/")).stem for name in read.names]
+    own = [PurePosixPath(name.replace("\\", "/")).stem for name in names]
+    if len(set(stems)) < len(stems) or len(set(own)) < len(own):
+        return {}
+    place = {stem: i for i, stem in enumerate(stems)}
+    return {place[stem]: view for view, stem in enumerate(own) if stem in place}
+
+
+def _world(read: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Frame, dict[int, int]]:
+    """How the file's world lies to that of the Gaussians, and which of its views are the scene's by name and pose."""
+    stored = SAME if load.recovery is None else load.recovery.best.frame
+    if not named:
+        return stored, {}
+    theirs = read.viewmats.numpy()[list(named)]
+    ours = load.scene.cameras.viewmats.double().numpy()[list(named.values())]
+    frames = [stored] + [similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
+    for frame in frames:
+        turn, shift = _disagreement(frame.move_cameras(theirs), ours)
+        if turn <= _MAX_TURN and shift <= _MAX_SHIFT:
+            return frame, dict(named)
+    return stored, {}
+
+
+def similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Frame:
+    """The frame that moves cameras onto their poses in another world, least squares.
+
+    Args:
+        theirs: ``[c,4,4]`` world to camera.
+        ours: The same cameras in the other world.
+        scale: Of the worlds, for cameras that all stand in one place and do not tell it.
+    """
+    turns = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
+    u, _, vt = np.linalg.svd(turns)
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    a, b = _centres(theirs) @ rotation.T, _centres(ours)
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    spread = float((a0**2).sum())
+    if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
+        scale = float((a0 * b0).sum()) / spread
+    return Frame(rotation, scale, b.mean(0) - scale * a.mean(0))
+
+
+def _centres(viewmats: np.ndarray) -> np.ndarray:
+    return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
+    """Largest angle (degrees) and largest distance (of the spread of the views) between two sets of poses."""
+    cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
+    distance = np.linalg.norm(_centres(moved) - _centres(ours), axis=1).max()
+    return float(np.degrees(np.arccos(cosines.clip(-1, 1))).max()), float(distance / _spread(ours))
+
+
+def _spread(viewmats: np.ndarray) -> float:
+    """Distance of the outermost centres; 1 where there is none."""
+    centres = _centres(viewmats)
+    return float(np.linalg.norm(centres.max(0) - centres.min(0))) or 1.0
+
+
+def _repeated(moved: np.ndarray, scene: PixelScene | UnalignedScene) -> dict[int, int]:
+    """Views that stand where one of the scene's does and look the same way, and which one that is."""
+    if len(scene) == 0 or len(scene.gaussians) == 0:
+        return {}
+    ours, middle = scene.cameras.viewmats.double().numpy(), scene.gaussians.means.double().median(0).values.numpy()
+    # what is seen lies as far away as the views may be apart, or farther; one view has nothing else to measure by
+    limit = _SAME_POSE * float(np.linalg.norm(_centres(ours) - middle, axis=1).max())
+    near = np.linalg.norm(_centres(moved)[:, None] - _centres(ours), axis=2) <= limit
+    alike = np.abs(moved[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= _SAME_POSE
+    return {int(i): int(view) for i, view in zip(*np.nonzero(near & alike), strict=True)}

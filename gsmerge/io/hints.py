@@ -1,0 +1,67 @@
+"""What a caller tells about a file instead of leaving it to be found out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, cast, get_args
+
+from gsmerge.io.alignment.layouts import ORDERS, Order
+
+QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
+QUATS: tuple[str, ...] = get_args(QuatChoice)
+
+
+@dataclass(frozen=True)
+class ReadHints:
+    """How to read a file where its values do not tell, or tell something wrong.
+
+    Args:
+        exporter: Which exporter wrote it, a name of :data:`gsmerge.io.exporters.EXPORTERS`; "auto": found out.
+        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are taken,
+            where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
+            "auto": as the exporter says, and checked against the surface where the pixels are known.
+        order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
+            pixels.
+        scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
+        max_side: Longest side, pixels, at which views are worked on whose Gaussians belong to no pixels.
+
+    Raises:
+        ValueError: If a value is none of the possible ones.
+    """
+
+    exporter: str = "auto"
+    quats: QuatChoice = "auto"
+    order: Order = "auto"
+    scene_scale: float | None = None
+    max_side: int = 1200
+
+    def __post_init__(self) -> None:
+        for name, known in (("quats", QUATS), ("order", ORDERS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected {_listed(known)}, got {getattr(self, name)!r}")
+        if self.scene_scale is not None and not 0 < self.scene_scale < float("inf"):
+            raise ValueError(f"scene_scale: expected a positive number, got {self.scene_scale}")
+        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or self.max_side < 16:
+            raise ValueError(f"max_side: expected a whole number of at least 16 pixels, got {self.max_side!r}")
+
+
+AUTO = ReadHints()
+
+
+def make_hints(values: Mapping[str, Any]) -> ReadHints:
+    """A reading from keyword arguments.
+
+    Raises:
+        ValueError: If one is unknown or none of its possible values.
+    """
+    known = {field.name for field in fields(ReadHints)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise ValueError(f"expected {_listed(sorted(known))}, got {unknown[0]!r}")
+    return ReadHints(**cast("dict[str, Any]", dict(values)))
+
+
+def _listed(names: Any) -> str:
+    *most, last = (repr(name) for name in names)
+    return f"{', '.join(most)} or {last}"

@@ -1,0 +1,1 @@
+"""Kernels on Gaussians and their parameters."""

@@ -1,0 +1,134 @@
+"""Bayesian adaptive superpixel segmentation (Uziel et al. 2019) with a fixed number of superpixels.
+
+Hard expectation maximisation of Gaussians in colour (fixed deviation) and position (normal-inverse-Wishart prior),
+with a Potts term on the borders. A pixel may change its label only where no label is taken apart. The splits and
+merges of the paper are left out, as they would change the number of superpixels; the pixels at the picture's edge
+take part, and no region can run empty.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.kernels.jit import kernel
+from gsmerge.kernels.superpixels.sweeps import ring_mask
+
+COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
+POTTS = 0.5
+PRIOR_WEIGHT = 50  # pseudo-observations of the shape prior per pixel of a superpixel's expected area
+NUM_PASSES = 4  # label passes per update of the parameters
+XX, XY, YY, LOG_DET, ROW = 5, 6, 7, 8, 9  # columns after the mean (three colours, x, y)
+
+
+def simple_point_table():
+    """``[256]`` uint8: 1 where walking round the ring meets one arc with the label and one without, each with an edge.
+
+    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
+    """
+    cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
+    changes = (cells != np.roll(cells, 1, axis=1)).sum(1)
+    edges = cells[:, 0::2].sum(1)
+    return ((changes == 2) & (edges > 0) & (edges < 4)).astype(np.uint8)
+
+
+@kernel
+def fit_regions(labels, colours, count):
+    """``[count,9]`` float32 parameters of every region: means, inverse covariance and its determinant's logarithm.
+
+    The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and A = h·w / count.
+    """
+    height, width, _ = colours.shape
+    sums = np.zeros((count, 9))
+    for y in range(height):
+        for x in range(width):
+            label = labels[y + 1, x + 1]
+            for i in range(3):
+                sums[label, i] += colours[y, x, i]
+            sums[label, 3] += x
+            sums[label, 4] += y
+            sums[label, XX] += x * x
+            sums[label, XY] += x * y
+            sums[label, YY] += y * y
+            sums[label, 8] += 1.0
+    rows = np.empty((count, ROW), np.float32)
+    area = height * width / count
+    for label in range(count):
+        n = sums[label, 8]
+        for i in range(5):
+            rows[label, i] = sums[label, i] / n
+        mean_x, mean_y = sums[label, 3] / n, sums[label, 4] / n
+        weight = 1 / max(n + PRIOR_WEIGHT * area - 3, 1.0)
+        xx = (area * area + sums[label, XX] - n * mean_x * mean_x) * weight
+        xy = (sums[label, XY] - n * mean_x * mean_y) * weight
+        yy = (area * area + sums[label, YY] - n * mean_y * mean_y) * weight
+        det = xx * yy - xy * xy
+        rows[label, XX], rows[label, XY], rows[label, YY] = yy / det, -2 * xy / det, xx / det
+        rows[label, LOG_DET] = np.log(det)
+    return rows
+
+
+@kernel(part=True)
+def log_posterior(rows, label, c0, c1, c2, x, y, num_foreign, precision):
+    """Twice the logarithm of the posterior of a label for a pixel, up to a constant."""
+    d0, d1, d2 = c0 - rows[label, 0], c1 - rows[label, 1], c2 - rows[label, 2]
+    dx, dy = x - rows[label, 3], y - rows[label, 4]
+    shape = rows[label, XX] * dx * dx + rows[label, XY] * dx * dy + rows[label, YY] * dy * dy
+    colour = precision * (d0 * d0 + d1 * d1 + d2 * d2)
+    return -(colour + shape + rows[label, LOG_DET] + np.float32(POTTS) * num_foreign)
+
+
+@kernel
+def label_pass(labels, colours, rows, table, foreign, precision):
+    """One pass over all border pixels, in four grids of pixels that do not touch; returns how many changed.
+
+    No two pixels of a grid are neighbours, so their order does not matter.
+    """
+    height, width, _ = colours.shape
+    num_changed = 0
+    for grid in range(4):
+        for y in range(1 + grid // 2, height + 1, 2):
+            for x in range(1 + grid % 2, width + 1, 2):
+                own = labels[y, x]
+                north, east, south, west = labels[y - 1, x], labels[y, x + 1], labels[y + 1, x], labels[y, x - 1]
+                if (north == own) & (east == own) & (south == own) & (west == own):
+                    continue
+                mask = ring_mask(labels, y, x, own)
+                if table[mask] == 0:
+                    continue
+                c0, c1, c2 = colours[y - 1, x - 1, 0], colours[y - 1, x - 1, 1], colours[y - 1, x - 1, 2]
+                across, down, label = np.float32(x - 1), np.float32(y - 1), own
+                best = log_posterior(rows, own, c0, c1, c2, across, down, foreign[mask], precision)
+                for rival in (north, east, south, west):
+                    if rival < 0 or rival == own or rival == label:  # noqa: SIM109 - faster
+                        continue
+                    mask = ring_mask(labels, y, x, rival)
+                    if table[mask] == 0:
+                        label = own
+                        break
+                    score = log_posterior(rows, rival, c0, c1, c2, across, down, foreign[mask], precision)
+                    if score > best:
+                        best, label = score, rival
+                if label != own:
+                    labels[y, x] = label
+                    num_changed += 1
+    return num_changed
+
+
+def infer_labels(labels, colours, count):
+    """Improve padded labels in place, as many rounds as a superpixel's side has pixels; returns them.
+
+    Args:
+        labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; they stay so.
+        colours: ``[h,w,3]`` float32, CIELAB / 100.
+        count: Number of regions.
+    """
+    height, width, _ = colours.shape
+    table = simple_point_table()
+    foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
+    precision = np.float32(1 / COLOUR_DEVIATION**2)
+    for _ in range(max(1, round((height * width / count) ** 0.5))):
+        rows = fit_regions(labels, colours, count)
+        for _ in range(NUM_PASSES):
+            if label_pass(labels, colours, rows, table, foreign, precision) == 0:
+                break
+    return labels

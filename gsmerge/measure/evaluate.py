@@ -1,0 +1,292 @@
+"""What compact scenes are worth: their renders against photos, view by view, beside the input's own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmerge.errors import UsageError
+from gsmerge.measure.lpips import lpips, min_size
+from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.render import render
+from gsmerge.render.metrics import psnr, ssim
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.prepare import NEAR, scene_frame
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.views import pick_views
+
+NETS = ("vgg", "alex")
+LITTLE = 0.1  # share of the held-out pixels that input views have seen; less is odd
+INPUT = "input"  # what the scene itself is called among the results
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """What is measured.
+
+    Args:
+        lpips: Networks of the perceptual distance, of "vgg" and "alex"; none: it is left out, which is much faster.
+        lpips_views: At most so many views of each split get it, evenly spread; None: all.
+        context: Also measure the input views.
+        own: Also measure the input itself.
+        threads: Threads to use; None: all processors. The figures do not depend on it.
+
+    Raises:
+        ValueError: If a network is unknown or the number of views not positive.
+    """
+
+    lpips: tuple[str, ...] = NETS
+    lpips_views: int | None = None
+    context: bool = True
+    own: bool = True
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        unknown = next((net for net in self.lpips if net not in NETS), None)
+        if unknown is not None:
+            raise ValueError(f"lpips: expected {' or '.join(NETS)}, got {unknown!r}")
+        if self.lpips_views is not None and self.lpips_views < 1:
+            raise ValueError(f"lpips_views: expected at least 1, got {self.lpips_views}")
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views with what they should look like.
+
+    Args:
+        cameras: v cameras, in the scene's world.
+        images: ``[v,h,w,3]`` sRGB in [0, 1].
+        names: Of the views.
+    """
+
+    cameras: Cameras
+    images: Tensor
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How near a picture is to another one; None where it was not measured.
+
+    Args:
+        psnr: dB; inf for equal pictures.
+        ssim: At most 1.
+        lpips_vgg: At least 0, lower is nearer.
+        lpips_alex: The same with AlexNet.
+    """
+
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips_vgg: float | None = None
+    lpips_alex: float | None = None
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One result in one view.
+
+    Args:
+        split: "context": an input view; "target": one that was held out.
+        view: Its name.
+        visible: Share of the pixels that the input views have seen.
+        full: Over all pixels.
+        masked: Over those that the input views have seen (supplement A).
+    """
+
+    split: str
+    view: str
+    visible: float
+    full: Quality
+    masked: Quality
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """One result.
+
+    Args:
+        name: As given.
+        num_gaussians: Their number.
+        ratio: Of the input's.
+        render_seconds: Mean wall time of one view, all threads.
+        scores: One for each view.
+    """
+
+    name: str
+    num_gaussians: int
+    ratio: float
+    render_seconds: float
+    scores: tuple[ViewScore, ...]
+
+    def mean(self, split: str) -> tuple[Quality, Quality]:
+        """Means over the views of a split: over all pixels, and over the visible ones."""
+        mine = [score for score in self.scores if score.split == split]
+        return _mean([score.full for score in mine]), _mean([score.masked for score in mine])
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All results on the same views.
+
+    Args:
+        results: The scene itself first, as "input", if it was measured.
+        reference: "photos"; "renders of the input" where there are none, "photos, and renders of the input in its own
+            views" where there are none of those alone.
+        num_views: Views by split.
+        notes: Things worth telling, one sentence each.
+    """
+
+    results: tuple[Evaluated, ...]
+    reference: str
+    num_views: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def evaluate(
+    scene: PixelScene | UnalignedScene,
+    results: Mapping[str, Gaussians],
+    targets: Views | None = None,
+    options: EvaluateOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Measure compact results, and the scene itself, on its input views and on held-out ones.
+
+    Args:
+        scene: The input. Without photos its own renders are what results are compared with.
+        results: Gaussians by name, in the scene's world.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_targets`; None: input views alone.
+        options: What is measured.
+        progress: Called with ("evaluate", done, total) after each result.
+
+    Raises:
+        UsageError: If the scene has no views, or a result is called "input".
+        GsmergeError: If LPIPS is asked for and its weights are not installed.
+    """
+    options = options or EvaluateOptions()
+    if INPUT in results:
+        raise UsageError(f"results: expected names other than {INPUT!r}")
+    if len(scene) == 0:
+        raise UsageError("expected a scene with views, got none")
+    own = scene.file_gaussians
+    with use_threads(options.threads):
+        near = near_plane(scene)
+        points = context_points(scene, near)
+        splits = _splits(scene, own, targets, options, near)
+        judged = [
+            (name, views, visible_pixels(points, views.cameras, near, scene.cameras)) for name, views in splits.items()
+        ]
+        out = []
+        every = {INPUT: own, **results} if options.own else dict(results)
+        _image(own[:1], scene.cameras, 0, near)  # loads the kernels, which is no one's time
+        for i, (name, gaussians) in enumerate(every.items()):
+            out.append(_evaluated(name, gaussians, len(own), judged, options, near))
+            if progress:
+                progress("evaluate", i + 1, len(every))
+    counts = {name: len(views.names) for name, views in splits.items()}
+    return Evaluation(tuple(out), _reference(scene, counts), counts, _notes(judged))
+
+
+def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) -> str:
+    """What results are compared with, in words."""
+    if scene.images is not None or "context" not in splits:
+        return "photos"
+    return "photos, and renders of the input in its own views" if "target" in splits else "renders of the input"
+
+
+def near_plane(scene: PixelScene | UnalignedScene) -> float:
+    """Nearest depth that is drawn where a scene and its results are compared, world units.
+
+    Raises:
+        ValueError: If there is no valid Gaussian or no view.
+    """
+    return NEAR * scene_frame(scene).unit
+
+
+def _notes(judged: Sequence[tuple[str, Views, NDArray[np.bool_]]]) -> tuple[str, ...]:
+    shares = {split: float(visible.mean()) for split, _, visible in judged}
+    if "target" not in shares:
+        return ("no held-out views were given: input views flatter what was fitted to them",)
+    if shares["target"] < LITTLE:
+        share = f"{100 * shares['target']:.0f} %"
+        return (f"the input views have seen {share} of the held-out views: are those of the same world?",)
+    return ()
+
+
+def _splits(
+    scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, near: float
+) -> dict[str, Views]:
+    """The views by split, with what they should look like."""
+    splits = {}
+    if options.context or targets is None:
+        images = scene.images
+        if images is None:
+            images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
+        splits["context"] = Views(scene.cameras, images, scene.names)
+    if targets is not None:
+        splits["target"] = targets
+    return splits
+
+
+def _evaluated(
+    name: str,
+    gaussians: Gaussians,
+    num_input: int,
+    judged: Sequence[tuple[str, Views, NDArray[np.bool_]]],
+    options: EvaluateOptions,
+    near: float,
+) -> Evaluated:
+    scores: list[ViewScore] = []
+    seconds, count = 0.0, 0
+    for split, views, visible in judged:
+        perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
+        for i, view in enumerate(views.names):
+            start = time.perf_counter()
+            image = _image(gaussians, views.cameras, i, near)
+            seconds, count = seconds + time.perf_counter() - start, count + 1
+            nets = options.lpips if i in perceptual else ()
+            scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[i], nets))
+    return Evaluated(name, len(gaussians), len(gaussians) / max(num_input, 1), seconds / max(count, 1), tuple(scores))
+
+
+def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
+    """``[h,w,3]``: one view, as every view is drawn here, so that equal Gaussians give equal pictures."""
+    return render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
+
+
+def _score(
+    split: str, view: str, image: np.ndarray, photo: np.ndarray, visible: NDArray[np.bool_], nets: Sequence[str]
+) -> ViewScore:
+    share = float(visible.mean())
+    full = _quality(image, photo, None, nets)
+    masked = full if visible.all() else _quality(image, photo, visible, nets) if visible.any() else Quality()
+    return ViewScore(split, view, share, full, masked)
+
+
+def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
+    found = Quality(psnr=psnr(image, photo, mask), ssim=_ssim(image, photo, mask))
+    large = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
+    return replace(found, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in large})
+
+
+def _ssim(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None) -> float | None:
+    """None where no window of it is inside of the picture."""
+    try:
+        return ssim(image, photo, mask)
+    except ValueError:
+        return None
+
+
+def _mean(found: Sequence[Quality]) -> Quality:
+    means = {}
+    for field in fields(Quality):
+        values = [v for q in found if (v := getattr(q, field.name)) is not None]
+        means[field.name] = float(np.mean(values)) if values else None
+    return Quality(**means)

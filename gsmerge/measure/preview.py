@@ -1,0 +1,124 @@
+"""Pictures for people: several scenes from the same cameras side by side, and superpixels drawn over photos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsmerge.render import render
+from gsmerge.render.metrics import psnr
+from gsmerge.types import Cameras, Gaussians
+from gsmerge.views import pick_views
+
+Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
+BAND = 22  # height of the band that carries a tile's label, pixels
+GAP = 4
+
+
+def to_picture(image: Tensor) -> Picture:
+    """``[h,w,3]`` float in [0, 1] -> 8 bit, RGB."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def label(picture: Picture, text: str) -> Picture:
+    """The picture under a dark band with a line of text, shortened until it fits."""
+    text = text.encode("utf-8", "replace").decode()  # OpenCV does not survive halves of characters
+    face, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.42
+    while len(text) > 1 and cv2.getTextSize(text, face, scale, 1)[0][0] > picture.shape[1] - 8:
+        text = text[:-1]
+    band = np.full((BAND, picture.shape[1], 3), 32, np.uint8)
+    cv2.putText(band, text, (4, BAND - 7), face, scale, (235, 235, 235), 1, cv2.LINE_AA)
+    return np.concatenate([band, picture])
+
+
+def contact_sheet(
+    scenes: Sequence[tuple[str, Gaussians]],
+    cameras: Cameras,
+    photos: Tensor | None = None,
+    *,
+    most_views: int = 4,
+    min_width: int = 320,
+    near: float = 0.01,
+) -> Picture:
+    """One row per view: the photo where there is one, then each scene from the same camera.
+
+    Args:
+        scenes: Name and Gaussians of each scene.
+        cameras: The cameras.
+        photos: ``[c,h,w,3]`` of the same cameras, or None.
+        most_views: Rows at most, evenly spread over the cameras.
+        min_width: Small renders are enlarged by a whole factor until a tile has this many columns.
+        near: Nearest depth that is drawn, world units.
+
+    Returns:
+        ``[h,w,3]`` 8 bit RGB. Every render is labelled with its number of Gaussians, and with its PSNR against
+        the photo, or without photos against the first scene.
+    """
+    ids = pick_views(len(cameras), most_views)
+    factor = max(1, -(-min_width // cameras.width))
+    renders = [render(gaussians, cameras[ids], near=near).images.clamp(0, 1) for _, gaussians in scenes]
+    rows = []
+    for row, view in enumerate(ids):
+        tiles = [] if photos is None else [_tile(photos[view], f"photo, view {view}", factor)]
+        for i, (name, gaussians) in enumerate(scenes):
+            against = photos[view] if photos is not None else renders[0][row] if i else None
+            quality = "" if against is None else f", {psnr(renders[i][row], against):.1f} dB"
+            tiles.append(_tile(renders[i][row], f"{name}: {len(gaussians):,}{quality}", factor))
+        rows.append(_join(tiles, axis=1))
+    return _join(rows, axis=0)
+
+
+def _tile(image: Tensor, text: str, factor: int) -> Picture:
+    picture = to_picture(image)
+    return label(np.repeat(np.repeat(picture, factor, 0), factor, 1), text)
+
+
+def _join(pictures: Sequence[Picture], axis: int) -> Picture:
+    """Pictures in a row or a column, with a gap between."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, 255, np.uint8)
+    out = [part for picture in pictures for part in (gap, picture)][1:]
+    return np.concatenate(out, axis)
+
+
+def draw_borders(image: Tensor, labels: Tensor) -> Picture:
+    """The photo with the borders between superpixels in yellow.
+
+    Args:
+        image: ``[h,w,3]`` sRGB in [0, 1].
+        labels: ``[h,w]`` integers.
+    """
+    picture, ids = to_picture(image).copy(), labels.numpy()
+    border = np.zeros(ids.shape, bool)
+    border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    border[1:] |= ids[1:] != ids[:-1]
+    picture[border] = (255, 230, 40)
+    return picture
+
+
+def draw_means(image: Tensor, labels: Tensor) -> Picture:
+    """Every superpixel filled with its mean colour.
+
+    Args:
+        image: ``[h,w,3]`` sRGB in [0, 1].
+        labels: ``[h,w]`` integers from 0.
+    """
+    flat = labels.reshape(-1).long()
+    count = int(flat.max()) + 1
+    sums = torch.zeros(count, 3, dtype=torch.float64).index_add_(0, flat, image.reshape(-1, 3).double())
+    sizes = torch.bincount(flat, minlength=count).clamp(min=1)
+    return to_picture((sums / sizes[:, None])[flat].reshape(image.shape))
+
+
+def draw_heat(values: Tensor) -> Picture:
+    """``[h,w]`` non-negative values as a heat map, the 99th percentile at the top."""
+    top = float(torch.quantile(values.double().flatten(), 0.99)) or 1.0
+    level = (values.double() / top).clamp(0, 1)
+    colored = cv2.applyColorMap((level.numpy() * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
+    return np.ascontiguousarray(colored[..., ::-1], np.uint8)

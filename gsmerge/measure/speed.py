@@ -1,0 +1,113 @@
+"""How long scenes take to draw, and how many Gaussians a pixel of theirs costs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsmerge.render import plan_view, prepare, render
+from gsmerge.render.cuda import cuda_problem
+from gsmerge.render.weights import view_weights
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import Cameras, Gaussians
+from gsmerge.views import pick_views
+
+VIEWS, REPEATS = 3, 3  # that are drawn: evenly spread, each so many times
+_MOST_REPEATED = 2.0  # seconds; what takes longer is drawn once
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Time to draw one view of a scene.
+
+    Args:
+        device: "cpu" or "cuda".
+        width: Of the picture, pixels.
+        height: The same.
+        threads: Processor threads that drew it; 0 on a GPU.
+        seconds: Mean over some views of the quickest of some tries.
+    """
+
+    device: str
+    width: int
+    height: int
+    threads: int
+    seconds: float
+
+
+def resized(cameras: Cameras, long_side: int) -> Cameras:
+    """The same cameras with pictures whose longer side has so many pixels."""
+    factor = long_side / max(cameras.width, cameras.height)
+    size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
+    scale = torch.tensor([size[0] / cameras.width, size[1] / cameras.height, 1.0], dtype=cameras.Ks.dtype)
+    return replace(cameras, Ks=cameras.Ks * scale[:, None], width=size[0], height=size[1])
+
+
+def measure_speeds(
+    scenes: Mapping[str, Gaussians],
+    cameras: Cameras,
+    long_sides: Sequence[int],
+    near: float,
+    *,
+    threads: int | None = None,
+) -> dict[str, tuple[Speed, ...]]:
+    """Draw scenes from the same views at several sizes.
+
+    The scenes take turns, so that a machine that slows down slows all of them. Where CUDA can be used, it is measured
+    too.
+
+    Args:
+        scenes: Gaussians by name.
+        cameras: Views; some of them are drawn.
+        long_sides: Pixels along the longer side.
+        near: Nearest depth that is drawn, world units.
+        threads: To draw with on the processor; None: all.
+    """
+    few = cameras[pick_views(len(cameras), VIEWS)]
+    found: dict[str, list[Speed]] = {name: [] for name in scenes}
+    with use_threads(threads) as used:
+        for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
+            placed = {name: gaussians.to(device) for name, gaussians in scenes.items()}
+            for side in long_sides:
+                views = resized(few, side)
+                for name, seconds in _turns(placed, views.to(device), near).items():
+                    count = used if device == "cpu" else 0
+                    found[name].append(Speed(device, views.width, views.height, count, seconds))
+    return {name: tuple(speeds) for name, speeds in found.items()}
+
+
+def _turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
+    """Seconds per view of each scene, one after the other and again."""
+    quickest = {name: np.full(len(views), np.inf) for name in scenes}
+    for gaussians in scenes.values():  # compiles, and fills caches
+        _draw(gaussians, views[[0]], near)
+    for turn in range(REPEATS):
+        for name, gaussians in scenes.items():
+            if turn and quickest[name].max() > _MOST_REPEATED:
+                continue
+            for view in range(len(views)):
+                quickest[name][view] = min(quickest[name][view], _draw(gaussians, views[[view]], near))
+    return {name: float(seconds.mean()) for name, seconds in quickest.items()}
+
+
+def _draw(gaussians: Gaussians, view: Cameras, near: float) -> float:
+    start = time.perf_counter()
+    image = render(gaussians, view, near=near).images
+    if image.is_cuda:
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
+    """Gaussians that are blended into a pixel, on average over some of the views: what drawing is made of."""
+    splats, entries, pixels = prepare(gaussians), 0, 0
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    for view in pick_views(len(cameras), VIEWS):
+        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
+        entries += len(view_weights(plan).lanes)
+        pixels += cameras.width * cameras.height
+    return entries / max(pixels, 1)

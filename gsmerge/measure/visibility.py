@@ -1,0 +1,85 @@
+"""Which pixels of a view show what the input views have seen: the rest is extrapolation (supplement A)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.render import render
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+
+Points = NDArray[np.float64]  # [n,3]
+_OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
+_ROWS = 1 << 18  # points at a time: all of them, in every thread, would not fit
+_DILATION = 3  # pixels of the input views per side of the square that every sample marks
+
+
+def context_points(scene: PixelScene | UnalignedScene, near: float) -> Points:
+    """A point in the world for every pixel of the input views: their depth samples.
+
+    Args:
+        scene: Of a scene with pixels the Gaussians are the samples; otherwise its depth is rendered.
+        near: Nearest depth that is rendered, world units.
+
+    Returns:
+        ``[n,3]``.
+    """
+    if isinstance(scene, PixelScene):
+        return np.asarray(scene.gaussians.means[scene.valid.reshape(-1)].double().numpy())
+    return np.concatenate([_rendered_points(scene.gaussians, scene.cameras[[i]], near) for i in range(len(scene))])
+
+
+def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
+    drawn = render(gaussians, camera, near=near, with_depths=True)
+    assert drawn.depths is not None
+    depth, solid = drawn.depths[0].double().numpy(), drawn.alphas[0].numpy() > _OPAQUE
+    y, x = np.nonzero(solid.reshape(depth.shape[:2]))
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.Ks[0].double().numpy()).T
+    pose = np.linalg.inv(camera.viewmats[0].double().numpy())
+    return np.asarray((rays * depth.reshape(solid.shape[0], -1)[y, x, None]) @ pose[:3, :3].T + pose[:3, 3])
+
+
+def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
+    """Pixels on which, or beside which, at least one of the points falls, whatever lies before it.
+
+    Args:
+        points: ``[n,3]`` depth samples of the input views, see :func:`context_points`.
+        cameras: The views to be judged.
+        near: Samples nearer than this do not count, world units.
+        sources: The input views: where those that are judged have pixels that are so much smaller, a sample marks so
+            many more, since samples would leave gaps otherwise; None: pixels of the same size.
+
+    Returns:
+        ``[c,h,w]`` bool.
+    """
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    size = np.array([cameras.width, cameras.height])
+
+    def one_view(view: int) -> NDArray[np.bool_]:
+        hit = np.zeros((cameras.height, cameras.width), np.uint8)
+        for first in range(0, len(points), _ROWS):
+            some = points[first : first + _ROWS]
+            image = (some @ viewmats[view, :3, :3].T + viewmats[view, :3, 3]) @ Ks[view].T
+            image = image[image[:, 2] > near]
+            pixels = np.floor(image[:, :2] / image[:, 2:])
+            pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
+            hit[pixels[:, 1], pixels[:, 0]] = 1
+        side = _side(Ks[view], sources)
+        return cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
+
+    return np.stack(parallel_map(one_view, range(len(cameras))))
+
+
+def _side(K: np.ndarray, sources: Cameras | None) -> int:
+    """Pixels per side, an odd number, of the square that a sample marks in a view with the intrinsics ``K [3,3]``."""
+    if sources is None:
+        return _DILATION
+    own = np.median(_focal(sources.Ks.double().numpy()))
+    return max(_DILATION, 2 * round((_DILATION * float(_focal(K) / own) - 1) / 2) + 1)
+
+
+def _focal(Ks: np.ndarray) -> np.ndarray:
+    """``[...]`` mean focal lengths of ``[...,3,3]`` intrinsics, pixels."""
+    return np.asarray(np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]))

@@ -1,0 +1,238 @@
+"""The grid of experiments: the product of lists, without what makes no sense."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io.tables import read_table
+from gsmerge.research.charts.record import INPUT
+
+OURS = "gsmerge"
+ALL = "all"  # word for all views
+SIZES = ("budget", "density")
+WHOLE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians, so have one size
+OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # would be overruled, or misnamed
+FITTED = ("unmerged-fit",)  # methods other than ours that effort changes
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One run.
+
+    Args:
+        scene: A ``.ply`` or the folder that it is in.
+        method: ``gsmerge``, the name of another method, or ``input``: nothing is merged, only measured.
+        settings: What differs from the defaults, by flat name.
+        views: Number of views, evenly spread; None: all.
+    """
+
+    scene: Path
+    method: str = OURS
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    views: int | None = None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Lists whose product is run.
+
+    Args:
+        methods: ``gsmerge`` and rivals.
+        k: Gaussians per superpixel: 1 to 8 or "auto".
+        budgets: Gaussians in the result, such as 40000 or "2%".
+        densities: Superpixels per pixel; beside the budgets, not times them.
+        segmentations: Superpixel methods.
+        fit: ``full``, ``color``, ``none``.
+        efforts: ``draft``, ``fast``, ``default``, ``best``.
+        matches: Merging across views: ``overlap``, ``aabb``, ``none``.
+        views: Numbers of views; "all" for all.
+        fixed: Any other settings of ours, each "name=value", the same in all runs.
+
+    Raises:
+        ValueError: If a list is empty that must not be, or a value is none that can be.
+    """
+
+    methods: tuple[str, ...] = (OURS,)
+    k: tuple[int | str, ...] = (1,)
+    budgets: tuple[int | str, ...] = ()
+    densities: tuple[float, ...] = ()
+    segmentations: tuple[str, ...] = ("rdseg",)
+    fit: tuple[str, ...] = ("full",)
+    efforts: tuple[str, ...] = ("default",)
+    matches: tuple[str, ...] = ("overlap",)
+    views: tuple[int | str, ...] = (ALL,)
+    fixed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not value and f.name not in ("budgets", "densities", "fixed"):
+                raise ValueError(f"{f.name}: expected at least one value, got none")
+            if len(set(value)) < len(value):
+                raise ValueError(f"{f.name}: expected every value once, got {', '.join(map(str, value))}")
+        for value in self.densities:
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"densities: expected numbers, got {value!r}")
+        for value in self.views:
+            if value != ALL and not (isinstance(value, int) and value >= 1):
+                raise ValueError(f'views: expected numbers from 1 or "all", got {value!r}')
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The fixed settings by name.
+
+        Raises:
+            UsageError: If one is no "name=value", or no setting that can be fixed.
+        """
+        found: dict[str, Any] = {}
+        for text in self.fixed:
+            name, sign, value = str(text).partition("=")
+            if not (name and sign):
+                raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
+            if name in OWN_OPTIONS:
+                raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
+            try:
+                found[name] = json.loads(value)
+            except ValueError:
+                found[name] = value
+            plain = found[name] is None or isinstance(found[name], str | int | float)
+            if not plain or found[name] != found[name]:
+                raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")
+        return found
+
+
+_PARSERS: dict[str, Any] = {
+    "k": lambda text: int(text) if text.isdigit() else text,
+    "budgets": lambda text: int(text) if text.isdigit() else text,
+    "densities": float,
+    "views": lambda text: int(text) if text.isdigit() else text,
+}
+
+
+def parse_grid(told: Mapping[str, str | None], base: Grid | None = None) -> Grid:
+    """A grid from comma-separated lists as the command line has them; None leaves the base's.
+
+    Raises:
+        UsageError: If a value is none that can be.
+    """
+    lists: dict[str, tuple[Any, ...]] = {}
+    for name, text in told.items():
+        if text is None:
+            continue
+        parts = [part.strip() for part in text.split(",") if part.strip()]
+        try:
+            lists[name] = tuple(_PARSERS.get(name, str)(part) for part in parts)
+        except ValueError as error:
+            raise UsageError(f"{name}: expected numbers, got {text!r}") from error
+    try:
+        return replace(base or Grid(), **lists)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def read_grid(path: Path) -> Grid:
+    """A grid from a small TOML or JSON file whose keys are the fields of :class:`Grid`.
+
+    Raises:
+        SceneError: If the file cannot be read, or holds anything else.
+    """
+    values, known = read_table(path), {f.name for f in fields(Grid)}
+    if values.keys() - known:
+        odd = ", ".join(sorted(values.keys() - known))
+        raise SceneError(path, f"expected lists named {', '.join(sorted(known))}, found {odd}")
+    try:
+        return Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
+    except (TypeError, ValueError) as error:
+        raise SceneError(path, str(error)) from error
+
+
+def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+    """Method and settings of every run on one scene, for one number of views, and what was left out.
+
+    Only what differs from the defaults is set. Left out are a method of superpixels times efforts that it does not
+    have, and for other methods than ours everything that only ours has: they run once per size.
+
+    Returns:
+        The combinations, the unmerged input first; one note per kind of combination that was left out.
+    """
+    defaults = {"k": 1, "segmentation": "rdseg", "fit": "full", "effort": "default", "match": "overlap"}
+    sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"density": d} for d in grid.densities]
+    out: list[tuple[str, dict[str, Any]]] = [(INPUT, {})]
+    dropped: dict[str, int] = {}
+    for method in grid.methods:
+        for *values, size in product(grid.k, grid.segmentations, grid.fit, grid.efforts, grid.matches, sizes or [{}]):
+            chosen = dict(zip(defaults, values, strict=True))
+            why = _senseless(method, chosen, size, grid, sizes)
+            if why is not None:
+                dropped[why] = dropped.get(why, 0) + 1
+                continue
+            known = chosen if method == OURS else {"effort": chosen["effort"]} if method in FITTED else {}
+            told = {name: value for name, value in known.items() if value != defaults[name]}
+            told |= grid.settings if method == OURS else {}
+            out.append((method, told if method in WHOLE else size | told))
+    return out, [f"{why}: {count} combination(s) left out" for why, count in dropped.items()]
+
+
+def _senseless(
+    method: str, chosen: Mapping[str, Any], size: Mapping[str, Any], grid: Grid, sizes: Sequence[Mapping[str, Any]]
+) -> str | None:
+    """Why a combination is left out; None if it is not."""
+    if method != OURS:
+        first = {"k": grid.k[0], "segmentation": grid.segmentations[0], "fit": grid.fit[0], "effort": grid.efforts[0]}
+        first |= {"match": grid.matches[0]}
+        own = {"effort"} if method in FITTED else set()
+        if any(chosen[name] != value for name, value in first.items() if name not in own):
+            return f"{method} takes " + ("effort alone" if own else "a size alone")
+        return f"{method} keeps all Gaussians" if method in WHOLE and sizes and size != sizes[0] else None
+    other = chosen["effort"] != grid.efforts[0] and "draft" not in (chosen["effort"], grid.efforts[0])
+    if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and other:
+        return "effort changes nothing for other superpixels than rdseg without a full fit"
+    if chosen["k"] == "auto" and sizes and size != sizes[0]:
+        return "k = auto finds the number itself, so it has one size"
+    return None
+
+
+def make_experiments(scenes: Sequence[Path], grid: Grid) -> tuple[list[Experiment], list[str]]:
+    """All runs, scene by scene, and notes on what was left out.
+
+    Raises:
+        UsageError: If a setting is none that the library takes.
+    """
+    combinations, notes = grid_settings(grid)
+    for method, settings in combinations:
+        _check(method, settings)
+    views = [None if count == ALL else int(count) for count in grid.views]
+    made = [
+        Experiment(scene, method, settings, count)
+        for scene in scenes
+        for count in views
+        for method, settings in combinations
+    ]
+    return made, notes
+
+
+def _check(method: str, settings: Mapping[str, Any]) -> None:
+    from gsmerge.baselines.registry import check_program, find_baseline
+    from gsmerge.options import CompactOptions
+
+    try:
+        CompactOptions().with_settings(run_settings(method, settings))
+        rival = None if method == INPUT else find_baseline(method)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    except TypeError as error:  # words in the place of numbers
+        told = ", ".join(f"{name}={value}" for name, value in settings.items())
+        raise UsageError(f"{method}: expected settings that compact takes, got {told}") from error
+    if rival is not None:
+        check_program(rival)
+
+
+def run_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings as ``compact`` takes them: with the method, where it is not ours."""
+    return dict(settings) if method in (OURS, INPUT) else {**settings, "method": method}

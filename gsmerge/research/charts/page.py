@@ -1,0 +1,255 @@
+"""One HTML file with everything in it: tables, figures, pictures to compare, commands, environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from gsmerge.report import human_bytes
+from gsmerge.research.charts.experiment import OURS
+from gsmerge.research.charts.figures import Curves, Figure, VerdictTable
+from gsmerge.research.charts.markup import Cell, Row, details, inline_svg, table, text
+from gsmerge.research.charts.pictures import compare_section, error_section
+from gsmerge.research.charts.record import INPUT, RunRecord
+from gsmerge.research.charts.series import (
+    PART_WORDS,
+    best_part,
+    by_size,
+    line_key,
+    line_names,
+    metrics_of,
+    score_of,
+    size_label,
+    usable,
+    usual_views,
+)
+from gsmerge.research.charts.statistics import Interval
+
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+HEADS = {"psnr": "PSNR", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS Alex"}
+DIGITS = {"psnr": 2, "ssim": 3, "lpips_vgg": 3, "lpips_alex": 3}
+
+
+def make_page(
+    records: Sequence[RunRecord],
+    figures: Sequence[Figure],
+    drawings: Mapping[str, str],
+    verdicts: Sequence[VerdictTable],
+    folder: Path,
+    *,
+    command: str,
+) -> str:
+    """The whole page; it asks the network for nothing, and says so to the browser.
+
+    Args:
+        records: All runs, failed ones too.
+        figures: What was drawn.
+        drawings: The SVG of each figure by name.
+        verdicts: Rivals against ours.
+        folder: The results folder, which has the pictures.
+        command: The command line that draws the page again.
+    """
+    good = usable(records)
+    scenes = list(dict.fromkeys(record.scene for record in records))
+    failed = [record for record in records if record.error is not None]
+    sections = [
+        ("results", "Results", _results(good)),
+        ("verdicts", "At equal cost", _verdicts(verdicts)),
+        *((figure.name, figure.title, _figure(figure, drawings[figure.name], good, command)) for figure in figures),
+        ("compare", "Side by side", compare_section(good, folder)),
+        ("errors", "Error maps", error_section(good, folder)),
+        ("failures", "Failed runs", _failures(failed)),
+        ("runs", "All runs", _runs(good)),
+        ("environment", "Environment", _environment(records, command)),
+    ]
+    sections = [section for section in sections if section[2]]
+    links = " ".join(f'<a href="#{text(name)}">{text(title)}</a>' for name, title, _ in sections)
+    body = "".join(
+        f'<section id="{text(name)}"><h2>{text(title)}</h2>{content}</section>' for name, title, content in sections
+    )
+    shown = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
+    words = f"{len(records)} runs on {len(scenes)} scene(s): {shown}" + (f"; {len(failed)} failed" if failed else "")
+    here = files("gsmerge.research.charts")
+    style, script = (here.joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{text(POLICY)}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>gsmerge: {text(shown)}</title><style>{style}</style></head><body>"
+        f'<header><h1>gsmerge experiments</h1><p class="muted">{text(words)}</p><nav>{links}</nav></header>'
+        f"<main>{body}</main><script>{script}</script></body></html>\n"
+    )
+
+
+def _interval(value: Interval, digits: int) -> str:
+    half = value.high - value.mean
+    return f"{value.mean:.{digits}f}" + (f" ± {half:.{digits}f}" if value.count > 1 else "")
+
+
+def _results(records: Sequence[RunRecord]) -> str:
+    """Means over the scenes by method, settings and size."""
+    if not records:
+        return ""
+    part = best_part(records)
+    metrics = metrics_of(records, part)
+    views = usual_views(records)
+    scores = {
+        metric: {
+            (line.name, point.label): point.y
+            for line in by_size(records, lambda record: record.ratio, score_of(metric, part))
+            for point in line.points
+        }
+        for metric in metrics
+    }
+    merged = [r for r in records if r.method != INPUT]
+    ours_first = sorted(merged, key=lambda r: (r.method != OURS, len(line_key(r)[1])))
+    names = line_names(list(dict.fromkeys(map(line_key, ours_first))))
+    groups: dict[tuple[str, str], list[RunRecord]] = {}
+    lines = list(names)
+    order = sorted(records, key=lambda r: (-1 if r.method == INPUT else lines.index(line_key(r)), r.ratio or 0.0))
+    for record in order:
+        if record.views_asked == views:
+            name = INPUT if record.method == INPUT else names[line_key(record)]
+            groups.setdefault((name, size_label(record)), []).append(record)
+    rows = []
+    for (name, size), group in groups.items():
+        told = [
+            _interval(found[name, size], DIGITS[metric]) if (name, size) in found else _plain(group, metric, part)
+            for metric, found in scores.items()
+        ]
+        rows.append([name, size, str(len(group)), *_costs(group), *told])
+    head = ["Method", "Size", "Scenes", "Gaussians", "Kept", "File", "Seconds", "ms/view", *(HEADS[m] for m in metrics)]
+    words = (
+        f"Means over scenes, measured on {PART_WORDS[part]}; ± is half of a 95 % t interval of what the settings differ"
+        " by, the scenes' own level taken off. PSNR and SSIM: higher is better; LPIPS: lower."
+    )
+    ours = [i for i, row in enumerate(rows) if row[0].startswith(OURS)]
+    return f"<p>{text(words)}</p>{table(head, rows, texts=(0, 1), ours=ours)}"
+
+
+def _plain(group: Sequence[RunRecord], metric: str, part: str) -> str:
+    values = [value for record in group if (value := record.score(f"{metric}_{part}")) is not None]
+    return f"{sum(values) / len(values):.{DIGITS[metric]}f}" if values else ""
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _costs(group: Sequence[RunRecord]) -> list[str]:
+    """Count, share, bytes, seconds, render time."""
+    count, ratio = _mean([r.count for r in group]), _mean([r.ratio for r in group])
+    size, seconds, ms = (
+        _mean([r.bytes for r in group]),
+        _mean([r.seconds for r in group]),
+        _mean([r.render_ms for r in group]),
+    )
+    return [
+        "" if count is None else f"{count:,.0f}",
+        "" if ratio is None else f"{100 * ratio:.2f} %",
+        "" if size is None else human_bytes(size),
+        "" if not seconds else f"{seconds:.2f}",
+        "" if ms is None else f"{ms:.1f}",
+    ]
+
+
+_KINDS = {"ours above": "above", "rival above": "below"}
+
+
+def _verdicts(tables: Sequence[VerdictTable]) -> str:
+    """Whether any rival's point lies above ours, in a sentence, and the points."""
+    parts = []
+    for one in tables:
+        words = [verdict.words for _, verdict in one.rows]
+        above, undecided = words.count("rival above"), words.count("undecided")
+        outside = words.count("ours has none so cheap")
+        answer = "no rival's point lies above ours" if not above else f"{above} rival point(s) lie above ours"
+        sentence = (
+            f"{one.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours, {undecided}"
+            f" undecided, {outside} cheaper than anything of ours, so not compared)."
+        )
+        rows: list[Row] = [
+            [
+                verdict.rival,
+                label,
+                f"{verdict.cost:.4g}",
+                f"{verdict.quality:.{one.decimals}f}",
+                "" if verdict.ours is None else f"{verdict.ours:.{one.decimals}f}",
+                "" if verdict.ahead is None else _interval(verdict.ahead, one.decimals),
+                Cell(verdict.words, f"text {_KINDS.get(verdict.words, '')}"),
+            ]
+            for label, verdict in one.rows
+        ]
+        head = ["Rival", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict"]
+        parts.append(f"<p>{text(sentence)}</p>" + details("the points", table(head, rows, texts=(0, 1, 6))))
+    if not parts:
+        return ""
+    how = (
+        "Each point of a rival against our curve at the same cost: our front, linear over the logarithm of the cost,"
+        " read scene by scene; a side is named where the 95 % interval of the paired difference leaves zero out."
+    )
+    return f'<p class="muted">{text(how)}</p>{"".join(parts)}'
+
+
+def _figure(figure: Figure, drawing: str, records: Sequence[RunRecord], command: str) -> str:
+    made = list(dict.fromkeys(record.command for record in records if record.command))
+    commands = details("commands", f"<pre>{text(chr(10).join([*made, command]))}</pre>")
+    points = _points(figure) if isinstance(figure, Curves) else ""
+    svg = inline_svg(drawing, figure.name, f"{figure.title}. {figure.caption}")
+    return f"<figure>{svg}<figcaption>{text(figure.caption)}</figcaption></figure>{points}{commands}"
+
+
+def _points(figure: Curves) -> str:
+    """The numbers of a figure."""
+    rows: list[Row] = [
+        [
+            panel.y_label,
+            line.name,
+            point.label,
+            f"{point.x:.4g}",
+            f"{point.y.mean:.5g}",
+            f"{point.y.low:.5g}",
+            f"{point.y.high:.5g}",
+        ]
+        for panel in figure.panels
+        for line in panel.lines
+        for point in line.points
+    ]
+    head = ["Panel", "Line", "Point", figure.x_label if not figure.percent else "Share kept", "Mean", "Low", "High"]
+    return details("numbers", table(head, rows, texts=(0, 1, 2)))
+
+
+def _failures(failed: Sequence[RunRecord]) -> str:
+    rows: list[Row] = [[r.scene, _what(r), Cell(r.error or "", "long")] for r in failed]
+    return table(["Scene", "Run", "Error"], rows, texts=(0, 1, 2)) if rows else ""
+
+
+def _what(record: RunRecord) -> str:
+    told = [f"{name} {value}" for name, value in record.settings.items()]
+    views = [] if record.views_asked is None else [f"{record.views_asked} views"]
+    return ", ".join([record.method, *told, *views])
+
+
+def _runs(records: Sequence[RunRecord]) -> str:
+    """One row for each run."""
+    if not records:
+        return ""
+    columns = [(m, p) for p in PART_WORDS for m in HEADS if any(r.score(f"{m}_{p}") is not None for r in records)]
+    rows = []
+    for record in records:
+        scores = [record.score(f"{metric}_{part}") for metric, part in columns]
+        told = ["" if v is None else f"{v:.{DIGITS[m]}f}" for v, (m, _) in zip(scores, columns, strict=True)]
+        rows.append([record.scene, _what(record), str(record.views), *_costs([record]), *told])
+    head = ["Scene", "Run", "Views", "Gaussians", "Kept", "File", "Seconds", "ms/view"]
+    head += [f"{HEADS[metric]} {part.replace('_', ', ')}" for metric, part in columns]
+    return details(f"{len(rows)} runs", table(head, rows, texts=(0, 1)))
+
+
+def _environment(records: Sequence[RunRecord], command: str) -> str:
+    """The machines that ran it, each once, and all commands."""
+    machines = list(dict.fromkeys(tuple(record.environment.items()) for record in records))
+    tables = [table(["", ""], [[name, value] for name, value in machine], texts=(0, 1)) for machine in machines]
+    made = list(dict.fromkeys(record.command for record in records if record.command))
+    return "".join(tables) + f"<pre>{text(chr(10).join([*made, command]))}</pre>"

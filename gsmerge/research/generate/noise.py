@@ -1,0 +1,136 @@
+"""What a feed-forward network makes of a view: its depth, its confidence, and one Gaussian for each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from gsmerge.kernels.raster.harmonics import view_colors
+from gsmerge.research.generate.options import Noise
+from gsmerge.research.generate.patterns import enlarged
+from gsmerge.research.generate.photograph import Float, Lens
+from gsmerge.research.generate.shapes import Array
+from gsmerge.types import SH_C0, Gaussians
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One view, exact: the photo as taken, and what the rays through the pixels' centres met.
+
+    Args:
+        image: ``[h,w,3]`` sRGB.
+        depth: ``[h,w]`` along z.
+        normals: ``[h,w,3]`` world.
+        c2w: ``[4,4]`` camera to world, as the network believes it.
+    """
+
+    image: Float
+    depth: Array
+    normals: Float
+    c2w: Array
+
+
+def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) -> Float:
+    """``[height,width]`` of deviation about 1 and ``cells`` swings along the longer side."""
+    side = max(height, width)
+    field = enlarged(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
+    return field / max(float(field.std()), 1e-3)
+
+
+def edges(depth: Array) -> Float:
+    """``[h,w]`` 0 on smooth surfaces to 1 where depth jumps by a tenth or more between neighbours."""
+    inverse = (1 / depth).astype(np.float32)
+    square = np.ones((3, 3), np.uint8)
+    jump = np.log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
+    middle = cv2.GaussianBlur(inverse, (0, 0), 1.0)  # slanted planes are smooth in inverse depth
+    bend = np.abs(middle / inverse - 1)
+    return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
+
+
+def textured(image: Float) -> Float:
+    """``[h,w]`` 0 where a photo shows nothing to hold on to, 1 where it has detail."""
+    grey = image.mean(2)
+    mean = cv2.blur(grey, (7, 7))
+    deviation = np.sqrt(np.maximum(cv2.blur(grey * grey, (7, 7)) - mean * mean, 0))
+    return np.clip(deviation / 0.05, 0, 1)
+
+
+def predicted_depth(seen: Seen, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Depth as a network predicts it, and its confidence in [0, 1], both ``[h,w]``.
+
+    Errors are of the logarithm of depth: a bias of the view, a slow drift, patches that are simply wrong, fine grain,
+    all of them larger where the photo has no texture; inverse depth bleeds over edges; what is far away is no farther
+    than the network can say; and some pixels float in the air.
+    """
+    height, width = seen.depth.shape
+    far = noise.far * float(np.median(seen.depth))
+    depth, beyond = np.minimum(seen.depth, far), seen.depth > far
+    blank = 1 - textured(seen.image)
+    edge = edges(depth)
+    soft = cv2.GaussianBlur(1 / depth, (0, 0), noise.bleed_width)
+    near_edge = cv2.dilate(edge, np.ones((3, 3), np.uint8))
+    bled = 1 / (1 / depth + noise.bleed * near_edge * (soft - 1 / depth))
+    worse = 1 + noise.blank * blank + 3 * beyond
+    drift = noise.drift * smooth_noise(rng, height, width, int(rng.integers(3, 7)))
+    field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
+    limit = np.quantile(field, 1 - noise.patches)
+    patch = np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
+    wrong = patch * noise.patch_error * smooth_noise(rng, height, width, 8)
+    grain = noise.grain * rng.normal(0, 1, depth.shape)
+    out = bled * np.exp(noise.view_bias * rng.normal() + worse * (drift + grain) + wrong)
+    floating = rng.random(depth.shape) < noise.floaters * (1 + 10 * edge)
+    out = np.where(floating, out * rng.uniform(0.4, 0.95, depth.shape), out)
+    doubt = 0.8 * near_edge + 0.5 * blank * noise.blank / 3 + 0.7 * patch * rng.uniform(0, 1) + 0.6 * beyond
+    trust = noise.trust * np.clip(1 - doubt, 0, 1) + 0.06 * smooth_noise(rng, height, width, 9)
+    return out.astype(np.float32), np.clip(np.where(floating, 0.5 * trust, trust), 0, 1).astype(np.float32)
+
+
+def facing(normals: Array) -> Array:
+    """``[n,4]`` wxyz: the shortest rotations of +z onto normals or their opposites."""
+    z = normals * np.where(normals[:, 2:] < 0, -1, 1)
+    quats = np.stack([1 + z[:, 2], -z[:, 1], z[:, 0], np.zeros(len(z))], 1)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
+    """sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` with which Gaussians have their colours seen from their own camera."""
+    n, num = len(colors), (noise.sh_degree + 1) ** 2 - 1
+    sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
+    common = rng.normal(0, 1, (1, num, 3))  # highlights of a view lie to one side
+    shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num, 3)))).astype(np.float32)
+    if num:
+        raised = np.full_like(sh0, 10 / SH_C0)  # colours are cut off at 0
+        found = np.empty((n, 3), np.float32)
+        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye.astype(np.float32), 0, n, found)
+        sh0 -= ((found - 10.5) / SH_C0)[:, None]
+    return sh0, shN
+
+
+def pixel_gaussians(seen: Seen, lens: Lens, noise: Noise, rng: np.random.Generator) -> Gaussians:
+    """One Gaussian for each pixel of a view, in row-major order."""
+    height, width = seen.depth.shape
+    n = height * width
+    depth, confidence = (a.reshape(-1).astype(np.float64) for a in predicted_depth(seen, noise, rng))
+    v, u = np.mgrid[:height, :width].reshape(2, -1) + 0.5 + rng.uniform(-noise.offset, noise.offset, (2, n))
+    rays = np.stack([(u - width / 2) / lens.focal, (v - height / 2) / lens.focal, np.ones(n)], 1)
+    means = (rays * depth[:, None]) @ seen.c2w[:3, :3].T + seen.c2w[:3, 3]
+    normals = seen.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    quats = facing(
+        np.where(length < 1e-6, rays, normals) / np.where(length < 1e-6, np.linalg.norm(rays, axis=1)[:, None], length)
+    )
+    shape = np.array([1.0, 1.0, noise.flatness]) * np.exp(rng.normal(0, noise.scale_jitter, (n, 3)))
+    scales = noise.scale * (depth / lens.focal)[:, None] * shape
+    oversized = rng.random(n) < noise.oversized
+    scales[oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(oversized.sum()), 1))
+    opacities = noise.opacity_low + (noise.opacity_high - noise.opacity_low) * confidence
+    opacities = np.clip(opacities + rng.normal(0, noise.opacity_grain, n), 0.01, 0.995)
+    image = cv2.GaussianBlur(seen.image, (0, 0), noise.color_blur) if noise.color_blur > 0.2 else seen.image
+    colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
+    means = means.astype(np.float32)
+    sh0, shN = _harmonics(colors, means, seen.c2w[:3, 3], noise, rng)
+    columns = (means, quats, scales, opacities, sh0, shN)
+    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in columns))

@@ -1,0 +1,286 @@
+"""Photos and exact depth of a stage: rays, textures, light with shade, and what a lens and a sensor do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, cast, light_seen
+from gsmerge.research.generate.shapes import Array, Packed, bounds, packed
+from gsmerge.research.generate.stage import Stage
+from gsmerge.research.generate.textures import Picture, pyramid
+
+FAR = 1e6  # depth where there is nothing
+NEAR_PLANE = 1e-3
+SAMPLES = 2  # rays per pixel and axis for the colours; depth is that of the pixel's centre
+KEY_MAPS, KEY_SIZE = 5, 640  # maps of the direct light, for soft shade, and their side
+AMBIENT_MAPS, AMBIENT_SIZE = 24, 256
+BEHIND = 1000.0  # radii that the eye of a light's map stands away, so that its rays are parallel
+GLOW = 0.7  # of what shines by itself, against a white wall in full light
+FROM_BELOW = 0.5  # light from below, against that from above
+
+Float: TypeAlias = NDArray[Any]  # float32
+
+
+@dataclass(frozen=True)
+class Lens:
+    """An image size and its intrinsics.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        focal: Focal length, pixels.
+    """
+
+    width: int
+    height: int
+    focal: float
+
+    @property
+    def intrinsics(self) -> Array:
+        """``[3,3]``, the principal point in the middle."""
+        return np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the rays of a view meet; h x w samples.
+
+    Args:
+        depth: ``[h,w]`` along the camera's z.
+        ids: ``[h,w]`` int32 shape, -1 where there is none.
+        points: ``[h,w,3]`` in the shape's frame.
+        normals: ``[h,w,3]`` world, towards the camera.
+    """
+
+    depth: Array
+    ids: NDArray[np.int32]
+    points: Float
+    normals: Float
+
+
+@dataclass(frozen=True)
+class Lit:
+    """A stage that is ready to be photographed.
+
+    Args:
+        stage: The stage.
+        shapes: Its shapes as arrays.
+        mips: Every texture with its halves.
+        axes: ``[k,3,3]`` of the lights, direct ones first.
+        middle: ``[3]`` of the lights' maps.
+        radius: Of the lights' maps.
+        key: Maps of the direct light.
+        ambient: Maps of the light from all sides.
+        weights: ``[k]`` of the ambient maps.
+    """
+
+    stage: Stage
+    shapes: Packed
+    mips: tuple[list[Picture], ...]
+    axes: Array
+    middle: Array
+    radius: float
+    key: Float
+    ambient: Float
+    weights: Array
+
+
+def rectangles(shapes: Packed, c2w: Array, lens: Lens, samples: int) -> NDArray[np.int32]:
+    """``[m,4]`` x0, y0, x1, y1 of the samples that may see each shape."""
+    half = bounds(shapes)
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.einsum("mij,mcj->mci", shapes.turns, half[:, None] * signs) + shapes.centres[:, None]
+    local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
+    edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
+    a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
+    with np.errstate(divide="ignore", invalid="ignore"):  # where an edge passes the near plane
+        crossing = a + (b - a) * ((NEAR_PLANE - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
+    crosses = (a[..., 2] < NEAR_PLANE) != (b[..., 2] < NEAR_PLANE)
+    points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
+    seen = np.concatenate([local[..., 2] >= NEAR_PLANE, crosses], 1)[..., None]
+    at = points[..., :2] / np.where(seen, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
+    limits = np.array([lens.width, lens.height]) * samples
+    low = np.where(seen, np.floor(at * samples) - 1, np.inf).min(1)
+    high = np.where(seen, np.ceil(at * samples) + 1, -np.inf).max(1)
+    return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
+
+
+def trace(shapes: Packed, c2w: Array, lens: Lens, samples: int) -> Hits:
+    """Cast ``samples`` x ``samples`` rays for each pixel."""
+    h, w = lens.height * samples, lens.width * samples
+    hits = Hits(
+        np.full((h, w), FAR),
+        np.full((h, w), -1, np.int32),
+        np.zeros((h, w, 3), np.float32),
+        np.zeros((h, w, 3), np.float32),
+    )
+    intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
+    c2w = np.ascontiguousarray(c2w, dtype=np.float64)
+    eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
+    table = shapes.kinds, shapes.turns, shapes.centres, shapes.sizes, shapes.waves
+    rects = rectangles(shapes, c2w, lens, samples)
+    cast(eye, axes, intrinsics, 1.0 / samples, *table, rects, hits.depth, hits.ids, hits.points, hits.normals)
+    return hits
+
+
+def _axes(towards: Array) -> Array:
+    """``[3,3]`` rows right, down, forward of light that comes from a direction."""
+    forward = -towards / np.linalg.norm(towards)
+    right = np.cross([0.3, 1.0, 0.2], forward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _map(shapes: Packed, axes: Array, middle: Array, radius: float, size: int) -> Float:
+    """``[size,size]`` how far forward of the middle the light gets."""
+    c2w = np.eye(4)
+    c2w[:3, :3], c2w[:3, 3] = axes.T, middle - BEHIND * radius * axes[2]
+    hits = trace(shapes, c2w, Lens(size, size, BEHIND * size / 2), 1)
+    return (hits.depth - BEHIND * radius).astype(np.float32)
+
+
+def lit(stage: Stage) -> Lit:
+    """Prepare a stage: its arrays, smaller textures, and where the lights reach."""
+    opaque = packed([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
+    extent = bounds(opaque)
+    reach = np.linalg.norm(extent, axis=1)
+    low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    rng = np.random.default_rng(0)
+    key = [stage.light.towards + stage.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
+    turns = np.arange(AMBIENT_MAPS) + 0.5  # evenly over the sphere (Fibonacci)
+    up, angle = 1 - 2 * turns / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * turns
+    flat = np.sqrt(1 - up**2)
+    ambient = np.stack([flat * np.cos(angle), -up, flat * np.sin(angle)], 1)
+    axes = np.stack([_axes(towards) for towards in (*key, *ambient)])
+    return Lit(
+        stage,
+        packed(stage.shapes),
+        tuple(pyramid(texture) for texture in stage.textures),
+        axes,
+        middle,
+        radius,
+        np.stack([_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
+        np.stack([_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
+        np.where(up > 0, 1.0, FROM_BELOW) * 4 / AMBIENT_MAPS,
+    )
+
+
+def coordinates(shapes: Packed, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
+    """Texture coordinates ``[n]`` of points in the frames of shapes, and texture repeats per world unit ``[n]``."""
+    kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
+    x, y, z = points.T
+    a, b, c = (np.abs(points) / np.maximum(half, 1e-9)).T
+    turned = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (b < 1 - 1e-5))
+    girth = np.maximum(half[:, 0], half[:, 2])
+    side = (kinds == BOX) & (a >= b) & (a >= c)
+    top = ((kinds == BOX) & (b > a) & (b >= c)) | ((kinds == CONE) & ~turned)
+    around = np.arctan2(x, z).astype(np.float32)
+    u = np.where(turned, around * girth, np.where(side, z, x))
+    v = np.where(top, z, y)
+    wide = np.where(turned, np.pi * girth, np.where(side, half[:, 2], half[:, 0]))
+    high = np.where(top, half[:, 2], half[:, 1])
+    looks = [s.look for s in shapes.shapes]
+    repeat = np.array([look.repeat for look in looks], np.float32)[ids]
+    shift = np.array([look.shift for look in looks], np.float32)[ids]
+    once = repeat == 0
+    u = np.where(once, u / (2 * wide) + 0.5, u * repeat + shift[:, 0])
+    v = np.where(once, v / (2 * high) + 0.5, v * repeat + shift[:, 1])
+    return np.stack([u, v], 1).astype(np.float32), np.where(once, 0.5 / np.maximum(wide, high), repeat)
+
+
+def paint(view: Lit, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
+    """``[n,3]`` colours of the textures, sRGB; ``spread`` is the size of a sample on the surface, world units."""
+    uv, repeat = coordinates(view.shapes, ids, points)
+    textures = np.array([s.look.texture for s in view.shapes.shapes])[ids]
+    size = len(view.mips[0][0])
+    levels = np.log2(np.maximum(spread * repeat * size, 1)).round().astype(int)
+    levels = np.minimum(levels, len(view.mips[0]) - 1)
+    group = textures * len(view.mips[0]) + levels
+    order = np.argsort(group, kind="stable")
+    out = np.empty((len(ids), 3), np.float32)
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    for rows in np.split(order, starts[1:]):
+        texture = view.mips[textures[rows[0]]][levels[rows[0]]]
+        out[rows] = _lookup(texture, uv[rows])
+    return out
+
+
+def _lookup(texture: Picture, uv: Float) -> Float:
+    """Bilinear samples of a texture that repeats; y of the texture is down."""
+    width = 4096  # cv2.remap takes at most 32767 columns
+    size = len(texture)
+    rows = -(-len(uv) // width)
+    at = np.zeros((rows * width, 2), np.float32)
+    at[: len(uv)] = (uv - np.floor(uv)) * size - 0.5
+    x, y = at.reshape(rows, width, 2)[..., 0], at.reshape(rows, width, 2)[..., 1]
+    found = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return found.reshape(-1, 3)[: len(uv)]
+
+
+def radiance(view: Lit, c2w: Array, lens: Lens, samples: int) -> tuple[Float, Hits]:
+    """Linear light ``[h,w,3]`` of every pixel, and the hits of all its samples."""
+    hits = trace(view.shapes, c2w, lens, samples)
+    h, w = hits.depth.shape
+    seen = hits.ids.reshape(-1) >= 0
+    ids, points = hits.ids.reshape(-1)[seen], hits.points.reshape(-1, 3)[seen]
+    normals, depth = hits.normals.reshape(-1, 3)[seen], hits.depth.reshape(-1)[seen]
+    y, x = np.divmod(np.flatnonzero(seen), w)
+    rays = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
+    rays = np.concatenate([rays, np.ones((len(rays), 1))], 1) @ c2w[:3, :3].T
+    world = (c2w[:3, 3] + rays * depth[:, None]).astype(np.float32)
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    cosine = np.maximum(-(normals * rays).sum(1), 0.1)
+    spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
+    albedo = paint(view, ids, points, spread) ** 2.2
+    out = np.zeros((h * w, 3), np.float32)
+    out[seen] = _shaded(view, ids, albedo, world, normals, rays)
+    return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3)), hits
+
+
+def _shaded(view: Lit, ids: NDArray[np.int32], albedo: Float, world: Float, normals: Float, rays: Float) -> Float:
+    """Linear light that leaves points towards the camera."""
+    light, shapes = view.stage.light, view.shapes.shapes
+    direct, indirect = np.zeros((2, len(ids)), np.float32)
+    bias = 2.0 * 2 * view.radius / KEY_SIZE
+    even = np.full(KEY_MAPS, 1 / KEY_MAPS)
+    light_seen(world, normals, view.axes[:KEY_MAPS], view.middle, view.radius, view.key, bias, even, direct)
+    bias = 1.2 * 2 * view.radius / AMBIENT_SIZE
+    around = view.axes[KEY_MAPS:], view.middle, view.radius, view.ambient, bias, view.weights
+    light_seen(world, normals, *around, indirect)
+    if light.lamp is not None:
+        away = np.linalg.norm(world - light.lamp.astype(np.float32), axis=1)
+        direct *= 2.5 / (1 + (away / np.linalg.norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
+    gloss = np.array([s.look.gloss for s in shapes], np.float32)[ids]
+    half = light.towards.astype(np.float32) - rays
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    shine = gloss * direct * np.clip((normals * half).sum(1), 0, 1) ** (8 + 120 * gloss)
+    rim = 0.25 * gloss * (1 + (normals * rays).sum(1)).clip(0, 1) ** 4  # grazing views reflect more (Schlick 1994)
+    key, ambient = light.key.astype(np.float32), light.ambient.astype(np.float32)
+    out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
+    out += shine[:, None] * key + rim[:, None] * ambient
+    glow = np.array([s.glow for s in shapes])[ids]
+    out[glow] = albedo[glow] * GLOW * float(key.mean() + ambient.mean())
+    return out
+
+
+def exposure(pictures: Sequence[Float], brightness: float) -> float:
+    """The factor on linear light after which the pictures' mean is about ``brightness``, sRGB."""
+    values = np.concatenate([p.reshape(-1) for p in pictures])
+    low, high = 1e-3, 1e3
+    for _ in range(30):
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if developed(values * middle).mean() < brightness else (low, middle)
+    return float((low * high) ** 0.5)
+
+
+def developed(linear: Float) -> Float:
+    """sRGB in [0, 1] of linear light: a film curve (Narkowicz 2015), then gamma."""
+    x = 0.6 * linear
+    return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1) ** (1 / 2.2)

@@ -1,0 +1,278 @@
+"""Textures: square colour pictures that repeat without a seam, made from random numbers alone.
+
+Every maker is ``(rng, size) -> [size,size,3]`` float32 sRGB in [0, 1]; ``KINDS`` names them by what they look like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.research.generate.patterns import Grey, cells, courses, enlarged, glyphs, grid, noise, text_line, warped
+
+Picture: TypeAlias = NDArray[Any]  # float32
+Color: TypeAlias = NDArray[Any]
+
+
+def color(
+    rng: np.random.Generator,
+    *,
+    hue: tuple[float, float] | None = None,
+    strength: tuple[float, float] = (0.05, 0.6),
+    light: tuple[float, float] = (0.2, 0.85),
+) -> Color:
+    """``[3]`` a random colour: hue 0 to 1 around the circle (None: all, warm ones most), saturation, value."""
+    h = rng.uniform(*hue) % 1 if hue is not None else rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()
+    s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
+    ramp = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)
+    return (v * (1 - s * (1 - ramp))).astype(np.float32)
+
+
+def shades(rng: np.random.Generator, base: Color, contrast: float) -> tuple[Color, Color]:
+    """A darker and a lighter neighbour of a colour."""
+    tint = rng.normal(0, 0.03, 3) * contrast
+    return np.clip(base * (1 - contrast) - tint, 0, 1), np.clip(base + (1 - base) * contrast * 0.6 + tint, 0, 1)
+
+
+def mix(low: Color, high: Color, amount: Grey) -> Picture:
+    """Colours between two, one for each pixel."""
+    return low + (high - low) * amount[..., None].astype(np.float32)
+
+
+def plain(rng: np.random.Generator, size: int) -> Picture:
+    """Paint: next to no texture."""
+    low, high = shades(rng, color(rng, light=(0.35, 0.95), strength=(0, 0.5)), rng.uniform(0.01, 0.05))
+    return mix(low, high, noise(rng, size, first=2, fade=0.5))
+
+
+def plaster(rng: np.random.Generator, size: int) -> Picture:
+    """Rough paint, stone, concrete."""
+    low, high = shades(rng, color(rng, strength=(0, 0.3)), rng.uniform(0.1, 0.4))
+    clouds, grit = noise(rng, size, fade=0.6), noise(rng, size, first=64, fade=0.9)
+    return mix(low, high, 0.6 * clouds + 0.4 * grit)
+
+
+def granite(rng: np.random.Generator, size: int) -> Picture:
+    """Speckles of three colours."""
+    base = color(rng, strength=(0, 0.25))
+    low, high = shades(rng, base, 0.3)
+    out = mix(low, high, noise(rng, size, first=64, fade=0.9))
+    speck = noise(rng, size, first=128, fade=0.7)[..., None]
+    dark, pale = (base + rng.uniform(0.2, 0.8) * (color(rng, light=v) - base) for v in ((0.05, 0.25), (0.75, 1)))
+    return np.where(speck > 0.75, pale, np.where(speck < 0.22, dark, out)).astype(np.float32)
+
+
+def marble(rng: np.random.Generator, size: int) -> Picture:
+    """Veins."""
+    low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.4, 0.9)), 0.5)
+    bend = noise(rng, size, fade=0.55)
+    x, y = grid(size)
+    veins = np.abs(np.sin(np.pi * (2 * x + 2 * y + 3 * bend))) ** 0.4
+    return mix(low, high, 0.8 * veins + 0.2 * noise(rng, size, first=16, fade=0.8))
+
+
+def wood(rng: np.random.Generator, size: int) -> Picture:
+    """Planks with grain along x."""
+    low, high = shades(rng, color(rng, hue=(0.04, 0.11), strength=(0.3, 0.7), light=(0.3, 0.8)), 0.45)
+    planks = int(rng.integers(2, 7))
+    tone, joint = courses(rng, size, planks, int(rng.integers(1, 3)), joint=rng.uniform(0.01, 0.03), offset=0.5)
+    rings = np.abs(np.sin(20 * noise(rng, size, first=16, fade=0.35, stretch=8) + 9 * tone))
+    fibres = noise(rng, size, first=128, fade=0.8, stretch=32)
+    out = mix(low, high, 0.35 * rings + 0.35 * fibres + 0.3 * tone)
+    return (out * (1 - 0.7 * joint[..., None])).astype(np.float32)
+
+
+def tiles(rng: np.random.Generator, size: int) -> Picture:
+    """Tiles with joints, of one colour or chequered."""
+    count = 2 * int(rng.integers(1, 5))
+    base = color(rng, strength=(0, 0.5))
+    low, high = shades(rng, base, rng.uniform(0.05, 0.3))
+    tone, joint = courses(rng, size, count, count, joint=rng.uniform(0.02, 0.05), offset=0.0)
+    if rng.random() < 0.4:
+        x, y = grid(size)
+        tone = 0.2 * tone + 0.8 * ((np.floor(x * count) + np.floor(y * count)) % 2)
+    out = mix(low, high, 0.6 * tone + 0.4 * noise(rng, size, first=8, fade=0.75))
+    return out + (color(rng, strength=(0, 0.2)) - out) * joint[..., None]
+
+
+def bricks(rng: np.random.Generator, size: int) -> Picture:
+    """Courses of bricks or hewn stones."""
+    rows = 2 * int(rng.integers(3, 7))
+    stone = rng.random() < 0.5
+    hue = (0.05, 0.13) if stone else (0.0, 0.07)
+    base = color(rng, hue=hue, strength=(0.05, 0.3) if stone else (0.35, 0.7), light=(0.4, 0.75))
+    low, high = shades(rng, base, 0.35)
+    tone, joint = courses(rng, size, rows, rows // 2, joint=rng.uniform(0.05, 0.1), offset=0.5)
+    dx, dy = (noise(rng, size, first=16, fade=0.6) for _ in range(2))
+    tone, joint = (warped(picture, dx, dy, 0.01) for picture in (tone, joint))
+    out = mix(low, high, 0.5 * tone + 0.5 * noise(rng, size, first=8, fade=0.85))
+    return out + (color(rng, strength=(0, 0.15), light=(0.4, 0.8)) - out) * joint[..., None]
+
+
+def cloth(rng: np.random.Generator, size: int) -> Picture:
+    """A weave with stripes or checks."""
+    x, y = grid(size)
+    count, base = int(rng.integers(3, 12)), color(rng, strength=(0.1, 0.8))
+    other = color(rng, strength=(0.0, 0.7))
+    bands = [(np.mod(count * c, 1) < rng.uniform(0.2, 0.6)).astype(np.float32) for c in (x, y)]
+    kind = rng.integers(0, 3)
+    amount = bands[0] if kind == 0 else 0.5 * bands[0] + 0.5 * bands[1] if kind == 1 else np.zeros_like(x)
+    threads = 2 ** int(rng.integers(5, 8))
+    weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
+    shade = 0.75 + 0.15 * weave + 0.2 * (noise(rng, size, fade=0.7) - 0.5)
+    return np.clip(mix(base, other, amount) * shade[..., None], 0, 1).astype(np.float32)
+
+
+def carpet(rng: np.random.Generator, size: int) -> Picture:
+    """Pile, or an ornament of a few colours."""
+    low, high = shades(rng, color(rng, strength=(0.1, 0.7), light=(0.2, 0.6)), 0.4)
+    out = mix(low, high, noise(rng, size, first=32, fade=0.95))
+    if rng.random() < 0.5:
+        motif = enlarged(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
+        mask = np.mod(3 * motif, 1)[..., None] > 0.5
+        out = np.where(mask, out, 0.3 * out + 0.7 * color(rng, strength=(0.2, 0.8)))
+    return out.astype(np.float32)
+
+
+def gravel(rng: np.random.Generator, size: int) -> Picture:
+    """Pebbles or cobbles."""
+    tone, edge = cells(rng, size, int(rng.integers(16, 64)))
+    low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.3, 0.7)), 0.5)
+    out = mix(low, high, 0.7 * tone + 0.3 * noise(rng, size, first=32, fade=0.9))
+    return out * (0.35 + 0.65 * np.clip(3 * edge, 0, 1))[..., None]
+
+
+def grass(rng: np.random.Generator, size: int) -> Picture:
+    """Meadow or leaf litter, from blades to patches."""
+    base = color(rng, hue=(0.18, 0.34) if rng.random() < 0.7 else (0.05, 0.12), strength=(0.3, 0.7), light=(0.25, 0.55))
+    low, high = shades(rng, base, 0.6)
+    blades = noise(rng, size, first=64, fade=0.9, stretch=2).T
+    return mix(low, high, 0.65 * blades + 0.35 * noise(rng, size, fade=0.6))
+
+
+def bark(rng: np.random.Generator, size: int) -> Picture:
+    """Furrows along y."""
+    low, high = shades(rng, color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55)), 0.6)
+    furrows = noise(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T
+    return mix(low, high, furrows)
+
+
+def foliage(rng: np.random.Generator, size: int) -> Picture:
+    """One leaf: veins from a middle rib."""
+    base = color(rng, hue=(0.2, 0.38), strength=(0.4, 0.85), light=(0.2, 0.6))
+    if rng.random() < 0.25:  # petals
+        base = color(rng, hue=(0.8, 1.12), strength=(0.4, 0.9), light=(0.6, 0.95))
+    low, high = shades(rng, base, 0.45)
+    x, y = grid(size)
+    side = np.abs(x - 0.5)
+    veins = np.clip(1 - np.abs(np.sin(np.pi * 12 * (y - side))) * 5, 0, 1) * 0.5
+    rib = np.clip(1 - side * 30, 0, 1)
+    return mix(low, high, np.clip(0.35 * noise(rng, size, fade=0.7) + np.maximum(veins, rib) + 0.4 * (1 - y), 0, 1))
+
+
+def crown(rng: np.random.Generator, size: int) -> Picture:
+    """Leaves from afar: what bushes and trees are made of."""
+    tone, edge = cells(rng, size, int(rng.integers(24, 56)))
+    base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
+    low, high = shades(rng, base, 0.6)
+    clumps = noise(rng, size, first=4, fade=0.75)
+    return (
+        mix(low, high, np.clip(0.5 * tone + 0.6 * clumps - 0.1, 0, 1))
+        * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
+    )
+
+
+def gradient(rng: np.random.Generator, size: int) -> Picture:
+    """From one colour into another and back."""
+    _, y = grid(size)
+    return mix(color(rng), color(rng), 0.5 - 0.5 * np.cos(2 * np.pi * y))
+
+
+def printed(rng: np.random.Generator, size: int) -> Picture:
+    """A page: heading, columns of text, pictures."""
+    paper = color(rng, strength=(0, 0.12), light=(0.8, 1)) if rng.random() < 0.7 else color(rng)
+    ink = color(rng, light=(0.02, 0.3)) if paper.mean() > 0.45 else color(rng, light=(0.85, 1), strength=(0, 0.2))
+    page, letters = np.tile(paper, (size, size, 1)).astype(np.float32), glyphs(rng, 26)
+    margin, y = size // 16, size // 16
+    page[: size // 64] = page[:, : size // 64] = 0.7 * paper
+    while y < size - 2 * margin:
+        kind, left = rng.random(), margin
+        height = size // int(rng.integers(6, 12)) if kind < 0.2 else size // int(rng.integers(22, 44))
+        width = int(rng.uniform(0.5, 1) * (size - 2 * margin))
+        if kind > 0.8:  # a picture, with text beside it
+            height, wide = int(rng.uniform(0.1, 0.25) * size), int(rng.uniform(0.2, 0.5) * size)
+            area = page[y : y + height, left : left + wide]
+            area[:] = mix(color(rng), color(rng), noise(rng, size, first=4, fade=0.6))[: area.shape[0], : area.shape[1]]
+            left, width, height = left + wide + margin // 2, size - 2 * margin - wide, height // 4
+        line = text_line(rng, letters, height, max(8, width))
+        area = page[y : y + height, left : min(left + width, size - margin)]
+        area += (ink - area) * line[: area.shape[0], : area.shape[1], None]
+        y += int(height * rng.uniform(1.3, 1.7)) + (size // 8 if kind > 0.8 else 0)
+    return page
+
+
+def label(rng: np.random.Generator, size: int) -> Picture:
+    """A package: bands, discs, large and small letters."""
+    x, y = grid(size)
+    page = mix(color(rng, strength=(0.3, 0.95)), color(rng, strength=(0.2, 0.9)), np.abs(2 * y - 1))
+    for _ in range(rng.integers(2, 6)):
+        cx, cy, r = rng.uniform(0, 1), rng.uniform(0, 1), rng.uniform(0.06, 0.3)
+        inside = np.hypot(x - cx, y - cy) < r if rng.random() < 0.5 else np.abs(y - cy) < r / 3
+        page = np.where(inside[..., None], color(rng, strength=(0.1, 0.95)), page)
+    letters = glyphs(rng, 26)
+    for _ in range(rng.integers(3, 9)):
+        height = size // int(rng.integers(5, 30))
+        top, left = int(rng.integers(0, size - height)), int(rng.integers(0, size // 2))
+        area = page[top : top + height, left : left + int(rng.integers(size // 5, size // 2))]
+        ink = color(rng, strength=(0, 0.4), light=(0.85, 1) if rng.random() < 0.5 else (0, 0.2))
+        area += (ink - area) * text_line(rng, letters, height, area.shape[1])[..., None]
+    return np.clip(page * (0.97 + 0.06 * noise(rng, size, first=16)[..., None]), 0, 1).astype(np.float32)
+
+
+def spines(rng: np.random.Generator, size: int) -> Picture:
+    """A row of books, or files, or planks of many colours."""
+    page, letters, x = np.zeros((size, size, 3), np.float32), glyphs(rng, 26), 0
+    while x < size:
+        width = int(rng.uniform(0.02, 0.09) * size)
+        book = page[:, x : x + width]
+        book[:] = color(rng, strength=(0.1, 0.8), light=(0.15, 0.95))
+        if book.shape[1] > size // 40:
+            line = text_line(rng, letters, book.shape[1], size)
+            book += (color(rng, strength=(0, 0.3), light=(0.8, 1)) - book) * line.T[:, : book.shape[1], None] * 0.8
+        book *= np.sin(np.linspace(0.5, 2.6, book.shape[1]))[None, :, None] ** 0.5
+        book[: int(rng.uniform(0, 0.2) * size)] *= 0.12
+        x += width
+    return page
+
+
+def sky(rng: np.random.Generator, size: int) -> Picture:
+    """Blue or grey with clouds; the horizon at y = 1/2."""
+    _, y = grid(size)
+    high = color(rng, hue=(0.56, 0.63), strength=(0.0, 0.6), light=(0.6, 0.95))
+    low = np.array([0.9, 0.92, 0.95], np.float32)
+    clouds = np.clip(rng.uniform(0.8, 2.5) * (noise(rng, size, first=4, fade=0.55) - rng.uniform(0.3, 0.8)), 0, 1)
+    out = mix(high, low, np.clip(1 - 2.2 * np.abs(y - 0.5), 0, 1) ** 2)
+    return out + (0.97 - out) * clouds[..., None]
+
+
+Maker = Callable[[np.random.Generator, int], Picture]
+KINDS: dict[str, Maker] = {
+    maker.__name__: maker
+    for maker in (
+        *(plain, plaster, granite, marble, wood, tiles, bricks, cloth, carpet, gravel, grass, bark),
+        *(foliage, crown, gradient, printed, label, spines, sky),
+    )
+}
+
+
+def pyramid(texture: Picture) -> list[Picture]:
+    """The texture, and halves of it down to 8 pixels, so that what is far away does not flicker."""
+    out: list[Picture] = [np.ascontiguousarray(texture, np.float32)]
+    while len(out[-1]) > 8:
+        half = len(out[-1]) // 2
+        out.append(cv2.resize(out[-1], (half, half), interpolation=cv2.INTER_AREA))
+    return out

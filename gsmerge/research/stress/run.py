@@ -1,0 +1,232 @@
+"""Runs the cases on a scene and judges each by its property."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsmerge.errors import GsmergeError, SceneError, UsageError
+from gsmerge.io import SceneLoad, align_scene, read_ply_with_hints
+from gsmerge.io.cameras.camera_file import from_viewmats, to_viewmats
+from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.hints import AUTO, ReadHints
+from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
+from gsmerge.options import CompactOptions
+from gsmerge.pipeline import compact
+from gsmerge.research.stress.cases import CASES, PROPERTIES, Case
+from gsmerge.research.stress.changes import Judged
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+
+WORSE = 0.1  # dB that a result may be below its input
+SAME, NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
+FITTED = 1.0  # dB more after a full fit, which rounding alone sends another way: thin poles show it
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05
+_QUICK = EvaluateOptions(lpips=())
+_FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class StressOutcome:
+    """What one case did to a scene.
+
+    Args:
+        case: Its name.
+        words: What was changed.
+        wanted: The property that must hold.
+        held: Whether it does; None where the case makes no sense for the scene.
+        found: What was measured, or why it makes no sense.
+        seconds: What it took.
+    """
+
+    case: str
+    words: str
+    wanted: str
+    held: bool | None
+    found: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A compact result with its figures."""
+
+    gaussians: Gaussians
+    before: float
+    after: float
+
+    @property
+    def count(self) -> int:
+        return len(self.gaussians)
+
+
+def stress(
+    load: SceneLoad,
+    options: CompactOptions | None = None,
+    *,
+    targets: Views | None = None,
+    cases: Sequence[str] | None = None,
+    hints: ReadHints = AUTO,
+    progress: Progress | None = None,
+) -> tuple[StressOutcome, ...]:
+    """Compact a scene under bad conditions.
+
+    Args:
+        load: The scene, with views.
+        options: Settings of every run.
+        targets: Held-out views that results are judged by; None: the input views, by their photos, or by renders of
+            the input where there are none.
+        cases: Names of ``CASES``; None: all.
+        hints: What was told when the scene was read.
+        progress: Called with (case, done, total).
+
+    Raises:
+        UsageError: If a case is unknown, or the scene has no views.
+    """
+    names = list(CASES if cases is None else cases)
+    unknown = next((name for name in names if name not in CASES), None)
+    if unknown is not None:
+        raise UsageError(f"cases: expected some of {', '.join(CASES)}, got {unknown!r}")
+    if len(load.scene) == 0:
+        raise UsageError("expected a scene with views, got none")
+    options = options or CompactOptions()
+    given = Judged(load.scene, targets)
+    usual = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None
+    out = []
+    for i, name in enumerate(names):
+        case, start = CASES[name], time.perf_counter()
+        if progress:
+            progress(case.words, i, len(names))
+        held, found = _judged(case, load, given, usual, options, hints)
+        seconds = time.perf_counter() - start
+        out.append(StressOutcome(name, case.words, _wanted(case, options), held, found, seconds))
+    if progress:
+        progress("done", len(names), len(names))
+    return tuple(out)
+
+
+def _judged(
+    case: Case, load: SceneLoad, given: Judged, usual: _Result | None, options: CompactOptions, hints: ReadHints
+) -> tuple[bool | None, str]:
+    """Whether the case's property holds, and what was measured."""
+    problem = _unfit(case, load)
+    if problem is not None:
+        return None, problem
+    if case.check == "convention":
+        return _convention(case, load, hints)
+    assert usual is not None
+    try:
+        if case.check == "again":
+            return _again(given, usual, options)
+        changed = given if case.change is None else case.change(given)
+        settings = options if case.threads is None else replace(options, threads=case.threads)
+        result = usual if case.name == "unchanged" else _run(changed, settings)
+    except (GsmergeError, ValueError) as error:  # what one case does to a scene must not end the others
+        return False, f"ended with: {error}"
+    unsound = _unsound(result.gaussians, changed.scene)
+    return (False, unsound) if unsound else _compared(case, usual, result, _slack(options))
+
+
+def _unfit(case: Case, load: SceneLoad) -> str | None:
+    """Why a case makes no sense for a scene; None where it does."""
+    scene = load.scene
+    if case.needs in ("pixels", "photos") and not isinstance(scene, PixelScene):
+        return "needs a Gaussian for each pixel"
+    if case.needs == "photos" and scene.images is None:
+        return "needs photos"
+    if case.needs == "file":
+        if load.cameras is None:
+            return "needs cameras from a file"
+        if case.convention == load.cameras.convention:
+            return "is how the cameras' format has them"
+    return None
+
+
+def _run(given: Judged, options: CompactOptions) -> _Result:
+    result = compact(given.scene, options)
+    return _Result(result.gaussians, *_quality(given, result.gaussians))
+
+
+def _quality(given: Judged, gaussians: Gaussians) -> tuple[float, float]:
+    """PSNR (dB) of the input and of a result on the judging views; the input's is infinite where it judges itself."""
+    found = evaluate(given.scene, {"result": gaussians}, given.judges, replace(_QUICK, context=given.judges is None))
+    split = "context" if given.judges is None else "target"
+    before, after = (one.mean(split)[1].psnr for one in found.results)
+    return (math.inf if before is None else before), (math.nan if after is None else after)
+
+
+def _slack(options: CompactOptions) -> float:
+    return FITTED if options.fit.fit == "full" else 0.0
+
+
+def _wanted(case: Case, options: CompactOptions) -> str:
+    slack = _slack(options)
+    return PROPERTIES[case.check].format(same=SAME + slack, near=NEAR + slack, worse=WORSE)
+
+
+def _compared(case: Case, usual: _Result, result: _Result, slack: float) -> tuple[bool, str]:
+    figures = f"{result.count:,} Gaussians, {result.after:.2f} dB"
+    beside = f"{figures}; unchanged {usual.count:,}, {usual.after:.2f} dB"
+    if case.check == "better":
+        if math.isinf(result.before):
+            return True, f"{figures} against renders of the input"
+        return result.after >= result.before - WORSE, f"{figures}; its input {result.before:.2f} dB"
+    if case.check == "bits":
+        same = all(torch.equal(getattr(usual.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
+        return same, "equal" if same else f"differs: {beside}"
+    if case.check == "near":
+        return result.after >= usual.after - NEAR - slack, beside
+    near = result.after >= usual.after - SAME - slack
+    if case.check == "once":
+        return near and result.count <= ONCE_COUNT * usual.count, beside
+    return near and abs(result.count - usual.count) <= max(1, SAME_COUNT * usual.count), beside
+
+
+def _again(given: Judged, usual: _Result, options: CompactOptions) -> tuple[bool, str]:
+    """The result as a scene of its own, compacted to as many Gaussians as it has."""
+    scene = given.scene
+    loose = UnalignedScene(usual.gaussians, scene.cameras, scene.images, scene.names)
+    plain = replace(options.target, budget=usual.count, max_bytes=None, preset=None, max_drop=None, target_psnr=None)
+    once = replace(options, target=replace(plain, levels=1), decode=replace(options.decode, k=1))
+    after = _quality(given, compact(loose, once).gaussians)[1]
+    return after >= usual.after - SAME - _slack(options), f"{after:.2f} dB; before {usual.after:.2f} dB"
+
+
+def _convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
+    """The scene read from cameras whose poses are written in another convention than their format has."""
+    assert load.cameras is not None
+    assert case.convention is not None
+    stored = from_viewmats(load.cameras.viewmats.numpy(), case.convention)
+    wrong = replace(load.cameras, viewmats=torch.from_numpy(to_viewmats(stored, load.cameras.convention)))
+    try:
+        ply = read_ply_with_hints(load.files.ply, opacity=_encoding(load), hints=hints)
+        read = align_scene(ply, load.files, wrong, hints=hints).scene
+    except SceneError as error:
+        return True, f"refused: {error.problem}"
+    expected, found = load.scene.cameras.viewmats.numpy(), read.cameras.viewmats.numpy()
+    same = expected.shape == found.shape and np.allclose(expected, found, atol=1e-3 * (1 + np.abs(expected).max()))
+    return bool(same), "recognised" if same else "taken for something else"
+
+
+def _encoding(load: SceneLoad) -> OpacityChoice:
+    return "raw" if load.ply.opacity_encoding == "raw" else "logit"
+
+
+def _unsound(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:
+    """What is wrong with a result whatever the scene; None where nothing is."""
+    for name in _FIELDS:
+        if not bool(torch.isfinite(getattr(gaussians, name)).all()):
+            return f"{name} are not finite"
+    if not 1 <= len(gaussians) <= scene.num_gaussians:
+        return f"{len(gaussians)} Gaussians of {scene.num_gaussians}"
+    if not bool(((gaussians.opacities > 0) & (gaussians.opacities < 1)).all()):
+        return "opacities outside of 0 to 1"
+    if not bool((gaussians.scales > 0).all()):
+        return "scales that are not positive"
+    lengths = gaussians.quats.norm(dim=1)
+    return None if bool((lengths - 1).abs().max() < 1e-4) else "quaternions that are no unit quaternions"

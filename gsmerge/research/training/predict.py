@@ -1,0 +1,143 @@
+"""Crops of examples through all networks, with gradients: the sum of the corrections of every stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.networks import Learned, Networks
+from gsmerge.networks.apply import (
+    encoder_outputs,
+    head_residuals,
+    head_starts,
+    merger_outputs,
+    nearest,
+    refiner_outputs,
+    with_corrections,
+    with_encoding,
+)
+from gsmerge.networks.residuals import MEAN, move_gaussians, rotated
+from gsmerge.networks.tokens import Described
+from gsmerge.research.training.examples import Example, differences
+from gsmerge.stages.merge import cluster_runs, pool_runs, take
+from gsmerge.types import FeatureGaussians, Gaussians, Matches
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """Neighbouring Feature Gaussians of an example, with K children each.
+
+    Args:
+        example: Where they are from.
+        k: Which of its levels.
+        rows: ``[r]`` rising rows of its merged Feature Gaussians.
+        children: ``[n]`` rising rows of the level's children.
+        judged: ``[n]`` whether their targets count.
+    """
+
+    example: Example
+    k: int
+    rows: Tensor
+    children: Tensor
+    judged: Tensor
+
+
+def random_crop(example: Example, count: int, inner: float, rng: np.random.Generator) -> Crop:
+    """The ``count`` Feature Gaussians that are nearest to a random one; the nearest of them are judged."""
+    k = list(example.levels)[int(rng.integers(len(example.levels)))]
+    level, centre = example.levels[k], example.centres[int(rng.integers(len(example.centres)))]
+    distances = (example.centres - centre).square().sum(1)
+    order = torch.argsort(distances, stable=True)[:count]
+    inside, close = torch.zeros(2, len(distances), dtype=torch.bool)
+    inside[order], close[order[: max(1, int(inner * len(order)))]] = True, True
+    children = torch.nonzero(inside[level.parents])[:, 0]
+    judged = close[level.parents[children]] & level.mask[children]
+    return Crop(example, k, torch.nonzero(inside)[:, 0], children, judged)
+
+
+def owners(matches: Matches) -> Tensor:
+    """``[g]`` row after merging of every Feature Gaussian before it."""
+    alone, order, cuts = cluster_runs(matches)
+    found = torch.empty(len(matches.clusters), dtype=torch.int64)
+    found[alone] = torch.arange(len(alone))
+    first = torch.zeros(len(order), dtype=torch.int64)
+    first[torch.from_numpy(cuts)] = 1
+    found[order] = len(alone) + first.cumsum(0) - 1
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Foreseen:
+    """What the networks make of a crop's children.
+
+    Args:
+        corrections: ``[n,13]`` of all stages together, as the targets are: from the analytic children.
+        gaussians: The children as the stages would make them, with gradients.
+    """
+
+    corrections: Tensor
+    gaussians: Gaussians
+
+
+def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
+    """A crop through all networks.
+
+    Each stage looks at what the ones before it made; gradients go through the latents and the corrections. At K = 1
+    the corrections of all stages add up; the children of a larger K are pooled anew from the members, so what reaches
+    them from the stages before their head is the latent.
+
+    The Gaussians of K = 1 are those that the stages make, one after the other; their gradient is that of the sum.
+    """
+    example = crop.example
+    learned = Learned(networks, example.members, example.cameras, seed)
+    owner = owners(example.matches)
+    parts = take(example.features, torch.nonzero(torch.isin(owner, crop.rows))[:, 0])
+    local = torch.searchsorted(crop.rows, owner[torch.isin(owner, crop.rows)])
+    described = learned.describe(parts)
+    parts, shifts = with_encoding(parts, described, encoder_outputs(parts, described, learned), networks)
+    merged, corrections = _merged(parts, described, shifts, Matches(local, len(crop.rows)), learned)
+    described = learned.describe(merged)
+    raw = refiner_outputs(merged, described, nearest(merged, networks.options.neighbors), learned)
+    refined, residuals = with_corrections(merged, described, raw, networks)
+    described = learned.describe(refined)
+    analytic = example.levels[crop.k].children[crop.children]
+    parents = torch.searchsorted(crop.rows, example.levels[crop.k].parents[crop.children])
+    frames, single = described.frames[parents], crop.k == 1
+    children = described.base if single else analytic
+    children = head_starts(children, parents.numpy(), refined, described, networks)
+    heads = head_residuals(children, parents.numpy(), refined, described, learned)
+    before = corrections + residuals if single else torch.zeros_like(heads)
+    last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
+    gaussians = move_gaussians(children, last, frames)
+    if networks.options.outputs == "absolute":
+        return Foreseen(differences(analytic, gaussians, frames), gaussians)
+    return Foreseen(before + heads, gaussians)
+
+
+def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:
+    """``[n,13]`` corrections that the networks make of a crop's children, see :func:`foreseen`."""
+    return foreseen(crop, networks, seed).corrections
+
+
+def _merged(
+    parts: FeatureGaussians, described: Described, shifts: Tensor, matches: Matches, learned: Learned
+) -> tuple[FeatureGaussians, Tensor]:
+    """Merged Feature Gaussians, and what encoder and merger did to each."""
+    alone, order, cuts = cluster_runs(matches)
+    if len(order) == 0:
+        return parts, shifts
+    pooled = pool_runs(parts, order, cuts)
+    of_pooled = learned.describe(pooled)
+    moved = rotated(described.frames, shifts[:, MEAN] * described.sizes[:, None])[order]
+    run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
+    share = parts.weights[order] / torch.zeros(len(cuts)).index_add(0, run, parts.weights[order])[run].clamp_min(1e-12)
+    world = torch.zeros(len(cuts), 3).index_add(0, run, share[:, None] * moved)
+    local = rotated(of_pooled.frames.transpose(1, 2), world) / of_pooled.sizes[:, None]
+    raw = merger_outputs(pooled, of_pooled, parts, order.numpy(), cuts, learned)
+    pooled, residuals = with_corrections(pooled, of_pooled, raw, learned.networks)
+    from_encoder = torch.cat([local, torch.zeros(len(cuts), residuals.shape[1] - 3)], 1)
+    merged = FeatureGaussians.concat([take(parts, alone), pooled])
+    return merged, torch.cat([shifts[alone], residuals + from_encoder])

@@ -1,0 +1,1 @@
+"""The process: threads, memory, logs, and what a run will take."""

@@ -1,0 +1,56 @@
+"""What a run notes down: seconds by stage, choices, sentences for the user; and whom it tells."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from gsmerge.runtime.memory import release_memory
+
+Progress = Callable[[str, int, int], None]
+RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
+STAGES = (
+    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "cover", "decode",
+    "choose", "join", "fit", "score", "input",
+)  # fmt: skip
+
+
+@dataclass
+class RunLog:
+    """Clock and notebook of one run.
+
+    Args:
+        progress: Called with (stage, done, total).
+        seconds: Wall time of each stage.
+        choices: What the stages decided.
+        notes: Things worth telling, one sentence each.
+    """
+
+    progress: Progress | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    choices: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def fit_progress(self, step: int, steps: int, photos: float, held_out: float) -> None:
+        """One step of the fit is done."""
+        if self.progress:
+            self.progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)
+
+    def curve_progress(self, done: int, total: int) -> None:
+        """One point of the curve is measured."""
+        if self.progress:
+            self.progress("curve: what each count brings", done, total)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """A block whose time counts as that of a stage."""
+        if self.progress:
+            self.progress(name, STAGES.index(name), len(STAGES))
+        start = time.perf_counter()
+        yield
+        if name in RELEASED:
+            release_memory()
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

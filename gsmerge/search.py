@@ -1,0 +1,230 @@
+"""What each number of Gaussians would bring: short fits, judged by parts of the photos that they left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from gsmerge.build import Source, build
+from gsmerge.measure.lpips import lpips, lpips_available
+from gsmerge.options import CompactOptions
+from gsmerge.render import composite, plan_view, prepare
+from gsmerge.render.metrics import WINDOW, ssim
+from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.fit.holdout import holdout_psnr, training_weights
+from gsmerge.stages.group import Canvas, cut_scene
+from gsmerge.stages.region_tree import RegionTree
+from gsmerge.types import Gaussians
+
+SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
+HOLDOUT = 0.1  # share of the photos' blocks
+NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
+PERCEPTUAL_SIDE = 64  # pixels, at least
+LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
+RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured
+AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
+SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
+KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
+SLOPE = 1.0  # dB per doubling of the count, until two counts have been tried
+CLOSE = 1.15  # counts this near to each other are one
+MAX_RUNS = 6
+MOST = 4  # times the usual count is the most that a quality target may take
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What a number of Gaussians reaches after a short fit, on parts of the photos that it was not fitted to.
+
+    Args:
+        count: Gaussians.
+        psnr: dB.
+        ssim: Structural similarity.
+        lpips: LPIPS (VGG), None where its weights are not installed.
+    """
+
+    count: int
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+def measure_curve(
+    source: Source,
+    canvas: Canvas,
+    tree: RegionTree,
+    options: CompactOptions,
+    steps: int,
+    counts: Sequence[int],
+    log: RunLog,
+) -> list[CurvePoint]:
+    """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
+
+    PSNR and SSIM are those of blocks that the short fits do not look at, at full size; LPIPS needs whole pictures.
+
+    Args:
+        source: The scene, which must have photos.
+        canvas: Its pictures.
+        tree: What superpixels are cut from.
+        options: All settings; the fit's own length does not matter.
+        steps: Length of the fits.
+        counts: Numbers of Gaussians, each within the canvas' limits.
+        log: Told the progress.
+    """
+    short = FitOptions(fit="full", fit_steps=steps, coarse=1.0, holdout=HOLDOUT, rates=options.fit.rates)
+    quick = replace(options, fit=short)
+    whole = replace(canvas, share=1.0)  # so short a fit does not grow
+    photos = scene_photos(source.scene)
+    held = training_weights(photos, HOLDOUT, options.seed)
+    points: list[CurvePoint] = []
+    for count in counts:
+        log.curve_progress(len(points), len(counts))
+        gaussians = build(source, cut_scene(source.scene, whole, tree, quick, count), quick, RunLog())
+        points.append(_point(count, gaussians, photos, held, quick.fit.min_gain))
+    return points
+
+
+def _point(count: int, gaussians: Gaussians, photos: Photos, held: list[np.ndarray], min_gain: float) -> CurvePoint:
+    splats, views = prepare(gaussians), range(len(photos))
+    images = parallel_map(lambda v: np.clip(composite(plan_view(splats, **photos.camera(v)))[0], 0, 1), views)
+    similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], held[v] == 0), views)
+    perceptual = None
+    if min(photos.height, photos.width) >= PERCEPTUAL_SIDE and lpips_available(NET):
+        some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
+        perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in some]))
+    psnr = holdout_psnr(images, photos, held, min_gain)
+    return CurvePoint(count, psnr, float(np.mean(similar)), perceptual)
+
+
+def _similarity(image: np.ndarray, photo: np.ndarray, held: np.ndarray) -> float:
+    """SSIM of the held-out windows that lie inside the picture; of the whole where none does, 0 where none can."""
+    if min(held.shape) < WINDOW:
+        return 0.0
+    border = WINDOW // 2
+    return ssim(image, photo, held if held[border:-border, border:-border].any() else None)
+
+
+def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:
+    """Rising counts at which a scene's curve is measured: shares of the usual one, all between least and most."""
+    return sorted({min(max(round(usual * share), least), most) for share in shares})
+
+
+def level_counts(finest: int, levels: int, least: int) -> list[int]:
+    """Gaussians of the levels of detail after the finest, as long as there are enough for a coarser one."""
+    counts = [finest // LEVEL_FACTOR**i for i in range(1, levels)]
+    return [count for count in counts if count >= least]
+
+
+def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
+    """The fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
+
+    Between points the curve is a straight line over the logarithm of the count.
+
+    Args:
+        points: By rising count, at least one.
+        max_drop: dB.
+
+    Raises:
+        ValueError: If there is no point.
+    """
+    if not points:
+        raise ValueError("points: expected at least one, got none")
+    wanted = max(p.psnr for p in points) - max_drop
+    first = next(i for i, p in enumerate(points) if p.psnr >= wanted)
+    if first == 0:
+        return points[0].count
+    below, above = points[first - 1], points[first]
+    share = (wanted - below.psnr) / (above.psnr - below.psnr)
+    return math.ceil(below.count * (above.count / below.count) ** share)
+
+
+def curve_knee(points: Sequence[CurvePoint]) -> int:
+    """The count beyond which more Gaussians are not worth it, by PSNR and structure together.
+
+    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB per doubling, on
+    a straight line between the slopes that lie midway between the points.
+
+    Args:
+        points: By rising count, at least one.
+
+    Raises:
+        ValueError: If there is no point.
+    """
+    if not points:
+        raise ValueError("points: expected at least one, got none")
+    if len(points) == 1:
+        return points[0].count
+    scale = [math.log2(p.count) for p in points]
+    quality = [p.psnr + SSIM_DB * p.ssim for p in points]
+    pairs = list(pairwise(range(len(points))))
+    middles = [(scale[a] + scale[b]) / 2 for a, b in pairs]
+    slopes = [(quality[b] - quality[a]) / max(scale[b] - scale[a], 1e-9) for a, b in pairs]
+    steep = max((i for i, slope in enumerate(slopes) if slope >= KNEE), default=None)
+    if steep is None:
+        return points[0].count
+    if steep == len(slopes) - 1:
+        return points[-1].count
+    share = (slopes[steep] - KNEE) / (slopes[steep] - slopes[steep + 1])
+    return round(2 ** (middles[steep] + share * (middles[steep + 1] - middles[steep])))
+
+
+@dataclass(frozen=True)
+class Search:
+    """The outcome of a search for a quality.
+
+    Args:
+        count: The count that was chosen.
+        psnr: What it reaches, dB.
+        met: Whether that is the target.
+        tried: Every count that was run and its PSNR, in the order of the runs.
+    """
+
+    count: int
+    psnr: float
+    met: bool
+    tried: tuple[tuple[int, float], ...]
+
+
+def search_count(run: Callable[[int], float], target: float, start: int, least: int, most: int) -> Search:
+    """The fewest Gaussians that reach a PSNR, within 15 %, by a few runs; the best of them where none does.
+
+    Args:
+        run: Count -> PSNR (dB), taken to rise with the count.
+        target: dB.
+        start: First count.
+        least: Fewest Gaussians that can be run.
+        most: Most Gaussians that are allowed.
+    """
+    tried: dict[int, float] = {}
+    count = min(max(start, least), most)
+    while count not in tried and len(tried) < MAX_RUNS:
+        tried[count] = run(count)
+        count = _next_count(tried, target, least, most)
+    reached = [c for c, psnr in tried.items() if psnr >= target]
+    chosen = min(reached) if reached else max(tried, key=lambda c: tried[c])
+    return Search(chosen, tried[chosen], bool(reached), tuple(tried.items()))
+
+
+def _next_count(tried: dict[int, float], target: float, least: int, most: int) -> int:
+    """Where to look next; a count that was tried already ends the search."""
+    above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
+    below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)
+    if above is not None and below is not None:
+        if above <= below * CLOSE:
+            return above
+        slope = (tried[above] - tried[below]) / math.log(above / below)
+        step = (target - tried[below]) / slope if slope > 0 else math.log(above / below) / 2
+        inner = math.log(above / below)
+        return round(below * math.exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner)))
+    edge = below if above is None else above
+    assert edge is not None  # one count has been tried
+    doublings = (target - tried[edge]) / SLOPE
+    if above is None:
+        return min(most, round(edge * 2 ** min(max(doublings, 0.5), 3.0)))
+    return max(least, round(edge * 2 ** max(min(doublings, -0.5), -3.0)))

@@ -1,0 +1,196 @@
+"""groups + gaussians in no order -> the pixel that each Gaussian belongs to.
+
+A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper, supplement
+"Compaction of Non-Pixel-Aligned FF Backbones"). What no view sees is marked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Lock
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+
+from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
+from gsmerge.kernels.raster.project import TILE
+from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
+from gsmerge.render.plan import MAX_SIZE
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Groups, UnalignedScene
+
+Unseen = Literal["drop", "keep"]
+
+ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
+FIRST_PAIRS = 1 << 16  # room for pairs of Gaussian and superpixel to begin with
+MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
+
+
+@dataclass(frozen=True)
+class ContributionOptions:
+    """What becomes of Gaussians that are in no order of pixels.
+
+    Args:
+        unseen: ``"drop"``: Gaussians that no view sees are left out. ``"keep"``: they are merged among their neighbours
+            in space, at the rate of the others, and added to the result.
+        min_contribution: Blending weight, in pixels of one view, below which a Gaussian counts as unseen.
+
+    Raises:
+        ValueError: If a setting is unknown or out of range.
+    """
+
+    unseen: Unseen = "drop"
+    min_contribution: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.unseen not in ("drop", "keep"):
+            raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
+        if not self.min_contribution >= 0:
+            raise ValueError(f"min_contribution: expected at least 0, got {self.min_contribution}")
+
+
+@dataclass(frozen=True)
+class Owners:
+    """The superpixel that each of n Gaussians adds most to.
+
+    Args:
+        values: ``[n]`` float32: its blending weights summed over that superpixel, pixels; 0 where nothing is seen.
+        views: ``[n]`` int32, -1 where nothing is seen.
+        labels: ``[n]`` int32 superpixel within the view, -1 where nothing is seen.
+    """
+
+    values: np.ndarray
+    views: np.ndarray
+    labels: np.ndarray
+
+
+def find_owners(scene: UnalignedScene, groups: Groups, near: float = 0.01) -> Owners:
+    """The dominant superpixel of every Gaussian, over all views; of equal ones the first view's first.
+
+    Only the best superpixel so far is kept of each Gaussian, and of one row of tiles at a time which Gaussian adds
+    what to which superpixel.
+
+    Args:
+        scene: n Gaussians and V views.
+        groups: The superpixels of the views.
+        near: Nearest depth that is seen.
+    """
+    splats, cameras = prepare(scene.gaussians), scene.cameras
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    count, lock = len(splats), Lock()
+    best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
+
+    def one_view(view: int) -> None:
+        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
+        values, labels = view_owners(plan, groups.labels[view].numpy(), groups.counts[view])
+        with lock:
+            old, first = best.values[plan.ids], best.views[plan.ids]
+            better = (values > old) | ((values == old) & (labels >= 0) & (view < first))
+            ids = plan.ids[better]
+            best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
+
+    each_view(one_view, len(scene), count)
+    return best
+
+
+def seen_weights(scene: UnalignedScene, near: float = 0.01) -> np.ndarray:
+    """``[n]`` float32: the most blending weight that each Gaussian has in one view, pixels.
+
+    Args:
+        scene: n Gaussians and their views.
+        near: Nearest depth that is seen.
+    """
+    splats, cameras = prepare(scene.gaussians), scene.cameras
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    most, lock = np.zeros(len(splats), np.float32), Lock()
+
+    def one_view(view: int) -> None:
+        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
+        sums, _ = contributions(plan)
+        with lock:
+            np.maximum(most, sums, out=most)
+
+    each_view(one_view, len(scene), len(splats))
+    return most
+
+
+def seen_depths(scene: UnalignedScene, near: float = 0.01) -> tuple[Tensor, Tensor]:
+    """``[v,h,w]`` mean depth of what each pixel shows, and ``[v,h,w]`` whether it mostly shows something.
+
+    Args:
+        scene: The canonical scene.
+        near: Nearest depth that is seen.
+    """
+    drawn = render(scene.gaussians, scene.cameras, near=near, with_depths=True)
+    assert drawn.depths is not None
+    return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
+
+
+def each_view(one_view: Callable[[int], None], num_views: int, num_gaussians: int) -> None:
+    """Call for every view, several at once unless the Gaussians are so many that their plans would fill the memory."""
+    if num_gaussians > ONE_AT_A_TIME:
+        for view in range(num_views):
+            one_view(view)
+    else:
+        parallel_map(one_view, range(num_views))
+
+
+def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Contribution ``[m]`` to the dominant superpixel of one view and its label ``[m]``, of the plan's Gaussians.
+
+    Args:
+        plan: The view.
+        labels: ``[h,w]`` int32, 0 to ``count - 1``.
+        count: Superpixels.
+    """
+    labels = np.ascontiguousarray(labels, np.int32)
+    num, room = len(plan.ids), max(FIRST_PAIRS, count)
+    values, found = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
+    heads, active = np.full(num, -1, np.int32), np.empty(num + 1, np.int32)
+    pairs, num_pairs, num_active = np.empty((room, PAIR)), 0, 0
+    for line in range(plan.lines):
+        pairs, num_pairs, num_active = add_row(
+            plan.footprints, plan.members, plan.offsets, plan.columns, line, labels,
+            heads, pairs, num_pairs, active, num_active, stamps,
+        )  # fmt: skip
+        bottom = (line + 1) * TILE if line < plan.lines - 1 else MAX_SIZE
+        pairs, num_pairs, num_active = settle_row(
+            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, found
+        )
+    return values, found
+
+
+def owner_pixels(owners: Owners, groups: Groups, min_contribution: float = 0.0) -> np.ndarray:
+    """The pixel in the middle of each Gaussian's superpixel, ``[n]`` int64 over all views; -1 for unseen ones.
+
+    Args:
+        owners: The dominant superpixels.
+        groups: The superpixels.
+        min_contribution: Those with less are taken for unseen, too.
+    """
+    counts = np.asarray(groups.counts)
+    size, first = groups.labels[0].numel(), np.cumsum(counts) - counts
+
+    def one_view(view: int) -> np.ndarray:
+        return middle_pixels(groups.labels[view].numpy(), groups.counts[view]) + view * size
+
+    middles = np.concatenate(parallel_map(one_view, range(len(counts))))
+    seen = (owners.labels >= 0) & (owners.values >= min_contribution)
+    return np.where(seen, middles[first[owners.views] + owners.labels], -1)
+
+
+def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
+    """``[count]`` int64 pixel of each superpixel nearest to its centroid, row-major; 0 where it has no pixel."""
+    height, width = labels.shape
+    flat = labels.reshape(-1)
+    y, x = np.divmod(np.arange(height * width), width)
+    sizes = np.maximum(np.bincount(flat, minlength=count), 1)
+    dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
+    order = np.lexsort((dx * dx + dy * dy, flat))
+    found, at = np.unique(flat[order], return_index=True)
+    middles = np.zeros(count, np.int64)
+    middles[found] = order[at]
+    return middles

@@ -1,0 +1,252 @@
+"""gaussians -> fitted gaussians: all parameters moved onto the input photos by a short, confined optimisation.
+
+One view per step: L1 and structural similarity on a random background, half-size photos first, Adam with rates in
+units of each Gaussian's own size, a box about the start. Longer runs begin with fewer Gaussians than they may have
+and spend the rest where the error is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.kernels.gaussians import optimise as kernels
+from gsmerge.render import composite, plan_view, splat_adjoint
+from gsmerge.render.gradient import plan_gradients
+from gsmerge.render.photos import Photos
+from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.stages.fit.grow import grow_to
+from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
+from gsmerge.stages.fit.loss import image_gradient
+from gsmerge.stages.fit.options import LONG_STEPS, FitOptions, Rates
+from gsmerge.stages.fit.report import FitReport
+from gsmerge.stages.fit.state import State, gaussians_of, start_state
+from gsmerge.types import Gaussians
+
+ROWS = 16384  # Gaussians per piece of an optimiser step
+GROWTH = 0.5  # part of the run after which Gaussians are added
+FEW_VIEWS, MANY_STEPS, DROPOUT, LONG_DROPOUT = 5, 150, 0.1, 0.05
+PROBE = 6  # steps that are timed to spend a time budget
+MAX_STEPS = 2000
+LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
+
+HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
+Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
+Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a run goes.
+
+    Args:
+        photos: At full and at half size.
+        weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
+            neither steps nor scores look at, 1 elsewhere.
+        step_weights: The same as a step looks at them: 0 on hidden pixels, and full size looks at held-out blocks, too.
+        options: What a step does.
+        dropout: Share of the Gaussians that a step leaves out.
+    """
+
+    photos: tuple[Photos, Photos]
+    weights: tuple[list[np.ndarray], list[np.ndarray]]
+    step_weights: tuple[list[np.ndarray], list[np.ndarray]]
+    options: FitOptions
+    dropout: float
+
+
+def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
+    """Held-out blocks, pixels that are not looked at, and dropout where there are few views."""
+    full = training_weights(photos[0], options.holdout, seed)
+    few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
+    usual = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
+    dropout = usual if options.dropout is None else options.dropout
+    weights = full, reduced(full, photos[1])
+    if masks is not None:
+        weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
+    everywhere = [np.where(weight == HIDDEN, np.float32(0), np.float32(1)) for weight in weights[0]]
+    trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
+    return Plan(photos, weights, (everywhere, trained), options, dropout)
+
+
+def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
+    """Training weights where the masks are."""
+    return [np.where(mask, weight, HIDDEN) for weight, mask in zip(weights, masks, strict=True)]
+
+
+def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
+    """One Adam step on one view -> mean squared error of its training pixels."""
+    level = 1 if progress < plan.options.coarse_share else 0
+    photos = plan.photos[level]
+    weight = plan.step_weights[level][view]
+    background, opacities = rng.random(3, dtype=np.float32), None
+    if plan.dropout > 0:
+        kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
+        opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
+    drawn = plan_view(state.splats, **photos.camera(view), opacities=opacities)
+    colors = state.view_colors()
+    image, transmittance = composite(drawn, colors, background)
+    gradient = image_gradient(image, photos.images[view], weight, plan.options.dssim)
+    g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
+    rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
+    g.opacities[:] += np.float32(plan.options.opacity_pull / count)
+    g.scales[:] += np.float32(plan.options.size_pull / count) / state.units[g.ids, None]
+    steps = step_sizes(rates, progress, plan.options.steps)
+    limits = np.array([rates.reach_mean, rates.reach_size, rates.reach_logit], np.float32)
+    betas = np.array([rates.beta1, rates.beta2], np.float32)
+
+    def update(first: int) -> None:
+        last = min(first + ROWS, len(state.x))
+        kernels.adam(
+            state.x, state.x0, state.m, state.v, state.units, state.shares, g.ids,
+            g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, step,
+            first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
+        )  # fmt: skip
+
+    parallel_map(update, range(0, len(state.x), ROWS))
+    error = weight[..., None] * (image - photos.images[view]) ** 2
+    return float(error.sum(dtype=np.float64) / max(3 * weight.sum(), 1))
+
+
+@dataclass(frozen=True)
+class Engine:
+    """What a run steps with.
+
+    Args:
+        step: One step on one view, as :func:`fit_step`, which may leave the state's arrays behind.
+        settle: Brings the state's arrays up to date, before anything else looks at them.
+    """
+
+    step: Callable[[State, Plan, int, int, float, np.random.Generator], float]
+    settle: Callable[[State], None]
+
+
+KERNELS = Engine(fit_step, lambda state: None)
+
+
+def step_sizes(rates: Rates, progress: float, steps: int) -> np.ndarray:
+    """Step of each of the fourteen columns at a point of the run, decaying geometrically; farther in longer runs."""
+    decay = rates.decay * min(1.0, LONG_RUN / steps)
+    columns = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
+    return (np.array(columns) * decay**progress).astype(np.float32)
+
+
+def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
+    """PSNR (dB) of the half-size held-out blocks, and ``[n]`` float32 the share of its box that each Gaussian may use.
+
+    The share is ``reach_alone`` to 1, by how many photos show a Gaussian: the effective number of them,
+    (sum w)^2 / sum w^2 of its blending weights w in them.
+    """
+    photos, colors = plan.photos[1], state.view_colors()
+    everywhere = np.ones((photos.height, photos.width, 1), np.float32)
+
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+        drawn = plan_view(state.splats, **photos.camera(view))
+        return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0]
+
+    images, sums, squares = [], np.zeros(len(state.x)), np.zeros(len(state.x))
+    for image, each in in_turn(one_view, range(len(photos))):
+        weights = each.astype(np.float64)
+        images.append(image)
+        sums += weights
+        squares += weights**2
+    photos_each = sums**2 / np.maximum(squares, 1e-12)
+    shares = np.clip(photos_each - 1, plan.options.rates.reach_alone, 1).astype(np.float32)
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), shares
+
+
+def holdout_score(state: State, plan: Plan) -> float:
+    """PSNR (dB) of the half-size held-out blocks."""
+    photos, colors = plan.photos[1], state.view_colors()
+
+    def one_view(view: int) -> np.ndarray:
+        drawn = plan_view(state.splats, **photos.camera(view))
+        return composite(drawn, colors)[0]
+
+    images = parallel_map(one_view, range(len(photos)))
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain)
+
+
+def score_to_beat(own: float, rival: Gaussians | None, plan: Plan) -> float:
+    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a rival that shows them worse.
+
+    Networks have learnt to show the photos whole. A fit of the rest takes from the blocks of what they made, and yet
+    helps new views; the start without networks is then what it is compared with.
+    """
+    return own if rival is None else min(own, holdout_score(start_state(rival), plan))
+
+
+def fit_full(
+    gaussians: Gaussians,
+    photos: tuple[Photos, Photos],
+    options: FitOptions,
+    count: int = 0,
+    seed: int = 0,
+    progress: Progress | None = None,
+    engine: Engine = KERNELS,
+    masks: Masks | None = None,
+    rival: Gaussians | None = None,
+) -> tuple[Gaussians, FitReport]:
+    """All parameters fitted to the photos.
+
+    Two states can be returned, judged by blocks of the photos that the half-size steps do not look at: the start, or
+    the end if the blocks were better after those steps. The full-size steps then look at everything.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        photos: The input views at full and at half size.
+        options: Steps, rates, limits.
+        count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
+        seed: Order of the views, backgrounds, dropout, held-out blocks.
+        progress: Told after every step.
+        engine: What it steps with.
+        masks: Pixels that are looked at; None: all. Where no Gaussian is, none should be drawn to.
+        rival: Another start that the fit may beat instead, see :func:`score_to_beat`.
+    """
+    rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
+    own, state.shares[:] = first_look(state, plan)
+    after = before = score_to_beat(own, rival, plan)
+    queue: list[int] = []
+    grows = options.grows
+    step, steps, started, error, judged = 0, options.steps, time.perf_counter(), 0.0, False
+    while step < steps:
+        part = step / steps
+        if grows and part >= GROWTH and len(state.x) < count:
+            engine.settle(state)
+            state = grow_to(state, photos[1], count)
+        if part >= options.coarse_share and not judged:
+            engine.settle(state)
+            after, judged = holdout_score(state, plan), True
+            if after <= before:
+                break
+        if not queue:
+            queue = rng.permutation(len(photos[0])).tolist()
+        error += (engine.step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
+        step += 1
+        if options.time_budget is not None and step == PROBE:
+            steps = affordable_steps(time.perf_counter() - started, plan)
+        if progress:
+            progress(step, steps, -10 * np.log10(max(error, 1e-12)), after)
+    engine.settle(state)
+    after = after if judged else holdout_score(state, plan)
+    if after <= before:
+        why = f"held-out parts of the photos were no better after {step} steps"
+        return gaussians, FitReport("none", False, step, before, after, why)
+    if grows:  # a time budget may end before the growth
+        state = grow_to(state, photos[1], count)
+    why = "time budget spent" if options.time_budget is not None else "all steps done"
+    return gaussians_of(state.x, state.splats.shN), FitReport("full", True, step, before, after, why)
+
+
+def affordable_steps(seconds: float, plan: Plan) -> int:
+    """Steps that fit into the time budget, from the time of the first PROBE ones at half size.
+
+    A step at full size costs up to three times as much.
+    """
+    budget, coarse = plan.options.time_budget, plan.options.coarse_share
+    assert budget is not None
+    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse))
+    return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

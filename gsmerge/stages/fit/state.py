@@ -1,0 +1,86 @@
+"""The optimiser's view of some Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
+from gsmerge.render import Splats
+from gsmerge.types import SH_C0, Gaussians
+
+
+@dataclass(eq=False)
+class State:
+    """Parameters under optimisation, and the arrays that they mean to the rasterizer.
+
+    Args:
+        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour.
+        x0: Where each began.
+        m: First moment.
+        v: Second moment.
+        units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales when it began.
+        shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
+        splats: Means, quaternions, scales and opacities as the rasterizer takes them.
+        colors: ``[n,3]`` base colours.
+    """
+
+    x: np.ndarray
+    x0: np.ndarray
+    m: np.ndarray
+    v: np.ndarray
+    units: np.ndarray
+    shares: np.ndarray
+    splats: Splats
+    colors: np.ndarray
+
+    def view_colors(self) -> np.ndarray | None:
+        """Colours for the rasterizer: as they are, or None: from the harmonics, which are brought up to date."""
+        if self.splats.shN.shape[1] == 0:
+            return self.colors
+        np.divide(self.colors[:, None] - np.float32(0.5), np.float32(SH_C0), out=self.splats.sh0)
+        return None
+
+
+def start_state(gaussians: Gaussians) -> State:
+    """A fresh state at some Gaussians."""
+    x = np.empty((len(gaussians), COLUMNS), np.float32)
+    opacities = gaussians.opacities.double().numpy().clip(0.004, 0.999)
+    x[:, :3] = gaussians.means.numpy()
+    x[:, SIZE:QUAT] = np.log(gaussians.scales.numpy().clip(1e-9))
+    x[:, QUAT:LOGIT] = gaussians.quats.numpy()
+    x[:, LOGIT] = np.log(opacities / (1 - opacities))
+    x[:, COLOR:] = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()
+    return state_of(x, gaussians.shN.numpy())
+
+
+def state_of(x: np.ndarray, shN: np.ndarray) -> State:
+    """A fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    sizes = np.sort(x[:, SIZE:QUAT], 1)
+    colors = np.ascontiguousarray(x[:, COLOR:])
+    splats = Splats(
+        means=np.ascontiguousarray(x[:, :3]),
+        quats=np.ascontiguousarray(x[:, QUAT:LOGIT]),
+        scales=np.exp(x[:, SIZE:QUAT]),
+        opacities=1 / (1 + np.exp(-x[:, LOGIT])),
+        sh0=(colors[:, None] - np.float32(0.5)) / np.float32(SH_C0),
+        shN=shN,
+        origin=np.zeros(3),
+    )
+    units = np.exp((sizes[:, 1] + sizes[:, 2]) / 2)
+    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, np.ones_like(units), splats, colors)
+
+
+def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
+    """The Gaussians that parameters ``[n,14]`` stand for."""
+    tensor = torch.from_numpy
+    return Gaussians(
+        means=tensor(x[:, :3].copy()),
+        quats=tensor(x[:, QUAT:LOGIT].copy()),
+        scales=tensor(np.exp(x[:, SIZE:QUAT])),
+        opacities=tensor(1 / (1 + np.exp(-x[:, LOGIT]))),
+        sh0=tensor((x[:, COLOR:] - 0.5) / SH_C0).float()[:, None],
+        shN=tensor(shN.copy()),
+    )

@@ -1,0 +1,115 @@
+"""feature gaussians -> matches: which Feature Gaussians of different views show the same piece of surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
+from gsmerge.networks import Learned, match_geometry
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import SH_C0, FeatureGaussians, Matches
+
+Method = Literal["overlap", "aabb", "none"]
+Geometry = Literal["analytic", "decoded"]
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """When two Feature Gaussians are taken for one.
+
+    Args:
+        match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes) and star clusters
+            that cannot chain. ``"aabb"``: the paper's box IoU and connected components. ``"none"``: no merging
+            across views. None: ``"overlap"``, but ``"none"`` for a draft.
+        effort: Of the whole run; ``"draft"`` matters here.
+        geometry: Of what is compared where networks are loaded: ``"analytic"``, that of the moments, or ``"decoded"``,
+            that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
+        overlap: Least overlap, 0 to 1.
+        max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
+        neighbors: Nearest neighbours in 3D that are looked at, the own view's included.
+        cluster_size: Most Feature Gaussians in a star cluster; None: as many as there are views (a cluster holds
+            one of each view at most).
+
+    Raises:
+        ValueError: If a setting is unknown or out of range.
+    """
+
+    match: Method | None = None
+    effort: str = "default"
+    geometry: Geometry = "analytic"
+    overlap: float = 0.7
+    max_color: float = 0.12
+    neighbors: int = 16
+    cluster_size: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.match not in (None, "overlap", "aabb", "none"):
+            raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
+        if self.geometry not in ("analytic", "decoded"):
+            raise ValueError(f'geometry: expected "analytic" or "decoded", got "{self.geometry}"')
+        if not 0 <= self.overlap <= 1:
+            raise ValueError(f"overlap: expected 0 to 1, got {self.overlap}")
+        if self.neighbors < 1:
+            raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
+        if self.cluster_size is not None and self.cluster_size < 1:
+            raise ValueError(f"cluster_size: expected at least 1, got {self.cluster_size}")
+
+    @property
+    def method(self) -> Method:
+        """How views are merged: as asked, otherwise by effort."""
+        return self.match or ("none" if self.effort == "draft" else "overlap")
+
+
+def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | None = None) -> Matches:
+    """Clusters of Feature Gaussians of different views.
+
+    The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
+    are taken by weight, ties by position. What is fully transparent is left alone.
+    """
+    if learned is not None and options.geometry == "decoded" and options.method != "none":
+        features = match_geometry(features, learned)
+    count = len(features)
+    clusters = np.full(count, -1, np.int64)
+    num_found = 0
+    if options.method != "none" and len(torch.unique(features.views)) > 1:
+        solid = features.extinctions > 0
+        for layer in (solid & ~features.backing, solid & features.backing):
+            rows = torch.nonzero(layer)[:, 0].numpy()
+            if len(rows) > 1:
+                found, num_layer = _clusters(features, rows, options)
+                clusters[rows] = num_found + found
+                num_found += num_layer
+    alone = np.flatnonzero(clusters < 0)
+    clusters[alone] = num_found + np.arange(len(alone))
+    return Matches(torch.from_numpy(clusters), num_found + len(alone))
+
+
+def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
+    """Cluster of each of some rows, and the number of clusters."""
+    means, views = features.means.double().numpy()[rows], features.views.numpy()[rows]
+    covars = features.covars.double().numpy()[rows].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    colors = SH_C0 * features.sh0[:, 0].double().numpy()[rows]
+    neighbors, boxes = _nearest(means, options.neighbors), options.method == "aabb"
+    scores = np.empty(neighbors.shape)
+    edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, views, options.max_color, boxes, scores)
+    if boxes:
+        return connected_components(neighbors, scores, options.overlap)
+    order = np.lexsort((*means.T, -features.weights.numpy()[rows]))
+    size = options.cluster_size or len(np.unique(views))
+    return leader_clusters(order, neighbors, scores, views, options.overlap, size)
+
+
+def _nearest(means: np.ndarray, count: int) -> np.ndarray:
+    """``[g,k]`` int64 nearest neighbours of each point, without itself; -1 where there are fewer."""
+    from scipy.spatial import cKDTree  # late: a quarter of a second that --match none does not need
+
+    k = min(count + 1, len(means))
+    with use_threads() as threads:
+        _, found = cKDTree(means).query(means, k=k, workers=threads)
+    found = found.astype(np.int64)
+    found[found == np.arange(len(means))[:, None]] = -1
+    return found

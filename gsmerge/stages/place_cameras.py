@@ -1,0 +1,128 @@
+"""Views of a scene that came without cameras: placed around it and inside it, where they show most of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians
+
+NUM_VIEWS = 24
+SAMPLES = 40_000  # Gaussians that candidates are judged by
+EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
+AROUND = 40  # directions from which the scene is looked at
+INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
+LOOKS = 8  # directions of a camera inside
+FIELD = 1.0  # width of the image over the focal length
+PROBE = 96  # pixels per side of the pictures that candidates are judged by
+SMALLEST, LARGEST = 96, 640  # pixels per side
+CLEAR = 0.02  # near plane, as a share of the scene's radius
+ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
+
+
+def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
+    """Cameras that see as much of the scene as possible.
+
+    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking everywhere.
+    They are taken one by one, each time the one that shows most opacity which none has shown so far, in pictures of a
+    sample of the Gaussians.
+
+    Args:
+        gaussians: n finite Gaussians.
+        num_views: Most cameras; fewer where all that can be seen is seen.
+
+    Returns:
+        Cameras of square images, the larger the more Gaussians there are.
+
+    Raises:
+        ValueError: If there is no Gaussian.
+    """
+    if len(gaussians) == 0:
+        raise ValueError("expected at least one Gaussian, got none")
+    sample = _sampled(gaussians)
+    centre, half = _extent(sample.means.double().numpy())
+    viewmats = _candidates(centre, half)
+    shares = _shares_seen(sample, viewmats, CLEAR * float(np.linalg.norm(half)))
+    chosen = _most_seen(shares, num_views)
+    size = int(np.clip(round(len(gaussians) ** 0.5), SMALLEST, LARGEST))
+    return Cameras(
+        torch.from_numpy(viewmats[chosen]), torch.from_numpy(_lens(size)).repeat(len(chosen), 1, 1), size, size
+    )
+
+
+def _lens(size: int) -> np.ndarray:
+    return np.array([[size / FIELD, 0, size / 2], [0, size / FIELD, size / 2], [0, 0, 1]])
+
+
+def _sampled(gaussians: Gaussians) -> Gaussians:
+    """Every so many-th Gaussian, larger so that they cover what all did."""
+    step = -(-len(gaussians) // SAMPLES)
+    few = gaussians[::step]
+    return Gaussians(few.means, few.quats, few.scales * step**0.5, few.opacities, few.sh0, few.shN)
+
+
+def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle ``[3]`` and half sides ``[3]`` of the box that most Gaussians are in."""
+    low, high = np.quantile(means, EXTENT, axis=0)
+    half = (high - low) / 2
+    widest = float(half.max()) if half.max() > 0 else 1.0
+    return (low + high) / 2, np.maximum(half, 1e-3 * widest)
+
+
+def _sphere(count: int) -> np.ndarray:
+    """``[count,3]`` directions spread evenly over the sphere (golden spiral)."""
+    i = np.arange(count) + 0.5
+    height, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * np.cos(turn), height, ring * np.sin(turn)], 1)
+
+
+def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """``[c,4,4]`` world to camera."""
+    radius = float(np.linalg.norm(half))
+    away = _sphere(AROUND)
+    distance = radius * (1 + 2 / FIELD) / 1.5  # the box fills the image
+    eyes, looks = [centre + distance * away], [-away]
+    grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
+    for place in grid:
+        eyes.append(np.broadcast_to(centre + place * half, (LOOKS, 3)))
+        looks.append(_sphere(LOOKS))
+    return np.stack([_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)])
+
+
+def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """World to camera, OpenCV axes."""
+    up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
+    x = np.cross(up, direction)
+    x /= np.linalg.norm(x)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([x, np.cross(direction, x), direction])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return viewmat
+
+
+def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.ndarray:
+    """``[c,n]`` float32 how much of each Gaussian's opacity each candidate shows."""
+    splats, K = prepare(sample), _lens(PROBE)
+
+    def one_view(viewmat: np.ndarray) -> np.ndarray:
+        sums, _ = contributions(plan_view(splats, viewmat, K, PROBE, PROBE, near=near))
+        return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
+
+    return np.stack(parallel_map(one_view, viewmats))
+
+
+def _most_seen(shares: np.ndarray, num_views: int) -> list[int]:
+    """Candidates, each the one that adds most to what is seen; at least one."""
+    seen = np.zeros(shares.shape[1], np.float32)
+    chosen: list[int] = []
+    for _ in range(num_views):
+        gains = np.maximum(shares - seen, 0).sum(1, dtype=np.float64)
+        best = int(gains.argmax())
+        if chosen and gains[best] <= 1e-3 * seen.sum(dtype=np.float64):
+            break
+        chosen.append(best)
+        np.maximum(seen, shares[best], out=seen)
+    return chosen

@@ -1,0 +1,240 @@
+"""Every rival method: its count, its order, and what defines it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import loose
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import CompactOptions, Gaussians, PixelScene, compact
+from gsmerge.baselines import BASELINES
+from gsmerge.baselines.contribution import summed_weights
+from gsmerge.cli.options import Method
+from gsmerge.errors import UsageError
+from gsmerge.options import METHODS
+from gsmerge.pipeline import CompactResult
+from gsmerge.stages.segment import grid_labels
+
+COUNT = 200
+KEEPERS = ("unmerged", "unmerged-color", "unmerged-fit")
+PRUNERS = ("opacity", "contribution", "random")
+EXACT = (*PRUNERS, "paper", "blocks", "greedy")
+OWN = sorted(set(BASELINES) - {"splat-transform"})  # which need no program
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
+
+
+def made(scene: PixelScene, method: str, **settings: Any) -> CompactResult:
+    """With a few steps of the fit for the one that has one."""
+    quick = {"fit_steps": 12} if method == "unmerged-fit" else {}
+    return compact(scene, method=method, **{"budget": COUNT, **quick, **settings})
+
+
+def rows_of(part: Gaussians, whole: Gaussians) -> list[int]:
+    """The rows of ``whole`` whose opacity and colour the rows of ``part`` have."""
+    keys = {tuple(row): i for i, row in enumerate(torch.cat([whole.opacities[:, None], whole.sh0[:, 0]], 1).tolist())}
+    return [keys[tuple(row)] for row in torch.cat([part.opacities[:, None], part.sh0[:, 0]], 1).tolist()]
+
+
+def test_one_list_of_methods() -> None:
+    assert ("gsmerge", *BASELINES) == METHODS
+    assert tuple(method.value for method in Method) == METHODS
+    assert all(name == baseline.name for name, baseline in BASELINES.items())
+
+
+def test_used_settings_exist() -> None:
+    known = set(CompactOptions().to_dict())
+    assert {setting for baseline in BASELINES.values() for setting in baseline.uses} - known == set()
+
+
+@pytest.mark.parametrize("method", EXACT)
+@pytest.mark.parametrize("count", [3, 100, 2000, 3 * 32 * 24])
+def test_budgets_are_met(scene: PixelScene, method: str, count: int) -> None:
+    result = made(scene, method, budget=count)
+    assert len(result.gaussians) == count
+    scenes.assert_invariants(result.gaussians, scene)
+    scenes.assert_consistent(result.report, scene, result.gaussians)
+
+
+@pytest.mark.parametrize("method", EXACT)
+def test_the_usual_count_without_a_budget(scene: PixelScene, method: str) -> None:
+    assert len(made(scene, method, budget=None, density=0.1).gaussians) == 3 * 76
+    assert len(made(scene, method, budget=None, density=0.1, k=2).gaussians) == 2 * 3 * 76
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_a_run_repeats_on_any_number_of_threads(scene: PixelScene, method: str) -> None:
+    one, other = (made(scene, method, threads=threads).gaussians for threads in (1, 3))
+    assert scenes.identical(one, other)
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_scenes_without_an_order(scene: PixelScene, method: str) -> None:
+    if method == "blocks":
+        with pytest.raises(UsageError, match="method blocks: expected one Gaussian per pixel, found them in no order"):
+            compact(loose.shuffled(scene), method=method)
+        return
+    result = compact(loose.shuffled(scene), method=method, budget=COUNT, fit_steps=4)
+    assert method in KEEPERS or len(result.gaussians) <= COUNT
+    assert len(result.gaussians) > COUNT / 2
+
+
+@pytest.mark.parametrize("method", ["unmerged", "opacity", "contribution", "voxel", "greedy"])
+def test_the_order_of_the_rows_does_not_matter(scene: PixelScene, method: str) -> None:
+    found = [compact(loose.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
+    scenes.assert_same_set(*found, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_rows_that_are_not_there_stay_out(scene: PixelScene, method: str) -> None:
+    valid = scene.valid.clone()
+    valid[:, :4] = False
+    gone = ~valid.reshape(-1)
+    means, opacities = scene.gaussians.means.clone(), scene.gaussians.opacities.clone()
+    opacities[gone], means[gone] = 0, 50.0
+    holed = replace(scene, gaussians=replace(scene.gaussians, means=means, opacities=opacities), valid=valid)
+    result = made(holed, method)
+    assert float(result.gaussians.means.abs().max()) < 10
+    assert len(result.gaussians) <= int(valid.sum())
+
+
+@pytest.mark.parametrize("method", ["unmerged-color", "unmerged-fit"])
+def test_photos_are_asked_for(scene: PixelScene, method: str) -> None:
+    with pytest.raises(UsageError, match=f"method {method}: expected photos, found none"):
+        made(replace(scene, images=None), method)
+
+
+@pytest.mark.parametrize("method", sorted(set(OWN) - {"unmerged-color", "unmerged-fit"}))
+def test_the_others_do_without_photos(scene: PixelScene, method: str) -> None:
+    result = made(replace(scene, images=None), method)
+    assert result.report.psnr_after is None
+    assert len(result.gaussians) > COUNT / 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [({"k": "auto"}, "k auto"), ({"levels": 2}, "levels"), ({"target_psnr": 20.0}, "target psnr"),
+     ({"max_drop": 0.2}, "max drop")],
+)  # fmt: skip
+def test_a_count_has_to_be_settled(settings: dict[str, Any], what: str) -> None:
+    with pytest.raises(ValueError, match=f"method voxel: expected a budget, a preset or a density, got {what}"):
+        CompactOptions().with_settings({"method": "voxel", **settings})
+
+
+def test_unknown_methods_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"method: expected one of gsmerge, unmerged, .*, got 'magic'"):
+        CompactOptions(method="magic")
+
+
+def test_settings_without_effect_are_told(scene: PixelScene) -> None:
+    assert made(scene, "voxel", seed=3, threads=1).report.notes == []
+    assert made(scene, "voxel", effort="best", match="none").report.notes == [
+        "method voxel does not look at effort, match"
+    ]
+    assert made(scene, "unmerged-fit", budget=None, effort="fast").report.notes == []
+    assert made(scene, "unmerged").report.notes == ["method unmerged does not look at budget"]
+
+
+def test_only_its_stages_are_timed(scene: PixelScene) -> None:
+    around = {"prepare", "score", "input"}
+    assert set(made(scene, "unmerged").report.seconds) == around
+    assert set(made(scene, "opacity").report.seconds) == around | {"reduce"}
+    assert set(made(scene, "paper").report.seconds) == around | {"segment", "encode", "decode"}
+    assert set(made(scene, "unmerged-color").report.seconds) == around | {"fit"}
+
+
+def test_unmerged_is_the_input(scene: PixelScene) -> None:
+    found = made(scene, "unmerged")
+    scenes.assert_same_set(found.gaussians, scene.gaussians, atol=1e-5)
+    assert found.report.psnr_after == pytest.approx(found.report.psnr_before, abs=1e-3)
+
+
+def test_colors_alone_are_solved(scene: PixelScene) -> None:
+    plain, solved = made(scene, "unmerged"), made(scene, "unmerged-color")
+    assert solved.report.choices["fit"]["method"] == "color"
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(plain.gaussians, name), getattr(solved.gaussians, name)), name
+    assert solved.report.psnr_after is not None
+    assert plain.report.psnr_after is not None
+    assert solved.report.psnr_after > plain.report.psnr_after + 1
+
+
+def test_the_same_fit_for_the_input(scene: PixelScene) -> None:
+    """By steps, or by time; whatever ``fit`` says."""
+    found = made(scene, "unmerged-fit", fit_steps=20, fit="color")
+    assert (found.report.choices["fit"]["method"], found.report.choices["fit"]["steps"]) == ("full", 20)
+    assert "method unmerged-fit does not look at fit, budget" in found.report.notes
+    limited = made(scene, "unmerged-fit", fit_steps=20, time_budget=1e-3).report.choices["fit"]
+    assert limited["steps"] < 20
+
+
+def test_the_most_opaque_stay(scene: PixelScene) -> None:
+    kept = rows_of(made(scene, "opacity").gaussians, scene.gaussians)
+    assert kept == sorted(kept)
+    left = np.setdiff1d(np.arange(len(scene.gaussians)), kept)
+    opacities = scene.gaussians.opacities.numpy()
+    assert opacities[kept].min() >= opacities[left].max()
+
+
+def test_the_first_of_equally_opaque_ones_stay(scene: PixelScene) -> None:
+    equal = replace(
+        scene, gaussians=replace(scene.gaussians, opacities=torch.full_like(scene.gaussians.opacities, 0.5))
+    )
+    assert torch.equal(made(equal, "opacity").gaussians.sh0, scene.gaussians.sh0[:COUNT])
+
+
+def test_those_that_show_most_stay(scene: PixelScene) -> None:
+    kept = rows_of(made(scene, "contribution").gaussians, scene.gaussians)
+    weights = summed_weights(scene.gaussians, scene.cameras)
+    left = np.setdiff1d(np.arange(len(weights)), kept)
+    assert weights[kept].min() >= weights[left].max() - 1e-3
+    alphas = scenes.images_of(scene.gaussians, scene.cameras)[1]
+    assert weights.sum() == pytest.approx(alphas.sum(), rel=1e-3)
+
+
+def test_the_seed_chooses(scene: PixelScene) -> None:
+    one, two = (rows_of(made(scene, "random", seed=seed).gaussians, scene.gaussians) for seed in (1, 2))
+    assert len(set(one)) == COUNT
+    assert one == sorted(one)
+    assert set(one) != set(two)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "count"),
+    [(24, 32, 66), (24, 32, 1), (24, 32, 768), (24, 32, 767), (1, 40, 7), (40, 1, 7), (5, 7, 11)],
+)
+def test_blocks_are_as_many_as_asked_for(height: int, width: int, count: int) -> None:
+    labels = grid_labels(height, width, count)
+    assert np.array_equal(np.unique(labels), np.arange(count))
+    for label in range(count):
+        ys, xs = np.nonzero(labels == label)
+        assert len(ys) == (np.ptp(ys) + 1) * (np.ptp(xs) + 1)  # a rectangle
+
+
+def test_blocks_are_about_equal() -> None:
+    sizes = np.bincount(grid_labels(240, 320, 300).reshape(-1))
+    assert sizes.max() < 1.5 * sizes.min()
+
+
+def test_one_gaussian_for_each_superpixel_has_their_mean_opacity() -> None:
+    """The paper's rule: the spread of the means, the mean opacity."""
+    flat = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.7, 0.7))
+    found = made(flat, "paper").gaussians
+    torch.testing.assert_close(found.opacities, torch.full((COUNT,), 0.7), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("method", OWN)
+def test_harmonics_are_kept(method: str, degree: int) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 24, 16), degree=degree)
+    found = made(scene, method, budget=50).gaussians
+    assert found.sh_degree == degree
+    assert degree == 0 or float(found.shN.abs().max()) > 0.01

@@ -1,0 +1,226 @@
+"""Encoding and decoding is compacting without a fit, to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import scenes
+from learned import noisy, written
+from loose import far_behind, shuffled, voxels
+
+import gsmerge
+from gsmerge import Encoded, Gaussians, PixelScene, UnalignedScene, compact, decode_scene, encode_scene
+from gsmerge.encoded.decode import plan_decode
+from gsmerge.errors import UsageError
+
+DENSITY = 0.1
+Scene = PixelScene | UnalignedScene
+
+
+@pytest.fixture(scope="module")
+def pixels() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4))
+
+
+@pytest.fixture(scope="module")
+def bare(pixels: PixelScene) -> PixelScene:
+    return replace(pixels, images=None)
+
+
+@pytest.fixture(scope="module")
+def encoded(pixels: PixelScene) -> Encoded:
+    return encode_scene(pixels, density=DENSITY)
+
+
+@pytest.fixture(scope="module")
+def encoded_bare(bare: PixelScene) -> Encoded:
+    return encode_scene(bare, density=DENSITY)
+
+
+def unfitted(scene: Scene, **settings: Any) -> Gaussians:
+    return compact(scene, **{"density": DENSITY, "fit": "none", **settings}).gaussians
+
+
+def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:
+    """What is decoded as it was encoded."""
+    found = decode_scene(encode_scene(scene, **{"density": DENSITY, **settings}))
+    assert scenes.identical(found, unfitted(scene, **settings))
+    assert len(found) > 10
+    return found
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 4])
+def test_one_encoding_gives_every_k(k: int, pixels: PixelScene, encoded: Encoded) -> None:
+    assert scenes.identical(decode_scene(encoded, k=k), unfitted(pixels, k=k))
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_one_encoding_gives_every_k_without_photos(k: int, bare: PixelScene, encoded_bare: Encoded) -> None:
+    assert encoded_bare.settings.prune == 0
+    assert scenes.identical(decode_scene(encoded_bare, k=k), unfitted(bare, k=k))
+
+
+def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene, encoded: Encoded) -> None:
+    found = decode_scene(encoded, k=4)
+    everything = replace(encoded, settings=replace(encoded.settings, prune=0.0))
+    assert len(found) < len(decode_scene(everything, k=4))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"budget": "5%"},
+        {"budget": 300, "k": 2},
+        {"max_bytes": "20KB"},
+        {"k": 8},
+        {"k": "auto"},
+        {"effort": "draft", "k": 2},
+        {"robust": False, "match": "aabb", "k": 2},
+        {"rule": "paper", "k": 2},
+        {"min_opacity": 0.3, "k": 2},
+        {"prune": 0.2},
+    ],
+    ids=str,
+)
+def test_the_same_settings_give_the_same_gaussians(settings: dict[str, Any], pixels: PixelScene) -> None:
+    assert_equal_to_compact(pixels, **settings)
+
+
+@pytest.mark.parametrize("settings", [{"budget": "6%"}, {"k": "auto"}, {"preset": "quest3", "k": 2}], ids=str)
+def test_the_same_without_photos(settings: dict[str, Any], bare: PixelScene) -> None:
+    assert_equal_to_compact(bare, **settings)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"k": 1}, {"k": 2}, {"k": 4}, {"budget": "7%"}, {"precision": "bfloat16"}], ids=str
+)
+def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: PixelScene, tmp_path: Path) -> None:
+    checkpoint = written(tmp_path / "networks.safetensors", noisy())
+    found = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
+    assert not scenes.identical(found, unfitted(pixels, **settings | {"precision": "float32"}))
+    kept = encode_scene(pixels, density=DENSITY, checkpoint=str(checkpoint), **settings)
+    checkpoint.unlink()
+    gsmerge.save_encoded(tmp_path / "scene.gsm", kept)
+    assert scenes.identical(decode_scene(gsmerge.load_encoded(tmp_path / "scene.gsm")), found)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_scenes_in_no_order(k: int, pixels: PixelScene) -> None:
+    loose = voxels(pixels, 0.05)
+    found = encode_scene(loose, density=0.2)
+    assert found.settings.places is not None
+    assert found.settings.most == 8
+    assert scenes.identical(decode_scene(found, k=k), unfitted(loose, k=k, density=0.2))
+
+
+def test_shuffled_rows_and_a_budget(pixels: PixelScene) -> None:
+    assert_equal_to_compact(shuffled(pixels), budget="4%")
+
+
+@pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"budget": "5%"}], ids=str)
+def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: PixelScene) -> None:
+    loose = shuffled(pixels)
+    hidden = far_behind(loose.gaussians, 200)
+    both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
+    found = encode_scene(both, density=DENSITY, unseen="keep", **settings)
+    assert found.num_kept > 0
+    assert scenes.identical(decode_scene(found), unfitted(both, unseen="keep", **settings))
+
+
+def test_a_budget_of_the_decoder_is_met_and_dealt_where_it_helps(encoded: Encoded) -> None:
+    groups = len(encoded)
+    counts = plan_decode(encoded, budget=groups + 50).counts
+    assert counts.sum() == groups + 50
+    more = plan_decode(encoded, budget=groups + 80).counts
+    assert (more >= counts).all()
+    share = plan_decode(encoded, budget="10%").counts.sum()
+    assert share == encoded.settings.num_input // 10
+
+
+def test_more_than_there_is_to_divide_is_told(encoded: Encoded) -> None:
+    plan = plan_decode(encoded, budget=encoded.settings.num_input)
+    assert plan.counts.sum() == encoded.num_most - encoded.num_kept
+    assert len(plan.notes) == 1
+    assert f"divide into {encoded.num_most} at most" in plan.notes[0]
+    assert len(decode_scene(encoded, budget=encoded.settings.num_input)) <= encoded.num_most
+
+
+def test_auto_takes_what_compact_would_without_photos(bare: PixelScene, encoded_bare: Encoded) -> None:
+    wanted = len(unfitted(bare, k="auto"))
+    assert encoded_bare.settings.knee == wanted
+    plan = plan_decode(encoded_bare, k="auto")
+    assert plan.counts.sum() == max(wanted, len(encoded_bare))
+    fewer = replace(encoded_bare, settings=replace(encoded_bare.settings, knee=len(encoded_bare) - 1))
+    plan = plan_decode(fewer, k="auto")
+    assert plan.counts.tolist() == [1] * len(encoded_bare)
+    assert "fewer than there are groups" in plan.notes[0]
+
+
+def test_auto_of_what_was_encoded_so(pixels: PixelScene) -> None:
+    found = encode_scene(pixels, density=DENSITY, k="auto")
+    assert scenes.identical(decode_scene(found), decode_scene(found, k="auto"))
+
+
+def test_the_result_does_not_depend_on_the_threads(pixels: PixelScene, encoded: Encoded) -> None:
+    one = decode_scene(encode_scene(pixels, density=DENSITY, threads=1), k=2, threads=1)
+    assert scenes.identical(one, decode_scene(encoded, k=2, threads=2))
+
+
+@pytest.mark.parametrize(
+    ("wish", "words"),
+    [
+        ({"k": 5}, 'k: expected 1 to 4 or "auto", as encoded'),
+        ({"k": 0}, "k: expected 1 to 4"),
+        ({"k": "many"}, "k: expected 1 to 4"),
+        ({"k": 2, "budget": 900}, "expected one of k and budget, got both"),
+        ({"budget": 10}, "one for each group, got 10; encode with that budget"),
+        ({"budget": "0%"}, "budget: expected at least one Gaussian"),
+        ({"budget": "some"}, "budget: expected a number"),
+    ],
+)
+def test_wishes_that_cannot_be_met(wish: dict[str, Any], words: str, encoded: Encoded) -> None:
+    with pytest.raises(UsageError, match=words):
+        decode_scene(encoded, **wish)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"fit": "full"}, "fit full: cannot be encoded"),
+        ({"fit": "color"}, "fit color: cannot be encoded"),
+        ({"method": "voxel"}, "method voxel: cannot be encoded"),
+        ({"levels": 2}, "levels: cannot be encoded"),
+        ({"max_drop": 0.1}, "max drop: cannot be encoded"),
+        ({"target_psnr": 20.0}, "target psnr: cannot be encoded"),
+        ({"max_k": 9}, "max k: expected 1 to 8, got 9"),
+        ({"max_k": 2, "k": 3}, "max k: expected at least 3, which is k, got 2"),
+    ],
+)
+def test_what_cannot_be_encoded(settings: dict[str, Any], words: str, pixels: PixelScene) -> None:
+    with pytest.raises(UsageError, match=words):
+        encode_scene(pixels, **settings)
+
+
+def test_a_budget_that_keeps_everything_needs_no_encoding(pixels: PixelScene) -> None:
+    with pytest.raises(UsageError, match="keeps every Gaussian"):
+        encode_scene(shuffled(pixels), budget="100%")
+
+
+def test_fewer_children_take_less_space(pixels: PixelScene, encoded: Encoded) -> None:
+    small = encode_scene(pixels, density=DENSITY, max_k=1)
+    assert len(small.division.children) == 0
+    assert scenes.identical(decode_scene(small), decode_scene(encoded, k=1))
+    with pytest.raises(UsageError, match="expected 1 to 1"):
+        decode_scene(small, k=2)
+
+
+def test_it_tells_where_it_comes_from(encoded: Encoded) -> None:
+    about = encoded.about
+    assert about["gsmerge"] == gsmerge.__version__
+    assert about["options"]["density"] == DENSITY
+    assert about["options"]["fit"] == "none"
+    assert "threads" not in about["options"]
+    assert about["choices"]["clusters"] <= about["choices"]["groups"]

@@ -1,0 +1,184 @@
+"""Evaluation: figures agree with scikit-image and with the metrics by hand, and say what they are of."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+import gsmerge
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate
+from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
+from gsmerge.report import to_json
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+
+PLAIN = EvaluateOptions(lpips=())
+
+
+def held_out(span: float = 2.0) -> Views:
+    made = scenes.make_scene(scenes.room(), scenes.arc(2, span=span, start=-0.3))
+    assert made.images is not None
+    return Views(made.cameras, made.images, ("a", "b"))
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
+
+
+@pytest.fixture(scope="module")
+def half(scene: PixelScene) -> Gaussians:
+    return scene.gaussians[::2]
+
+
+@pytest.fixture(scope="module")
+def found(scene: PixelScene, half: Gaussians) -> Evaluation:
+    return evaluate(scene, {"half": half}, held_out(), PLAIN)
+
+
+def test_figures_are_scikit_image_s(found: Evaluation, half: Gaussians) -> None:
+    views = held_out()
+    images = gsmerge.render(half, views.cameras).images.clamp(0, 1).numpy()
+    scores = [s for s in found.results[1].scores if s.split == "target"]
+    for score, image, photo in zip(scores, images, views.images.numpy(), strict=True):
+        assert score.full.psnr == pytest.approx(peak_signal_noise_ratio(photo, image, data_range=1), abs=1e-5)
+        expected = structural_similarity(photo, image, channel_axis=2, data_range=1)
+        assert score.full.ssim == pytest.approx(expected, abs=1e-5)
+
+
+def test_masked_figures_count_visible_pixels_alone(found: Evaluation) -> None:
+    targets = [s for s in found.results[0].scores if s.split == "target"]
+    assert 0.3 < targets[1].visible < 0.95
+    assert targets[1].masked.psnr is not None
+    assert targets[1].full.psnr is not None
+    assert targets[1].masked.psnr > targets[1].full.psnr + 3  # what nobody has seen is black
+    assert all(s.masked == s.full for s in found.results[0].scores if s.split == "context")
+
+
+def test_what_is_counted(found: Evaluation, scene: PixelScene, half: Gaussians) -> None:
+    assert [r.name for r in found.results] == [INPUT, "half"]
+    assert found.results[1].num_gaussians == len(half)
+    assert found.results[1].ratio == pytest.approx(len(half) / len(scene.gaussians))
+    assert found.num_views == {"context": 3, "target": 2}
+    assert found.reference == "photos"
+    assert found.notes == ()
+
+
+def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene, half: Gaussians) -> None:
+    found = evaluate(replace(scene, images=None), {"half": half}, None, PLAIN)
+    assert found.reference == "renders of the input"
+    assert all(math.isinf(s.full.psnr or 0) for s in found.results[0].scores)
+    assert all((s.full.psnr or 99) < 60 for s in found.results[1].scores)
+    assert "flatter" in found.notes[0]
+    document = json.loads(to_json(evaluation_document(found, {})))
+    assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
+
+
+def test_views_of_another_world_are_told(scene: PixelScene) -> None:
+    away = held_out()
+    viewmats = away.cameras.viewmats.clone()
+    viewmats[:, 0, 3] -= 50
+    away = replace(away, cameras=replace(away.cameras, viewmats=viewmats))
+    assert "of the same world?" in evaluate(scene, {}, away, PLAIN).notes[0]
+
+
+def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
+    loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+    found = evaluate(loose, {"half": half}, held_out(), PLAIN)
+    usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
+    for one, other in zip(found.results[1].scores, usual.results[1].scores, strict=True):
+        assert one.full == other.full
+        assert one.visible == pytest.approx(other.visible, abs=0.05)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+def test_units_change_nothing(factor: float, scene: PixelScene, half: Gaussians) -> None:
+    moved = scenes.move(scene, np.eye(3), factor, np.zeros(3))
+    small = scenes.move_gaussians(half, np.eye(3), factor, np.zeros(3))
+    found = evaluate(moved, {"half": small}, None, PLAIN)
+    usual = evaluate(scene, {"half": half}, None, PLAIN)
+    for one, other in zip(found.results[1].scores, usual.results[1].scores, strict=True):
+        assert one.full.psnr == pytest.approx(other.full.psnr, abs=0.05)
+
+
+def test_only_held_out_views(scene: PixelScene) -> None:
+    found = evaluate(scene, {}, held_out(), replace(PLAIN, context=False))
+    assert found.num_views == {"target": 2}
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_do_not_matter(threads: int, scene: PixelScene, half: Gaussians, found: Evaluation) -> None:
+    again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, threads=threads))
+    assert [r.scores for r in again.results] == [r.scores for r in found.results]
+
+
+def test_bad_arguments(scene: PixelScene, half: Gaussians) -> None:
+    with pytest.raises(ValueError, match="vgg or alex"):
+        EvaluateOptions(lpips=("squeeze",))
+    with pytest.raises(ValueError, match="at least 1"):
+        EvaluateOptions(lpips_views=0)
+    with pytest.raises(ValueError, match="other than 'input'"):
+        evaluate(scene, {INPUT: half}, None, PLAIN)
+    empty = UnalignedScene(half, scene.cameras[[]], None, ())
+    with pytest.raises(ValueError, match="a scene with views"):
+        evaluate(empty, {}, None, PLAIN)
+
+
+def test_csv_has_a_row_for_each_result_and_view(found: Evaluation) -> None:
+    document = evaluation_document(found, {"half": {"bytes": 12, "path": "half.ply"}})
+    rows = list(csv.DictReader(io.StringIO(evaluation_csv(document))))
+    assert tuple(rows[0]) == CSV_COLUMNS
+    assert len(rows) == 2 * 5
+    assert rows[-1]["result"] == "half"
+    assert float(rows[-1]["psnr"]) == found.results[1].scores[-1].full.psnr
+    assert rows[-1]["lpips_vgg"] == ""
+
+
+def test_table_for_people(found: Evaluation) -> None:
+    lines = evaluation_lines(evaluation_document(found, {"half": {"bytes": 1234}}))
+    assert lines[0].startswith("against photos")
+    assert len(lines) == 2 + 4
+    assert "1.2 kB" in lines[-1]
+    assert "LPIPS" not in lines[1]
+
+
+def test_progress_is_told(scene: PixelScene, half: Gaussians) -> None:
+    told: list[tuple[str, int, int]] = []
+    evaluate(scene, {"half": half}, None, PLAIN, progress=lambda *step: told.append(step))
+    assert told == [("evaluate", 1, 2), ("evaluate", 2, 2)]
+
+
+def test_pictures_too_small_for_ssim() -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 6, 5))
+    score = evaluate(scene, {}, None, PLAIN).results[0].scores[0]
+    assert score.full.ssim is None
+    assert score.full.psnr is not None
+
+
+def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = []
+    monkeypatch.setitem(evaluate.__globals__, "lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
+    score = evaluate(scene, {}, None, EvaluateOptions()).results[0].scores[0]
+    assert (score.full.lpips_vgg, score.full.lpips_alex) == (0.5, None)
+    assert looked == ["vgg"]
+
+
+def test_what_results_are_compared_with(scene: PixelScene) -> None:
+    bare = replace(scene, images=None)
+    assert evaluate(bare, {}, held_out(), PLAIN).reference == "photos, and renders of the input in its own views"
+    assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
+
+
+def test_means_leave_out_what_was_not_measured(found: Evaluation) -> None:
+    full, masked = found.results[1].mean("target")
+    scores = [s for s in found.results[1].scores if s.split == "target"]
+    assert full.psnr == pytest.approx(np.mean([s.full.psnr for s in scores]))
+    assert masked.lpips_vgg is None

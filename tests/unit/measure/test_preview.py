@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsmerge.measure import preview
+from gsmerge.types import Cameras, Gaussians
+
+
+def blob(color: float) -> Gaussians:
+    """One large opaque Gaussian two units in front of the camera."""
+    return Gaussians(
+        means=torch.tensor([[0.0, 0, 2]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), 5.0),
+        opacities=torch.tensor([0.95]),
+        sh0=torch.full((1, 1, 3), (color - 0.5) / 0.28209479),
+        shN=torch.zeros(1, 0, 3),
+    )
+
+
+def cameras(count: int) -> Cameras:
+    K = torch.tensor([[20.0, 0, 10], [0, 20, 6], [0, 0, 1]], dtype=torch.float64)
+    return Cameras(torch.eye(4, dtype=torch.float64).repeat(count, 1, 1), K.repeat(count, 1, 1), 20, 12)
+
+
+@pytest.mark.parametrize(
+    ("views", "most", "ids"), [(1, 4, [0]), (3, 4, [0, 1, 2]), (12, 4, [1, 4, 7, 10]), (5, 1, [2])]
+)
+def test_pick_views(views: int, most: int, ids: list[int]) -> None:
+    assert preview.pick_views(views, most) == ids
+
+
+def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
+    photos = torch.full((2, 12, 20, 3), 0.2)
+    sheet = preview.contact_sheet([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos, min_width=20)
+    tile_height, tile_width = 12 + preview.BAND, 20
+    assert sheet.shape == (2 * tile_height + preview.GAP, 3 * tile_width + 2 * preview.GAP, 3)
+    middle = preview.BAND + 6
+    columns = [tile_width // 2 + i * (tile_width + preview.GAP) for i in range(3)]
+    photo, dark, bright = (int(sheet[middle, x, 0]) for x in columns)
+    assert photo == 51
+    assert dark == pytest.approx(0.95 * 0.3 * 255, abs=4)
+    assert bright == pytest.approx(0.95 * 0.9 * 255, abs=4)
+
+
+def test_small_renders_are_enlarged_by_whole_pixels() -> None:
+    sheet = preview.contact_sheet([("one", blob(0.5))], cameras(1), min_width=50)
+    assert sheet.shape == (3 * 12 + preview.BAND, 3 * 20, 3)
+
+
+def test_labels_never_widen_a_tile() -> None:
+    picture = np.zeros((4, 30, 3), np.uint8)
+    assert preview.label(picture, "a label that is far too long for it").shape == (4 + preview.BAND, 30, 3)
+
+
+def test_draw_borders_marks_where_labels_change() -> None:
+    image, labels = torch.zeros(2, 4, 3), torch.tensor([[0, 0, 1, 1], [0, 0, 1, 1]])
+    drawn = preview.draw_borders(image, labels).any(-1)
+    assert drawn.tolist() == [[False, False, True, False]] * 2
+
+
+def test_draw_means() -> None:
+    image = torch.tensor([[0.0, 1.0, 0.2]])[..., None].expand(1, 3, 3)
+    drawn = preview.draw_means(image, torch.tensor([[0, 0, 1]]))
+    assert drawn[0, :, 0].tolist() == [128, 128, 51]
+
+
+def test_draw_heat_of_nothing_is_even() -> None:
+    assert len(np.unique(preview.draw_heat(torch.zeros(3, 4)).reshape(-1, 3), axis=0)) == 1
+
+
+def test_to_picture_clamps() -> None:
+    assert preview.to_picture(torch.tensor([[[-1.0, 0.5, 2.0]]])).tolist() == [[[0, 128, 255]]]

@@ -1,0 +1,90 @@
+"""The paper's visibility mask, against one loop over all samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge.measure import visibility
+from gsmerge.measure.speed import resized
+from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.types import Cameras, UnalignedScene
+from gsmerge.views import subset
+
+
+def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
+    mask = np.zeros((cameras.height, cameras.width), bool)
+    for point in points:
+        x, y, z = cameras.Ks[view].numpy() @ (cameras.viewmats[view].numpy() @ np.append(point, 1))[:3]
+        if z <= 0.01:
+            continue
+        column, row = int(np.floor(x / z)), int(np.floor(y / z))
+        if 0 <= column < cameras.width and 0 <= row < cameras.height:
+            mask[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = True
+    return mask
+
+
+@pytest.mark.parametrize("rows", [100, 1 << 18])
+def test_mask_is_that_of_the_slow_loop(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(visibility, "_ROWS", rows)
+    scene = scenes.make_scene(scenes.two_planes(), scenes.arc(2, 24, 18))
+    held_out = scenes.arc(3, 24, 18, span=3.0)
+    points = context_points(scene, 0.01)
+    masks = visible_pixels(points, held_out, 0.01)
+    for view in range(3):
+        assert np.array_equal(masks[view], slow_mask(points, held_out, view))
+    assert 0.2 < masks[0].mean() < 0.9
+
+
+@pytest.mark.parametrize("factor", [2, 3, 5, 8])
+def test_larger_pictures_have_no_gaps_between_samples(factor: int) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
+    points, cameras = context_points(scene, 0.01), scene.cameras
+    large = resized(cameras, factor * 24)
+    assert visible_pixels(points, large, 0.01, cameras).all()
+    assert not visible_pixels(points, large, 0.01).all() or factor < 4
+    small = resized(cameras, 12)
+    assert np.array_equal(visible_pixels(points, small, 0.01, cameras), visible_pixels(points, small, 0.01))
+
+
+def test_input_views_see_themselves_whole() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
+    assert visible_pixels(context_points(scene, 0.01), scene.cameras, 0.01).all()
+
+
+def test_pixels_without_a_gaussian_give_no_sample() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
+    valid = scene.valid.clone()
+    valid[0, :, 12:] = False
+    masks = visible_pixels(context_points(replace(scene, valid=valid), 0.01), scene.cameras, 0.01)
+    assert masks[0, :, :13].all()  # a column more than there are samples: every sample marks its neighbours
+    assert not masks[0, :, 13:].any()
+
+
+def test_what_lies_behind_the_camera_is_not_seen() -> None:
+    camera = scenes.arc(1, 24, 18)
+    behind = np.linalg.inv(camera.viewmats[0].numpy())[:3] @ np.array([0, 0, -2.0, 1.0])
+    assert not visible_pixels(behind[None], camera, 0.01).any()
+
+
+def test_a_scene_in_no_order_is_sampled_by_its_rendered_depth() -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.95, 0.99))
+    loose = UnalignedScene(scene.gaussians, scene.cameras, None, scene.names)
+    points = context_points(loose, 0.01)
+    assert len(points) > 0.9 * len(scene.gaussians)
+    assert np.abs(points[:, 2] - 3.0).max() < 0.1  # the wall is at z = 3
+    held_out = scenes.arc(1, 32, 24)
+    agree = visible_pixels(points, held_out, 0.01) == visible_pixels(context_points(scene, 0.01), held_out, 0.01)
+    assert agree.mean() > 0.98
+
+
+def test_far_scenes_are_seen_as_well() -> None:
+    shift = np.array([4e5, 5e6, 100.0])
+    here = scenes.make_scene(scenes.room(), scenes.arc(3, 24, 18, span=2.0))
+    there = scenes.move(here, np.eye(3), 1.0, shift)
+    masks = [visible_pixels(context_points(subset(s, [0]), 0.01), s.cameras, 0.01) for s in (here, there)]
+    assert (masks[0] == masks[1]).mean() > 0.999
+    assert 0.2 < masks[0][2].mean() < 0.98

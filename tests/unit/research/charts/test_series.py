@@ -1,0 +1,177 @@
+"""Which runs make a line, what it is called, and its means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from experiments import SCENES, make_grid, make_proxies, make_record
+
+from gsmerge.research.charts.figures import Bars, Curves, Payback, make_figures, make_verdicts
+from gsmerge.research.charts.series import (
+    best_part,
+    by_size,
+    by_views,
+    input_mean,
+    line_key,
+    line_names,
+    metrics_of,
+    newest,
+    score_of,
+    size_label,
+    usual_size,
+    usual_views,
+)
+
+PSNR = score_of("psnr", "target_visible")
+
+
+def test_lines_are_methods_with_their_settings() -> None:
+    lines = by_size(make_grid(), lambda r: r.ratio, PSNR)
+    assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "voxel", "random"]
+    assert [line.ours for line in lines] == [True, True, False, False]
+    assert [p.label for p in lines[0].points] == ["1%", "4.4%", "20%"]
+    point = lines[0].points[1]
+    assert point.x == pytest.approx(0.044)
+    assert point.y.mean == pytest.approx(np.mean([26, 24.01, 21.02]))
+    assert point.y.count == 3
+    assert point.y.high - point.y.low < 0.2  # the scenes' own level, 5 dB apart, is taken off
+
+
+def test_no_scene_counts_twice() -> None:
+    first, other = make_record("fern", "gsmerge", {"k": 2}), make_record("fox", "gsmerge", {"k": 2})
+    again = replace(first, key="another seed", psnr_target_visible=20.0)
+    few = replace(first, key="few", views_asked=3)
+    assert newest([first, other, again, few]) == ([again, other, few], [])
+    changed = replace(first, key="changed", scene_sha256="ff" * 32)
+    records, notes = newest([first, few, other, changed])
+    assert records == [other, changed]
+    assert len(notes) == 1
+    assert notes[0].startswith("fern: 2 run(s) left out")
+
+
+def test_names_tell_only_what_differs() -> None:
+    records = [
+        make_record("fern", "gsmerge", {"k": 2, "effort": "fast"}),
+        make_record("fern", "gsmerge", {"k": 2, "effort": "best", "segmentation": "slic"}),
+        make_record("fern", "voxel"),
+    ]
+    names = line_names([line_key(r) for r in records])
+    assert list(names.values()) == ["gsmerge, effort fast", "gsmerge, effort best, slic", "voxel"]
+    alone = line_names([line_key(records[0])])
+    assert list(alone.values()) == ["gsmerge, effort fast, K = 2"]
+
+
+def test_sizes_have_names() -> None:
+    sizes = [{"budget": "2%"}, {"budget": 40000}, {"density": 0.01}, {}]
+    told = [size_label(replace(make_record("fern", "gsmerge"), settings=settings)) for settings in sizes]
+    assert told == ["2%", "40,000", "density 0.01", ""]
+
+
+def test_means_are_over_the_same_scenes() -> None:
+    records = [
+        r for r in make_grid() if not (r.scene == "fox" and r.method == "voxel" and r.settings["budget"] == "1%")
+    ]
+    lines = by_size(records, lambda r: r.ratio, PSNR)
+    assert {frozenset(p.by_scene) for line in lines for p in line.points} == {frozenset({"apples", "fern"})}
+
+
+def test_one_bad_setting_does_not_cost_the_scenes_of_the_others() -> None:
+    records = [r for r in make_grid() if not (r.scene != "fern" and r.method == "random")]
+    lines = by_size(records, lambda r: r.ratio, PSNR)
+    assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "voxel"]
+    assert {len(p.by_scene) for line in lines for p in line.points} == {3}
+
+
+def test_usual_size_and_views() -> None:
+    assert usual_size(make_grid(("0.5%", "5%", "20%"), views=(None,))) == "5%"
+    assert usual_views(make_grid()) is None
+    assert usual_views(make_grid(views=(3, 6))) == 6
+    assert (usual_size([]), usual_views([])) == ("", None)
+
+
+def test_views_make_lines_where_there_are_several() -> None:
+    lines = by_views(make_grid(views=(None, 3, 6)), PSNR, with_input=True)
+    assert [line.name for line in lines] == ["gsmerge", "gsmerge, no fit", "input", "voxel", "random"]
+    assert [p.x for p in lines[0].points] == [3, 6, 12]
+    assert by_views(make_grid(views=(None,)), PSNR) == []
+
+
+def test_scenes_with_fewer_views_do_not_end_the_line() -> None:
+    records = [r for r in make_grid(views=(3, 6)) if r.views_asked == 3 or r.scene != "a"]
+    scenes = {r.scene for r in records}
+    lines = by_views(records, PSNR)
+    assert [[point.label for point in line.points] for line in lines] == [["3", "6"]] * len(lines) != []
+    assert all(set(point.by_scene) == scenes - {"a"} for line in lines for point in line.points)
+
+
+def test_parts_and_metrics() -> None:
+    records = make_grid()
+    assert best_part(records) == "target_visible"
+    assert metrics_of(records, "target_visible") == ["psnr", "ssim", "lpips_vgg"]
+    without = [replace(r, psnr_target_visible=None) for r in records]
+    assert best_part(without) == "context"
+    assert best_part(without[:2] + records[2:]) == "target_visible"  # nine of ten are enough
+    assert best_part([]) == "context"
+
+
+def test_the_input_is_a_level() -> None:
+    assert input_mean(make_grid(), PSNR, SCENES) == pytest.approx(18 + (2 + 0 - 3) / 3 + 0.01)
+    assert input_mean(make_grid(), PSNR, ["unknown"]) is None
+
+
+def test_all_figures() -> None:
+    figures = make_figures(make_grid(), make_proxies())
+    names = ["quality-seconds", "quality-ratio", "stages", "proxy", "count-views", "quality-views", "break-even"]
+    assert [figure.name for figure in figures] == names
+    assert all("3 scenes" in f.caption or "3 scene(s)" in f.caption for f in figures)
+    by_name = {figure.name: figure for figure in figures}
+    stages, payback, counts = by_name["stages"], by_name["break-even"], by_name["count-views"]
+    assert isinstance(stages, Bars)
+    assert stages.rows == ("gsmerge", "gsmerge, no fit", "voxel", "random")
+    assert stages.stages["fit"][0] == pytest.approx(4.8)
+    assert "score" not in stages.stages
+    assert isinstance(payback, Payback)
+    assert payback.rows[0][3] == pytest.approx(6 / 0.055)
+    assert isinstance(counts, Curves)
+    assert [line.name for line in counts.panels[0].lines] == ["gsmerge", "input"]  # all others meet the same budget
+
+
+def test_bars_and_break_even_are_over_the_same_scenes() -> None:
+    records = [r for r in make_grid() if not (r.scene == "fox" and r.method == "voxel")]
+    records = [r for r in records if not (r.scene != "fern" and r.method == "random")]
+    slow = [replace(r, seconds=100.0, stages={"fit": 100.0}) if r.scene == "fox" and r.seconds else r for r in records]
+    stages, payback = (f for f in make_figures(slow) if isinstance(f, Bars | Payback))
+    assert isinstance(stages, Bars)
+    assert isinstance(payback, Payback)
+    assert stages.rows == tuple(name for name, *_ in payback.rows) == ("gsmerge", "gsmerge, no fit", "voxel")
+    assert stages.stages["fit"][0] == pytest.approx(4.8)
+    assert payback.rows[0][1] == pytest.approx(6)
+
+
+def test_figures_need_their_data() -> None:
+    assert make_figures([]) == []
+    failed = [replace(r, error="out of memory") for r in make_grid()]
+    assert make_figures(failed) == []
+    alone = make_figures([make_record("fern", "gsmerge")])
+    assert [f.name for f in alone] == ["quality-seconds", "quality-ratio", "stages"]
+    assert "one scene has no intervals" in alone[0].caption
+
+
+def test_verdicts() -> None:
+    tables = make_verdicts(make_grid())
+    assert [t.title for t in tables[3:]] == [
+        "PSNR (dB) at equal size",
+        "SSIM at equal size",
+        "LPIPS (VGG) at equal size",
+    ]
+    assert [t.title.split(" at ")[1] for t in tables] == ["equal time"] * 3 + ["equal size"] * 3
+    assert {verdict.words for _, verdict in tables[0].rows} == {"ours has none so cheap"}
+    assert [label for label, _ in tables[3].rows] == ["1%", "4.4%", "20%"] * 2
+    for table in tables[3:]:
+        assert {verdict.words for _, verdict in table.rows} == {"ours above"}
+    voxel = tables[3].rows[1][1]
+    assert voxel.ahead is not None
+    assert voxel.ahead.mean == pytest.approx(7)
+    assert make_verdicts([r for r in make_grid() if r.method != "gsmerge"]) == []

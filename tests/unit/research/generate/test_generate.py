@@ -1,0 +1,144 @@
+"""Made scenes as folders: the same for the same seed, read back aligned, kept when they are there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gsmerge
+from gsmerge import PixelScene
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.geometry import project
+from gsmerge.io import load_scene, read_targets
+from gsmerge.render.metrics import psnr
+from gsmerge.research.generate import GenerateOptions, generate, make_scene
+from gsmerge.research.generate.styles import STYLES
+from gsmerge.runtime.threads import use_threads
+
+TINY = GenerateOptions(views=(3, 3), width=48, height=36)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One scene of every style. Read only."""
+    out = tmp_path_factory.mktemp("generated")
+    generate(out, len(STYLES), TINY, seed=0)
+    return out
+
+
+def test_the_folders_are_complete(folder: Path) -> None:
+    views = {f"{sub}images/view_00{i}.png" for sub, n in (("", 3), ("targets/", 2)) for i in range(n)}
+    files = {"scene.ply", "transforms.json", "targets/transforms.json", "generated.json"} | views
+    for index, style in enumerate(STYLES):
+        assert set(contents(folder / f"scene_{index:04d}")) == files
+        record = json.loads((folder / f"scene_{index:04d}" / "generated.json").read_text())
+        assert (record["style"], record["num_views"], record["num_gaussians"]) == (style, 3, 3 * 48 * 36)
+    assert len(list(folder.iterdir())) == len(STYLES)
+
+
+@pytest.mark.parametrize("index", range(len(STYLES)))
+def test_scenes_are_read_back_aligned(folder: Path, index: int) -> None:
+    load = load_scene(folder / f"scene_{index:04d}")
+    scene = load.scene
+    assert isinstance(scene, PixelScene)
+    assert load.notes == ()
+    assert bool(scene.valid.all())
+    pixels, depths = project(scene.gaussians.means, scene.cameras)
+    centres = torch.stack(torch.meshgrid(torch.arange(48) + 0.5, torch.arange(36) + 0.5, indexing="xy"), -1)
+    for view in range(3):
+        own = slice(view * 48 * 36, (view + 1) * 48 * 36)
+        assert float((pixels[view, own] - centres.reshape(-1, 2)).abs().max()) < 0.31
+        assert float(depths[view, own].min()) > 0
+
+
+def test_targets_look_at_the_same_scene(folder: Path) -> None:
+    """Renders of the Gaussians are nearer to the held-out photos than those photos are to one another's places."""
+    better = []
+    for index in range(len(STYLES)):
+        load = load_scene(folder / f"scene_{index:04d}")
+        targets = read_targets(load, folder / f"scene_{index:04d}" / "targets", None)
+        images = gsmerge.render(load.scene.gaussians, targets.cameras).images
+        own = np.mean([psnr(a, b) for a, b in zip(images, targets.images, strict=True)])
+        other = np.mean([psnr(a, b) for a, b in zip(images, targets.images.flip(0), strict=True)])
+        better.append(own > other + 1)
+    assert np.mean(better) >= 0.8
+
+
+def test_any_number_of_threads_makes_the_same_bytes(tmp_path: Path) -> None:
+    for threads in (1, 2):
+        generate(tmp_path / str(threads), 2, TINY, seed=4, threads=threads)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+    with use_threads(2):
+        alone = make_scene(4, 1, TINY)
+    scene = gsmerge.read_scene(tmp_path / "1" / "scene_0001")
+    np.testing.assert_allclose(alone.gaussians.means, scene.gaussians.means)
+
+
+def test_every_scene_is_different() -> None:
+    scenes = [make_scene(seed, index, TINY) for seed, index in ((0, 0), (0, 5), (5, 0))]
+    assert {scene.style for scene in scenes} == {"room"}
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert np.abs(np.array(scenes[a].images) - np.array(scenes[b].images)).mean() > 0.05
+
+
+def test_the_number_of_views_is_drawn_from_its_range() -> None:
+    options = GenerateOptions(views=(2, 4), width=16, height=16, style="desk", path="arc")
+    assert {len(make_scene(0, index, options).cameras) for index in range(12)} == {2, 3, 4}
+
+
+def test_what_is_there_is_kept_and_the_rest_added(folder: Path, tmp_path: Path) -> None:
+    generate(tmp_path, 1, TINY)
+    before = (tmp_path / "scene_0000" / "scene.ply").stat().st_mtime_ns
+    calls: list[tuple[int, int]] = []
+    found = generate(tmp_path, 2, TINY, progress=lambda done, total: calls.append((done, total)))
+    assert [scene.kept for scene in found] == [True, False]
+    assert (tmp_path / "scene_0000" / "scene.ply").stat().st_mtime_ns == before
+    assert calls[-1] == (2, 2)
+    assert contents(tmp_path / "scene_0001") == contents(folder / "scene_0001")
+
+
+def test_other_scenes_and_strangers_are_not_replaced(tmp_path: Path) -> None:
+    generate(tmp_path, 1, TINY)
+    before = contents(tmp_path)
+    with pytest.raises(UsageError, match="--overwrite"):
+        generate(tmp_path, 1, TINY, seed=5)
+    assert contents(tmp_path) == before
+    generate(tmp_path, 1, TINY, seed=5, overwrite=True)
+    assert contents(tmp_path) != before
+    stranger = tmp_path / "scene_0001"
+    stranger.mkdir()
+    (stranger / "thesis.txt").write_text("years of work")
+    with pytest.raises(UsageError, match="something else"):
+        generate(tmp_path, 2, TINY, seed=5, overwrite=True)
+    assert (stranger / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_damaged_record_is_no_scene(tmp_path: Path) -> None:
+    generate(tmp_path, 1, TINY)
+    (tmp_path / "scene_0000" / "generated.json").write_text("[")
+    with pytest.raises(UsageError, match="--overwrite"):
+        generate(tmp_path, 1, TINY)
+
+
+def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gsmerge.research.generate.writing.write_ply", full)
+    with pytest.raises(SceneError, match="No space left"):
+        generate(tmp_path, 1, TINY)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_counts_and_seeds_are_checked(tmp_path: Path) -> None:
+    for count, seed in ((0, 0), (1, -1)):
+        with pytest.raises(ValueError, match="expected at least 1 scene"):
+            generate(tmp_path, count, TINY, seed=seed)

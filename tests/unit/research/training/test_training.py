@@ -1,0 +1,294 @@
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from learned import noisy
+from scenes import arc, make_scene, room, two_planes
+from training_runs import OPTIONS, TINY
+
+import gsmerge
+from gsmerge.errors import SceneError
+from gsmerge.networks import Learned, NetworkOptions, Networks, load_checkpoint
+from gsmerge.networks.apply import encode_features, head_residuals, refine_features
+from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussians
+from gsmerge.research.training import (
+    Example,
+    TrainOptions,
+    make_example,
+    network_device,
+    preset_options,
+    read_config,
+    train,
+)
+from gsmerge.research.training.examples import differences
+from gsmerge.research.training.predict import Crop, owners, predicted, random_crop
+from gsmerge.research.training.subjects import Subject, make_subject
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.merge import merge
+from gsmerge.types import PixelScene
+
+
+class StoppedError(Exception):
+    """What a test interrupts a run with."""
+
+
+def scene(views: int = 3) -> PixelScene:
+    return make_scene(room(), arc(views, 32, 24))
+
+
+def subject() -> Subject:
+    return make_subject(scene(), range(3))
+
+
+@pytest.fixture(scope="module")
+def example() -> Example:
+    return make_example(subject(), OPTIONS, 0.1, "room")
+
+
+def files(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()}
+
+
+def test_targets_lead_from_the_start_to_the_fit(example: Example) -> None:
+    """Applying the targets gives what the fit gave."""
+    for k, level in example.levels.items():
+        assert len(level.children) == len(level.parents) == len(level.targets) == len(level.mask)
+        assert bool(level.mask.any())
+        assert bool(level.targets[level.mask].any(1).all())
+        assert not bool(level.targets[~level.mask].any())
+        assert int(torch.bincount(level.parents).max()) == k
+
+
+def test_differences_undo_corrections(example: Example) -> None:
+    start = example.levels[1].children
+    start = replace(start, opacities=start.opacities.clamp(0.1, 0.9))
+    raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
+    frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
+    frames = frames * torch.linalg.det(frames)[:, None, None]
+    wanted = bounded(raw, TINY.bounds, 0.5)
+    found = differences(start, move_gaussians(start, wanted, frames), frames)
+    torch.testing.assert_close(found, wanted, atol=2e-4, rtol=1e-3)
+
+
+def test_untrained_networks_predict_nothing(example: Example) -> None:
+    crop = random_crop(example, 40, 0.5, np.random.default_rng(0))
+    assert len(crop.rows) == 40
+    assert 0 < int(crop.judged.sum()) <= 20 * crop.k
+    assert not bool(predicted(crop, Networks(TINY), 0).any())
+
+
+def test_owners_are_the_rows_after_merging(example: Example) -> None:
+    found, merged = owners(example.matches), merge(example.features, example.matches)
+    torch.testing.assert_close(merged.means, example.centres)
+    weights = torch.zeros(len(merged)).index_add(0, found, example.features.weights)
+    torch.testing.assert_close(weights, merged.weights)
+    assert len(merged) < len(example.features)
+
+
+def test_what_is_trained_is_what_runs(example: Example) -> None:
+    """The corrections of a crop that holds everything are those that the stages make."""
+    networks = noisy(TINY)
+    learned = Learned(networks, example.members, example.cameras, 5)
+    everything = torch.arange(len(example.centres))
+    encoded = encode_features(example.features, learned)
+    refined = refine_features(merge(encoded, example.matches, learned), learned)
+    level = example.levels[2]
+    crop = Crop(example, 2, everything, torch.arange(len(level.children)), level.mask)
+    with torch.no_grad():
+        found = predicted(crop, networks, 5)
+    described = learned.describe(refined)
+    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, learned)
+    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
+    first = replace(crop, k=1, children=everything, judged=example.levels[1].mask)
+    with torch.no_grad():
+        total = predicted(first, networks, 5)
+    final = decode(refined, example.members, DecodeOptions(min_opacity=0), learned=learned)
+    start = example.levels[1].children
+    made = differences(start, final, learned.describe(merge(example.features, example.matches)).frames)
+    for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
+        told, real = total[:, columns].reshape(-1), made[:, columns].reshape(-1)
+        assert float(torch.corrcoef(torch.stack([told, real]))[0, 1]) > 0.8
+
+
+def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> None:
+    networks, level = noisy(TINY), example.levels[1]
+    rng = np.random.default_rng(3)
+    small = random_crop(replace(example, levels={1: level}), 60, 0.1, rng)
+    everything = torch.arange(len(level.children))
+    with torch.no_grad():
+        whole = predicted(Crop(example, 1, everything, everything, level.mask), networks, 0)
+        some = predicted(small, networks, 0)
+    torch.testing.assert_close(some[small.judged], whole[small.children][small.judged], atol=1e-5, rtol=1e-4)
+
+
+def test_training_lowers_the_loss(example: Example, tmp_path: Path) -> None:
+    options = replace(OPTIONS, steps=30, save_every=10)
+    done = train([example], [], tmp_path, options)
+    rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))
+    assert [int(row["step"]) for row in rows] == [10, 20, 30]
+    losses = [float(row["validation_loss"]) for row in rows]
+    assert losses[-1] < losses[0]
+    assert done.validation_loss == pytest.approx(min(losses))
+    assert float(rows[-1]["explained_color"]) > 0
+    best = load_checkpoint(done.best)
+    assert best.networks.options == TINY
+    assert best.training["data"] == [example.sha256]
+    assert best.training["options"] == options.to_dict()
+
+
+def test_a_trained_checkpoint_works(example: Example, tmp_path: Path) -> None:
+    done = train([example], [], tmp_path, replace(OPTIONS, steps=4))
+    chosen = {"fit": "none", "density": 0.1, "robust": False}
+    plain = gsmerge.compact(scene(), **chosen)
+    learned = gsmerge.compact(scene(), **chosen, checkpoint=str(done.last), require_checkpoint=True)
+    assert not torch.equal(plain.gaussians.means, learned.gaussians.means)
+    assert learned.report.choices["networks"]["training"]["step"] == 4
+
+
+def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(example: Example, tmp_path: Path) -> None:
+    train([example], [example], tmp_path / "whole", OPTIONS, threads=1)
+
+    def stop(step: int, *_: float) -> None:
+        if step in (6, 9):
+            stops.append(step)
+            raise StoppedError
+
+    stops: list[int] = []
+    with pytest.raises(StoppedError):
+        train([example], [example], tmp_path / "parts", OPTIONS, threads=4, progress=stop)
+    assert load_checkpoint(tmp_path / "parts" / "last.safetensors").training["step"] == 4
+    with pytest.raises(StoppedError):
+        train([example], [example], tmp_path / "parts", OPTIONS, threads=2, progress=stop)
+    done = train([example], [example], tmp_path / "parts", OPTIONS)
+    assert done.resumed == 4
+    assert stops == [6, 6]
+    assert files(tmp_path / "whole") == files(tmp_path / "parts")
+    again = train([example], [example], tmp_path / "parts", OPTIONS)
+    assert (again.resumed, again.step) == (12, 12)
+
+
+def test_another_run_is_not_gone_on_with(example: Example, tmp_path: Path) -> None:
+    train([example], [], tmp_path, replace(OPTIONS, steps=4))
+    with pytest.raises(SceneError, match="same options"):
+        train([example], [], tmp_path, replace(OPTIONS, steps=8))
+    with pytest.raises(SceneError, match="same data"):
+        train([replace(example, sha256="0")], [], tmp_path, replace(OPTIONS, steps=4))
+    with pytest.raises(ValueError, match="examples"):
+        train([], [], tmp_path)
+    (tmp_path / "state.safetensors").write_bytes(b"state")
+    with pytest.raises(SceneError, match="damaged"):
+        train([example], [], tmp_path, replace(OPTIONS, steps=4))
+
+
+def test_examples_are_kept_by_content(tmp_path: Path) -> None:
+    fits: list[int] = []
+
+    def told(step: int, _: int) -> None:
+        fits.append(step)
+
+    first = make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told)
+    assert len(fits) == 2 * OPTIONS.fit_steps
+    second = make_example(subject(), OPTIONS, 0.1, "b", tmp_path, told)
+    assert len(fits) == 2 * OPTIONS.fit_steps
+    assert first.sha256 == second.sha256
+    for k in OPTIONS.levels:
+        for f in fields(first.levels[k]):
+            a, b = getattr(first.levels[k], f.name), getattr(second.levels[k], f.name)
+            assert a.means.equal(b.means) if f.name == "children" else a.equal(b)
+    (kept,) = tmp_path.iterdir()
+    kept.write_bytes(kept.read_bytes()[:1000])
+    assert make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
+    assert len(fits) == 4 * OPTIONS.fit_steps
+    other = make_example(make_subject(make_scene(two_planes(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "c", tmp_path)
+    assert other.sha256 != first.sha256
+    sparse = make_example(subject(), OPTIONS, 0.05, "a", tmp_path)
+    assert len(sparse.features) < len(first.features)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_settings_are_checked(tmp_path: Path) -> None:
+    for wrong in (
+        {"steps": 0},
+        {"rate": -1.0},
+        {"levels": (3,)},
+        {"levels": ()},
+        {"densities": ()},
+        {"densities": (2,)},
+        {"match": "all"},
+        {"seed": 1.5},
+        {"views": ()},
+        {"views": (-1,)},
+        {"photo_start": 1.5},
+        {"novel": -0.1},
+        {"photo_scale": 0},
+        {"window": 5},
+        {"photo_loss": "l2"},
+        {"lpips_weight": -1},
+        {"teacher_steps": 0},
+    ):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            replace(OPTIONS, **wrong)  # type: ignore[arg-type]
+    assert TrainOptions.from_dict(json.loads(json.dumps(OPTIONS.to_dict()))) == OPTIONS
+    for values in ({"step": 3}, {"network": {"depth": 1}}, {"network": 3}):
+        with pytest.raises(ValueError, match=r"unknown|network"):
+            TrainOptions.from_dict(values)
+
+
+def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
+    paper, config = preset_options("paper"), tmp_path / "run.json"
+    assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
+    assert (paper.teacher_weight, paper.diversity_weight, paper.steps) == (0.25, 1, 300_000)
+    assert (paper.rate_at(1999), paper.photo_step, paper.clip) == (5e-5, 0, 10)
+    assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
+    assert preset_options("default") == TrainOptions()
+    config.write_text(json.dumps({"steps": 10, "network": {"width": 16}}))
+    changed = read_config(config, paper)
+    assert changed == replace(paper, steps=10, network=NetworkOptions(width=16))
+    assert read_config(config) == replace(TrainOptions(), steps=10, network=NetworkOptions(width=16))
+    with pytest.raises(ValueError, match="preset"):
+        preset_options("papers")
+
+
+def test_what_holds_the_gaussians_fades() -> None:
+    options = replace(
+        OPTIONS, steps=100, photo_start=0.2, regression_weight=0.8, teacher_weight=0.25, teacher_steps=10,
+        diversity_weight=1.0, diversity_steps=1000,
+    )  # fmt: skip
+    assert options.photo_step == 20
+    assert options.held_by(20) == (0.8, 0.25, 1)
+    assert options.held_by(25) == pytest.approx((0.75, 0.125, 0.995))
+    assert options.held_by(60) == pytest.approx((0.4, 0, 0.96))
+    assert replace(options, photo_start=1.0).photo_step == 100
+
+
+def test_rate_rises_and_falls() -> None:
+    rates = [replace(OPTIONS, steps=100, warmup=10).rate_at(step) for step in range(100)]
+    assert np.argmax(rates) in (9, 10)
+    assert rates[0] == pytest.approx(OPTIONS.rate / 10)
+    assert rates[-1] < 0.01 * OPTIONS.rate
+    assert (np.diff(rates[10:]) < 0).all()
+
+
+def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there, told in ((False, "cpu"), (True, "cuda")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        assert network_device("cpu") == "cpu"
+        assert network_device("auto") == told
+    assert network_device("cuda") == "cuda"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for wanted in ("cuda", "tpu"):
+        with pytest.raises(ValueError, match="device: expected"):
+            network_device(wanted)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_training_on_cuda(example: Example, tmp_path: Path) -> None:
+    on_cpu, on_cuda = (train([example], [], tmp_path / device, OPTIONS, device=device) for device in ("cpu", "cuda"))
+    assert on_cuda.loss == pytest.approx(on_cpu.loss, rel=0.05)
+    assert load_checkpoint(on_cuda.best).networks.num_parameters > 0

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import cv2
+import pytest
+import torch
+
+from gsmerge.runtime.threads import available_threads, in_turn, parallel_map, use_threads
+
+
+@pytest.fixture(autouse=True)
+def library_threads() -> Iterator[None]:
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    yield
+    assert (torch.get_num_threads(), cv2.getNumThreads()) == before
+
+
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_results_keep_the_order_of_the_items(count: int) -> None:
+    with use_threads(count):
+        assert parallel_map(lambda i: i * i, range(100)) == [i * i for i in range(100)]
+        assert parallel_map(str, iter([])) == []
+
+
+def test_one_pool_works_at_once() -> None:
+    barrier = threading.Barrier(3, timeout=30)  # breaks unless three threads wait together
+    with use_threads(3) as count:
+        assert count == 3
+        assert len(parallel_map(lambda _: barrier.wait(), range(3))) == 3
+
+
+def test_one_thread_is_the_callers() -> None:
+    with use_threads(1):
+        assert parallel_map(lambda _: threading.get_ident(), range(3)) == [threading.get_ident()] * 3
+
+
+def test_other_libraries_are_held_to_one_thread() -> None:
+    with use_threads(2):
+        assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
+
+
+def test_outer_block_wins() -> None:
+    with use_threads(3):
+        with use_threads(7) as count:
+            assert count == 3
+        with use_threads() as count:
+            assert count == 3
+
+
+def test_pool_threads_do_not_wait_for_their_own_pool() -> None:
+    def outer(i: int) -> list[int]:
+        return parallel_map(lambda j: 10 * i + j, range(3))
+
+    with use_threads(2):
+        assert parallel_map(outer, range(4)) == [[10 * i + j for j in range(3)] for i in range(4)]
+
+
+def test_errors_come_through_and_leave_the_pool_usable() -> None:
+    def fail(i: int) -> int:
+        if i == 1:
+            raise KeyError("one")
+        return i
+
+    with use_threads(2):
+        with pytest.raises(KeyError, match="one"):
+            parallel_map(fail, range(4))
+        assert parallel_map(abs, [-1, -2]) == [1, 2]
+    with pytest.raises(KeyError, match="one"), use_threads(2):
+        parallel_map(fail, range(4))
+
+
+def test_without_a_block_a_pool_is_made_for_the_call() -> None:
+    assert parallel_map(abs, [-1, -2, -3]) == [1, 2, 3]
+
+
+def test_two_callers_do_not_stop_each_other() -> None:
+    found: dict[int, list[int]] = {}
+
+    def caller(i: int) -> None:
+        with use_threads(2):
+            for _ in range(20):
+                found[i] = parallel_map(lambda j: i + j, range(10))
+
+    threads = [threading.Thread(target=caller, args=(i,)) for i in (0, 100)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert found == {0: list(range(10)), 100: list(range(100, 110))}
+
+
+def test_overlapping_blocks_give_the_libraries_their_threads_back() -> None:
+    """The first caller in is the first one out, while the second still works."""
+    inside, out = threading.Event(), threading.Event()
+
+    def second() -> None:
+        with use_threads(2):
+            inside.set()
+            out.wait(30)
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        thread = threading.Thread(target=second)
+        with use_threads(2):
+            thread.start()
+            assert inside.wait(30)
+        out.set()
+        thread.join(30)
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize("count", [0, -1])
+def test_no_threads_are_refused(count: int) -> None:
+    with pytest.raises(ValueError, match=f"expected at least 1 thread, got {count}"), use_threads(count):
+        pass
+
+
+def test_available_threads() -> None:
+    assert available_threads() >= 1
+
+
+@pytest.mark.parametrize("at_once", [1, 4, 100])
+def test_in_turn_gives_all_results_in_order_and_holds_few(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+    begun: list[int] = []
+
+    def work(i: int) -> int:
+        begun.append(i)
+        return i * i
+
+    monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
+    with use_threads(2):
+        for i, square in enumerate(in_turn(work, range(10))):
+            assert square == i * i
+            assert len(begun) <= at_once * (i // at_once + 1)
+    assert sorted(begun) == list(range(10))

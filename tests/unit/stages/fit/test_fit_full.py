@@ -1,0 +1,388 @@
+"""The full fit, on a tiny scene whose photos some known Gaussians made."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.render import plan_view, splat_adjoint
+from gsmerge.render.photos import Photos
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.fit import FitOptions, Rates, start_share
+from gsmerge.stages.fit import full as full_module
+from gsmerge.stages.fit.full import affordable_steps, first_look, fit_full, holdout_score, plan_run, step_sizes
+from gsmerge.stages.fit.state import start_state
+from gsmerge.types import SH_C0
+
+Pair = tuple[Photos, Photos]
+QUICK = FitOptions(fit_steps=30, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.self_made(0)[0]
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    return scenes.self_made(0)[1]
+
+
+@pytest.fixture(scope="module")
+def photos(scene: PixelScene) -> Pair:
+    return scenes.pair_of(scene)
+
+
+@pytest.fixture(scope="module")
+def noise(photos: Pair) -> Pair:
+    return scenes.noise_for(photos)
+
+
+# what it reaches
+
+
+def test_perturbed_scene_comes_back(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, photos, replace(LONG, dropout=0.0))
+    assert (report.method, report.accepted, report.steps) == ("full", True, 160)
+    assert report.holdout_after > report.holdout_before + 4
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
+    assert len(result) == len(start)
+    scenes.assert_invariants(result, scene)
+
+
+def test_view_between_gets_better(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+    """Not one of the photos."""
+    between = scenes.arc(1, 48, 36, start=-0.25)
+    wanted = scenes.images_of(truth, between)[0].clip(0, 1)
+
+    def score(gaussians: Gaussians) -> float:
+        image = scenes.images_of(gaussians, between)[0].clip(0, 1)
+        return float(-10 * np.log10(((image - wanted) ** 2).mean()))
+
+    start = scenes.spoil(truth)
+    assert score(fit_full(start, photos, LONG)[0]) > score(start) + 3
+
+
+@pytest.mark.parametrize("steps", [1, 12])
+def test_few_steps_help_already(truth: Gaussians, photos: Pair, steps: int) -> None:
+    start = scenes.spoil(truth)
+    _, report = fit_full(start, photos, replace(QUICK, fit_steps=steps))
+    assert report.steps == steps
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    if steps > 1:
+        assert report.accepted
+
+
+def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    result, _ = fit_full(start, photos, QUICK)
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        moved = (getattr(result, name) != getattr(start, name)).reshape(len(start), -1).any(1)
+        assert moved.float().mean() > 0.9, name
+
+
+def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
+    rates = Rates(reach_mean=0.5, reach_size=0.1, reach_logit=0.2)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, photos, replace(QUICK, rates=rates))
+    assert report.accepted
+    unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
+    assert ((result.means - start.means).norm(dim=1) <= 0.501 * unit).all()
+    assert float((result.scales / start.scales).log().abs().max()) <= 0.1001
+    logits = [g.opacities.double().logit() for g in (start, result)]
+    assert float((logits[1] - logits[0]).abs().max()) <= 0.2001
+
+
+def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
+    state, least = start_state(truth), QUICK.rates.reach_alone
+
+    def shares_of(some: Pair) -> np.ndarray:
+        plan = plan_run(some, QUICK, 0)
+        psnr, found = first_look(state, plan)
+        assert psnr == holdout_score(state, plan)
+        return found
+
+    def with_views(views: list[int]) -> Pair:
+        return tuple(Photos(p.images[views], p.viewmats[views], p.Ks[views], p.eps2d) for p in photos)  # type: ignore[return-value]
+
+    shares, alone = shares_of(photos), with_views([0])
+    assert shares.dtype == np.float32
+    assert shares.min() >= np.float32(least)
+    assert shares.max() == 1
+    np.testing.assert_array_equal(shares_of(alone), np.full(len(truth), least, np.float32))
+    whole = np.ones((alone[1].height, alone[1].width, 1))
+    shown = splat_adjoint(plan_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
+    np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
+
+
+def test_single_photo_moves_less(truth: Gaussians) -> None:
+    scene, _ = scenes.self_made(0, 1)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert report.accepted
+    rates = QUICK.rates
+    unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
+    assert ((result.means - start.means).norm(dim=1) <= 1.001 * rates.reach_alone * rates.reach_mean * unit).all()
+    assert float((result.scales / start.scales).log().abs().max()) <= 1.001 * rates.reach_alone * rates.reach_size
+
+
+@pytest.mark.parametrize(("name", "field"), [("opacity_pull", "opacities"), ("size_pull", "scales")])
+def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
+    start = scenes.spoil(truth)
+    free, pulled = (fit_full(start, photos, replace(QUICK, **{name: pull}))[0] for pull in (0.0, 0.05))
+    assert getattr(pulled, field).log().mean() < getattr(free, field).log().mean() - 0.02
+
+
+# counts
+
+
+@pytest.mark.parametrize("extra", [0, 1, 30, 70])
+def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, extra: int) -> None:
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, photos, LONG, count=len(start) + extra)
+    assert report.accepted
+    assert len(result) == len(start) + extra
+
+
+def test_more_than_double_is_grown_in_turns(truth: Gaussians, photos: Pair) -> None:
+    start = truth[::4]
+    result, report = fit_full(start, photos, LONG, count=3 * len(start) + 5)
+    assert report.accepted
+    assert len(result) == 3 * len(start) + 5
+
+
+def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    assert len(fit_full(start, photos, QUICK, count=2 * len(start))[0]) == len(start)
+    assert start_share(QUICK) == 1
+    assert start_share(replace(LONG, fit="color")) == 1
+    assert 0 < start_share(LONG) < 1
+
+
+def test_growing_pays(scene: PixelScene, photos: Pair) -> None:
+    """At the same final number, against nothing but the first ones."""
+    start = scenes.plain(scene, density=0.03)
+    start = replace(start, means=start.means.float())
+    alone, grown = (fit_full(start, photos, LONG, count=c * len(start))[0] for c in (1, 2))
+    assert scenes.psnr_of(grown, scene) > scenes.psnr_of(alone, scene) + 0.5
+
+
+# safety
+
+
+def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair) -> None:
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    result, report = fit_full(grey, noise, LONG, count=2 * len(grey))
+    assert (report.method, report.accepted) == ("none", False)
+    assert report.holdout_after <= report.holdout_before
+    assert result is grey
+    assert report.steps < 160  # judged before the steps that look at everything
+    assert "no better" in report.stopped
+
+
+def test_a_rival_is_what_the_fit_has_to_beat(truth: Gaussians, noise: Pair) -> None:
+    """Held-out blocks that the start shows too well to be bettered do not forbid a fit; those of a rival would."""
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    _, alone = fit_full(grey, noise, LONG)
+    black = replace(truth, sh0=torch.full_like(truth.sh0, -0.5 / SH_C0))
+    _, report = fit_full(grey, noise, LONG, rival=black)
+    assert not alone.accepted
+    assert alone.holdout_before - 2 > report.holdout_before  # of black
+    assert report.accepted
+    _, better = fit_full(black, noise, LONG, rival=grey)
+    assert better == fit_full(black, noise, LONG)[1]  # its own blocks are the worse ones
+
+
+def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    before = [getattr(start, name).clone() for name in scenes.FIELDS]
+    images = [p.images.copy() for p in photos]
+    fit_full(start, photos, QUICK)
+    assert all(torch.equal(getattr(start, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
+    for photo, image in zip(photos, images, strict=True):
+        np.testing.assert_array_equal(photo.images, image)
+
+
+def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
+    result, report = fit_full(truth, photos, LONG)
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    assert report.accepted or result is truth
+    found, wanted = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
+    assert np.abs(found - wanted).mean() < 0.01
+
+
+def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+    """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
+    options = replace(QUICK, coarse=1.0, dssim=0.0)
+    start = scenes.spoil(truth)
+    weights = plan_run(photos, options, seed=0).weights[1]
+    painted = photos[1].images.copy()
+    for image, weight in zip(painted, weights, strict=True):
+        image[weight == 0] = 1 - image[weight == 0]
+    one = run_steps(start, photos, options)
+    other = run_steps(start, (photos[0], replace(photos[1], images=painted)), options)
+    np.testing.assert_array_equal(one, other)
+
+
+def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.ndarray:
+    """The state after some steps, without a judge."""
+    rng, state, plan = np.random.default_rng(0), start_state(gaussians), plan_run(photos, options, 0)
+    for step in range(options.fit_steps):
+        full_module.fit_step(state, plan, step % len(photos[0]), step + 1, step / options.fit_steps, rng)
+    return state.x
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_unseen_ones_stay_as_they_are(degree: int) -> None:
+    """Outside all photos; also with colours that no photo has."""
+    scene, truth = scenes.self_made(degree)
+    behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=torch.full((4, 1, 3), 4.0))
+    start = Gaussians.concat([scenes.spoil(truth), behind])
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert report.accepted
+    for name in scenes.FIELDS:
+        torch.testing.assert_close(getattr(result, name)[-4:], getattr(behind, name), rtol=1e-5, atol=1e-6)
+
+
+# views, harmonics
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_few_views(views: int) -> None:
+    scene, truth = scenes.self_made(0, views)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert report.accepted
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 2
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_harmonics_keep_their_degree_and_values(degree: int) -> None:
+    scene, truth = scenes.self_made(degree)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert report.accepted
+    assert result.sh_degree == degree
+    assert torch.equal(result.shN, start.shN)
+    assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 2
+
+
+def test_harmonics_are_inherited_by_grown_ones() -> None:
+    scene, truth = scenes.self_made(1)
+    start = scenes.spoil(truth)
+    result, report = fit_full(start, scenes.pair_of(scene), LONG, count=len(start) + 20)
+    assert report.accepted
+    assert len(result) == len(start) + 20
+    assert torch.equal(result.shN[: len(start)], start.shN)
+    assert all((row == start.shN).all((1, 2)).any() for row in result.shN[len(start) :])
+
+
+# time
+
+
+def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
+    """Hardly any: a few steps, and still judged."""
+    result, report = fit_full(scenes.spoil(truth), photos, replace(LONG, time_budget=1e-6))
+    assert full_module.PROBE < report.steps <= full_module.PROBE + 1
+    assert report.accepted == (report.holdout_after > report.holdout_before)
+    if report.accepted:
+        assert report.stopped == "time budget spent"
+        assert len(result) == len(truth)
+
+
+def test_steps_follow_the_time_budget(photos: Pair) -> None:
+    def steps(budget: float, seconds: float) -> int:
+        return affordable_steps(seconds, plan_run(photos, replace(LONG, time_budget=budget), 0))
+
+    probe, most = full_module.PROBE, full_module.MAX_STEPS
+    assert steps(1e-9, 1.0) == probe + 1
+    assert steps(1e9, 1.0) == most
+    found = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
+    assert found == sorted(found)
+    assert found[0] > probe + 1
+    # a step of 10 ms at half size: 70 % of the steps at that, the rest at three times it
+    assert steps(1.0, 0.06) == pytest.approx(probe + (1.0 - 0.06) / (0.01 * (0.7 + 3 * 0.3)), abs=1)
+
+
+# rates, report, progress
+
+
+def test_rates_decay() -> None:
+    rates = Rates()
+    start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
+    wanted = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
+    np.testing.assert_allclose(start, wanted, rtol=1e-6)
+    np.testing.assert_allclose(end, rates.decay * start, rtol=1e-6)
+    assert rates.decay < 1
+    np.testing.assert_allclose(half**2, start * end, rtol=1e-6)
+
+
+def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
+    calls: list[tuple[int, int, float, float]] = []
+    _, report = fit_full(scenes.spoil(truth), photos, QUICK, progress=lambda *call: calls.append(call))
+    assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
+    assert calls[-1][2] > calls[0][2]  # of the photos
+    assert calls[0][3] == pytest.approx(report.holdout_before)
+    assert calls[-1][3] == pytest.approx(report.holdout_after)
+    assert np.isfinite(np.array(calls, float)).all()
+
+
+def test_score_is_that_of_the_half_size_blocks(truth: Gaussians, photos: Pair) -> None:
+    plan = plan_run(photos, QUICK, 0)
+    state = start_state(scenes.spoil(truth))
+    _, report = fit_full(scenes.spoil(truth), photos, QUICK)
+    assert holdout_score(state, plan) == report.holdout_before
+
+
+# the same again
+
+
+@pytest.mark.parametrize("settings", [{}, {"dropout": 0.2}, {"fit_steps": 160}], ids=str)
+def test_threads_change_no_bit(truth: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
+    start, found = scenes.spoil(truth), []
+    for threads in (1, 2, 8):
+        with use_threads(threads):
+            found.append(fit_full(start, photos, replace(QUICK, **settings), count=len(start) + 20, seed=3))
+    assert all(scenes.identical(a[0], b[0]) and a[1] == b[1] for a, b in itertools.pairwise(found))
+
+
+def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = fit_full(scenes.spoil(truth), photos, QUICK)
+    monkeypatch.setattr(full_module, "ROWS", 17)
+    assert scenes.identical(fit_full(scenes.spoil(truth), photos, QUICK)[0], one[0])
+
+
+def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    one, two, other = (fit_full(start, photos, QUICK, seed=seed) for seed in (5, 5, 6))
+    assert scenes.identical(one[0], two[0])
+    assert one[1] == two[1]
+    assert not scenes.identical(one[0], other[0])
+
+
+@pytest.mark.parametrize("size", [(8, 6), (5, 1), (1, 1)])
+def test_tiny_photos(size: tuple[int, int]) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
+    start = replace(scene.gaussians, means=scene.gaussians.means.float())
+    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    assert len(result) == len(start)
+    assert np.isfinite([report.holdout_before, report.holdout_after]).all()
+    for name in scenes.FIELDS:
+        assert torch.isfinite(getattr(result, name)).all()
+
+
+def test_longer_runs_end_with_smaller_steps() -> None:
+    rates = FitOptions().rates
+    usual, long = step_sizes(rates, 1.0, 300), step_sizes(rates, 1.0, 900)
+    np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
+    np.testing.assert_array_equal(step_sizes(rates, 0.0, 300), step_sizes(rates, 0.0, 900))
+    np.testing.assert_array_equal(step_sizes(rates, 1.0, 12), usual)

@@ -1,0 +1,132 @@
+"""The stage: what stays, and which fit is taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.render.photos import Photos
+from gsmerge.stages.fit import FitOptions, FitReport, fit
+from gsmerge.stages.fit.full import fit_full
+from gsmerge.stages.fit.stage import shown
+from gsmerge.types import SH_C0
+
+Pair = tuple[Photos, Photos]
+QUICK = FitOptions(fit_steps=30, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.self_made(0)[0]
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    return scenes.self_made(0)[1]
+
+
+@pytest.fixture(scope="module")
+def photos(scene: PixelScene) -> Pair:
+    return scenes.pair_of(scene)
+
+
+@pytest.fixture(scope="module")
+def noise(photos: Pair) -> Pair:
+    return scenes.noise_for(photos)
+
+
+def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
+    start = scenes.spoil(truth)
+    result, report = fit(start, photos, QUICK, seed=4)
+    wanted, own = fit_full(start, photos, QUICK, seed=4)
+    assert report == own
+    assert scenes.identical(result, wanted)
+
+
+def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the full fit is refused."""
+    refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
+    monkeypatch.setattr("gsmerge.stages.fit.stage.fit_full", lambda gaussians, *_: (gaussians, refused))
+    start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
+    result, report = fit(start, photos, QUICK)
+    assert report is not None
+    assert (report.method, report.accepted) == ("color", True)
+    colored, _ = fit(start, photos, replace(QUICK, fit="color"))
+    assert scenes.identical(result, colored)
+    assert torch.equal(result.means, start.means)
+    assert not torch.equal(result.sh0, start.sh0)
+
+
+def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
+    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    options = replace(LONG, pull=1e-6, iterations=60, huber=10.0)
+    result, report = fit(grey, noise, options, count=2 * len(grey))
+    assert report is not None
+    assert not report.accepted
+    assert scenes.identical(result, grey)
+
+
+def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None:
+    """Hidden ones go, those outside all photos stay, nothing else changes."""
+    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
+    behind = replace(truth[:3], means=truth.means[:3] - 100)
+    start = Gaussians.concat([opaque, hidden, behind])
+    result, report = fit(start, photos, replace(QUICK, fit="none"))
+    assert report is None
+    keep = shown(start, photos[1], QUICK.prune)
+    assert scenes.identical(result, start[keep])
+    assert not keep[-6:-3].any()
+    assert keep[-3:].all()
+    for hasty in ({"prune": 0.0}, {"effort": "draft"}):
+        assert scenes.identical(fit(start, photos, replace(QUICK, fit="none", **hasty))[0], start)
+
+
+def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
+    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
+    for method in ("color", "full"):
+        options = replace(QUICK, fit=method)  # type: ignore[arg-type]
+        alone, both = (fit(g, photos, options)[0] for g in (opaque, Gaussians.concat([opaque, hidden])))
+        assert len(both) == len(alone)
+
+
+@pytest.mark.parametrize("method", ["none", "color", "full"])
+def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
+    result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))  # type: ignore[arg-type]
+    assert len(result) == 0
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"fit": "best"}, {"fit_steps": 0}, {"time_budget": 0.0}, {"time_budget": -1.0}, {"dropout": 1.0},
+        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0}, {"opacity_pull": -1.0},
+        {"size_pull": -1.0},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(setting: dict[str, Any]) -> None:
+    (name,) = setting
+    with pytest.raises(ValueError, match=name):
+        FitOptions(**setting)
+
+
+def test_shown(photos: Pair) -> None:
+    """In sight, hidden behind an opaque sheet, and outside all photos."""
+    sheet = [[x, y, 2.0] for x in np.linspace(-2, 2, 41) for y in np.linspace(-2, 2, 41)]
+    means = torch.tensor([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]])
+    n = len(means)
+    made = Gaussians(
+        means, torch.tensor([1.0, 0, 0, 0]).expand(n, 4), torch.full((n, 3), 0.1), torch.full((n,), 0.99),
+        torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
+    )  # fmt: skip
+    made.scales[-3:] = 0.02
+    assert shown(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]

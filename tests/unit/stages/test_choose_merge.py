@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import PixelScene
+from gsmerge.moments import Members, feature_to_gaussians, principal_axes, scene_members
+from gsmerge.render.metrics import psnr
+from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.stages.backing import BackingOptions, encode_backing
+from gsmerge.stages.choose_merge import RobustOptions, choose_merge, close_holes, photo_psnr, weigh
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.merge import take
+from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.types import FeatureGaussians
+
+NAMES = ["plain", "wide", "wide+back", "plain+weigh", "plain+weigh+back", "wide+weigh", "wide+weigh+back"]
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.02)
+
+
+@pytest.fixture(scope="module")
+def members(scene: PixelScene) -> Members:
+    return scene_members(scene)
+
+
+@pytest.fixture(scope="module")
+def photos(scene: PixelScene) -> Photos:
+    return scene_photos(scene)
+
+
+@pytest.fixture(scope="module")
+def features(scene: PixelScene, members: Members) -> FeatureGaussians:
+    assert scene.images is not None
+    return encode(scene, members, segment(scene.images, SegmentOptions(), 150), EncodeOptions())
+
+
+@pytest.fixture(scope="module")
+def backing(scene: PixelScene, members: Members) -> FeatureGaussians:
+    assert scene.images is not None
+    return encode_backing(scene, members, segment(scene.images, SegmentOptions(), 12), BackingOptions())
+
+
+def test_best_score_wins(features: FeatureGaussians, backing: FeatureGaussians, photos: Photos) -> None:
+    found, choice = choose_merge(features, backing, photos, RobustOptions())
+    assert sorted(choice.scores) == sorted(NAMES)
+    assert choice.scores[choice.name] == max(choice.scores.values())
+    assert photo_psnr(found, photos, left_out=True) == pytest.approx(choice.scores[choice.name], abs=1e-9)
+    assert choice.scores["plain"] == pytest.approx(photo_psnr(features, photos, left_out=True), abs=1e-9)
+    assert bool(found.backing.any()) == choice.name.endswith("back")
+
+
+def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos: Photos, scene: PixelScene) -> None:
+    gaussians = feature_to_gaussians(features)
+    scores = []
+    for view in range(3):
+        image = scenes.images_of(gaussians[features.views != view], scene.cameras[view : view + 1])[0][0]
+        scores.append(psnr(np.clip(image, 0, 1), photos.images[view]))
+    assert photo_psnr(features, photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
+
+
+def test_many_views_are_judged_by_some(
+    features: FeatureGaussians, photos: Photos, scene: PixelScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each still without its own Gaussians."""
+    monkeypatch.setattr("gsmerge.views.MOST_JUDGED", 1)
+    others = feature_to_gaussians(features)[features.views != 1]
+    image = scenes.images_of(others, scene.cameras[1:2])[0][0]
+    expected = psnr(np.clip(image, 0, 1), photos.images[1])
+    assert photo_psnr(features, photos, left_out=True) == pytest.approx(expected, abs=0.01)
+
+
+def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
+    options = RobustOptions()
+    wrong = torch.arange(len(features)) % 10 == 0
+    sh0 = features.sh0.clone()
+    sh0[wrong] = -sh0[wrong] + 1.5
+    gains = weigh(replace(features, sh0=sh0), photos, options)
+    assert torch.isfinite(gains).all()
+    assert float(gains.min()) >= 0.05 * options.boost - 1e-6
+    assert float(gains.max()) <= options.boost + 1e-6
+    assert float(gains[wrong].median()) < 0.5 * float(gains[~wrong].median())
+
+
+def test_unseen_ones_keep_the_boost(features: FeatureGaussians, photos: Photos) -> None:
+    lost = replace(features, means=torch.cat([features.means[:5] - 100, features.means[5:]]))
+    assert weigh(lost, photos, RobustOptions())[:5].tolist() == pytest.approx([3.0] * 5)
+
+
+def test_backing_lies_behind_and_covers_the_image(
+    scene: PixelScene, features: FeatureGaussians, backing: FeatureGaussians
+) -> None:
+    options = BackingOptions()
+    assert backing.backing.all()
+    assert len(backing) == 36
+    eyes = scene.cameras.centres.float()
+    distance = (backing.means - eyes[backing.views]).norm(dim=1)
+    surface = scenes.trace(scenes.room(), scene.cameras)[1]
+    assert float(distance.min()) > (1 + options.push) * surface.min() * 0.95
+    gaussians = feature_to_gaussians(backing)
+    for view in range(3):
+        own = gaussians[backing.views == view]
+        assert scenes.images_of(own, scene.cameras[view : view + 1])[1].mean() > 0.65
+
+
+def test_backing_draws_no_curtain() -> None:
+    """Colours that cross a depth edge: the layer stays near the median depth of each superpixel."""
+    grey = scenes.flat(0.5, 0.5, 0.5)
+    surfaces = [scenes.plane(1.5, grey, right=0.0), scenes.plane(6.0, grey)]
+    edge = scenes.make_scene(surfaces, scenes.arc(1))
+    assert edge.images is not None
+    groups = segment(edge.images, SegmentOptions(), 6)
+    layer = encode_backing(edge, scene_members(edge), groups, BackingOptions(push=0.0))
+    thickness = principal_axes(layer.covars.double().numpy())[0][:, 0]
+    depths = layer.means[:, 2].double().numpy()
+    assert (thickness < 0.3 * depths).all()
+
+
+# one or two views, no backing layer
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_few_views_differ_in_spread_alone(scene: PixelScene, members: Members, views: int) -> None:
+    """Rendered from everything, since nothing can be left out."""
+    own = scenes.take_views(scene, list(range(views)))
+    assert own.images is not None
+    features = encode(own, scene_members(own), segment(own.images, SegmentOptions(), 150), EncodeOptions())
+    photos = scene_photos(own)
+    found, choice = choose_merge(features, None, photos, RobustOptions())
+    assert list(choice.scores) == ["plain", "wide", "wider"]
+    assert choice.scores[choice.name] == max(choice.scores.values())
+    power = list(choice.scores).index(choice.name)
+    torch.testing.assert_close(found.spreads, torch.full((len(features),), 1.2**power))
+    for name in ("means", "covars", "gains", "extinctions"):
+        assert torch.equal(getattr(found, name), getattr(features, name))
+    assert choice.scores["plain"] == pytest.approx(photo_psnr(features, photos, left_out=False), abs=1e-9)
+
+
+def test_without_a_backing_layer_no_candidate_has_one(features: FeatureGaussians, photos: Photos) -> None:
+    found, choice = choose_merge(features, None, photos, RobustOptions())
+    assert sorted(choice.scores) == sorted(name for name in NAMES if not name.endswith("back"))
+    assert not found.backing.any()
+
+
+def test_rendering_everything_shows_more(features: FeatureGaussians, photos: Photos, scene: PixelScene) -> None:
+    gaussians = feature_to_gaussians(features)
+    images = scenes.images_of(gaussians, scene.cameras)[0]
+    wanted = np.mean([psnr(np.clip(i, 0, 1), p) for i, p in zip(images, photos.images, strict=True)])
+    found = photo_psnr(features, photos, left_out=False)
+    assert found == pytest.approx(wanted, abs=0.01)
+    assert found > photo_psnr(features, photos, left_out=True)
+
+
+# holes after merging
+
+
+def test_holes_are_closed_by_what_shows_the_photos_best(
+    features: FeatureGaussians, backing: FeatureGaussians, photos: Photos
+) -> None:
+    """A thinned layer: every candidate is tried, and the best is taken."""
+    thin = take(features, torch.arange(0, len(features), 2))
+    found, choice = close_holes(thin, backing, photos, RobustOptions())
+    assert list(choice.scores) == ["as it is", "wide", "back", "wide+back"]
+    assert choice.scores[choice.name] == max(choice.scores.values())
+    assert choice.name != "as it is"
+    assert photo_psnr(found, photos, left_out=False) == pytest.approx(choice.scores[choice.name], abs=1e-9)
+    assert bool(found.backing.any()) == choice.name.endswith("back")
+
+
+def test_closed_layers_stay_as_they_are(features: FeatureGaussians, photos: Photos) -> None:
+    """Where nothing may be added, the very same Feature Gaussians come back."""
+    wide = replace(features, spreads=1.2 * features.spreads)
+    found, choice = close_holes(wide, None, photos, RobustOptions())
+    assert list(choice.scores) == ["as it is"]
+    assert found is wide
+
+
+def test_candidates_are_not_widened_or_backed_twice(
+    features: FeatureGaussians, backing: FeatureGaussians, photos: Photos
+) -> None:
+    options = RobustOptions()
+    wide = replace(features, spreads=1.2 * features.spreads)
+    backed = FeatureGaussians.concat([features, backing])
+    assert list(close_holes(wide, backing, photos, options)[1].scores) == ["as it is", "back"]
+    assert list(close_holes(backed, backing, photos, options)[1].scores) == ["as it is", "wide"]
+    both = FeatureGaussians.concat([wide, backing])
+    assert list(close_holes(both, backing, photos, options)[1].scores) == ["as it is"]
+    assert list(close_holes(backing, None, photos, options)[1].scores) == ["as it is"]

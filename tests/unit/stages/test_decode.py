@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import Gaussians, PixelScene
+from gsmerge.geometry import covariances
+from gsmerge.moments import Members, feature_to_gaussians, scene_members
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.merge import merge
+from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.types import FeatureGaussians, Groups, Matches
+
+COUNT = 8  # so that no superpixel has fewer than 8 pixels
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18), degree=1)
+
+
+@pytest.fixture(scope="module")
+def members(scene: PixelScene) -> Members:
+    return scene_members(scene)
+
+
+@pytest.fixture(scope="module")
+def features(scene: PixelScene, members: Members) -> FeatureGaussians:
+    assert scene.images is not None
+    groups = segment(scene.images, SegmentOptions(), COUNT)
+    return encode(scene, members, groups, EncodeOptions())
+
+
+def assert_alike(a: Gaussians, b: Gaussians) -> None:
+    for name in ("means", "opacities", "sh0", "shN"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-4, atol=1e-6, err_msg=name)
+    one, two = (covariances(g.quats.double(), g.scales.double()) for g in (a, b))
+    np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-9)
+
+
+def test_one_child_is_the_feature(features: FeatureGaussians, members: Members) -> None:
+    assert_alike(decode(features, members, DecodeOptions(k=1)), feature_to_gaussians(features))
+
+
+@pytest.mark.parametrize("k", [2, 3, 4, 8])
+def test_k_children(features: FeatureGaussians, members: Members, k: int) -> None:
+    assert len(decode(features, members, DecodeOptions(k=k))) == 2 * COUNT * k
+
+
+@pytest.mark.parametrize("k", [2, 4])
+def test_children_keep_the_groups_moments(features: FeatureGaussians, members: Members, k: int) -> None:
+    """Opacity, colour and place of a group's children average to the group's."""
+    children = decode(features, members, DecodeOptions(k=k, min_opacity=0))
+    depths = -torch.log1p(-children.opacities.double()) * children.scales.double().sort(1).values[:, 1:].prod(1)
+    assert len(children) == 2 * COUNT * k
+    np.testing.assert_allclose(depths.reshape(-1, k).sum(1), features.extinctions, rtol=0.1)
+    for name in ("means", "sh0"):
+        low, high = getattr(children, name).reshape(2 * COUNT, k, 3).aminmax(dim=1)
+        own = getattr(features, name).reshape(-1, 3)
+        assert (own >= low - 1e-5).all()
+        assert (own <= high + 1e-5).all()
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k: int) -> None:
+    """The paper's: members of one opacity have children of that opacity; the own rule makes them denser."""
+    assert scene.images is not None
+    even = replace(members, opacities=np.full_like(members.opacities, 0.5))
+    groups = segment(scene.images, SegmentOptions(), COUNT)
+    paper = encode(scene, even, groups, EncodeOptions("paper"))
+    found = decode(paper, even, DecodeOptions(k=k), rule="paper")
+    assert len(found) == 2 * COUNT * k
+    np.testing.assert_allclose(found.opacities, 0.5, rtol=1e-3)
+    if k > 1:
+        assert (decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).abs().max() > 0.1
+
+
+def test_auto_is_one_child(features: FeatureGaussians, members: Members) -> None:
+    assert DecodeOptions(k="auto").count == 1
+    assert_alike(decode(features, members, DecodeOptions(k="auto")), feature_to_gaussians(features))
+
+
+def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -> None:
+    same = Members(
+        *(np.repeat(getattr(members, n)[:1], 10, axis=0) for n in members.__dataclass_fields__ if n != "pixels")
+    )
+    one = scenes.make_features(same.means[:1], sizes=0.01)
+    one = replace(one, starts=torch.tensor([0, 10]), members=torch.arange(10), shN=torch.zeros(1, 3, 3))
+    assert len(decode(one, same, DecodeOptions(k=4))) == 1
+
+
+def test_single_members_stay_themselves(scene: PixelScene, members: Members) -> None:
+    """Every pixel its own superpixel: K changes nothing."""
+    labels = torch.arange(scene.pixels_per_view, dtype=torch.int32).reshape(1, 18, 24).expand(2, -1, -1)
+    features = encode(scene, members, Groups(labels, (432, 432)), EncodeOptions())
+    assert_alike(decode(features, members, DecodeOptions(k=4)), decode(features, members, DecodeOptions(k=1)))
+
+
+def test_gains_and_spreads_reach_the_children(features: FeatureGaussians, members: Members) -> None:
+    plain = decode(features, members, DecodeOptions(k=2, min_opacity=0))
+    stronger = replace(features, gains=2 * features.gains, spreads=1.5 * features.spreads)
+    changed = decode(stronger, members, DecodeOptions(k=2, min_opacity=0))
+    np.testing.assert_allclose(changed.scales, 1.5 * plain.scales, rtol=1e-5)
+    wanted = 1 - (1 - plain.opacities.double()) ** 2
+    np.testing.assert_allclose(changed.opacities, wanted.clamp(max=0.999), rtol=1e-4)
+
+
+def test_merged_features_are_split_again(features: FeatureGaussians, members: Members) -> None:
+    clusters = torch.arange(2 * COUNT) % COUNT  # each of view 0 with one of view 1
+    merged = merge(features, Matches(clusters, COUNT))
+    children = decode(merged, members, DecodeOptions(k=2, min_opacity=0))
+    assert len(children) == 2 * COUNT
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_backing_stays_at_one(features: FeatureGaussians, members: Members, k: int) -> None:
+    behind = replace(
+        features, backing=torch.ones(len(features), dtype=torch.bool), extinctions=2 * features.extinctions
+    )
+    both = FeatureGaussians.concat([features, behind])
+    found = decode(both, members, DecodeOptions(k=k, min_opacity=0))
+    assert len(found) == 2 * COUNT * (k + 1)
+    assert_alike(found[2 * COUNT * k :], feature_to_gaussians(behind))
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_only_backing(features: FeatureGaussians, members: Members, k: int) -> None:
+    behind = replace(features, backing=torch.ones(len(features), dtype=torch.bool))
+    assert len(decode(behind, members, DecodeOptions(k=k))) == 2 * COUNT
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_nothing(members: Members, k: int) -> None:
+    none = scenes.make_features(np.zeros((0, 3)), degree=1)
+    assert len(decode(none, members, DecodeOptions(k=k))) == 0
+
+
+@pytest.mark.parametrize("k", [1, 4])
+def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
+    opacities = scene.gaussians.opacities.clone()
+    opacities[: scene.pixels_per_view] = 0
+    half = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
+    own = scene_members(half)
+    assert half.images is not None
+    features = encode(half, own, segment(half.images, SegmentOptions(), COUNT), EncodeOptions())
+    assert len(features) == 2 * COUNT
+    found = decode(features, own, DecodeOptions(k=k))
+    assert len(found) == COUNT * k
+    assert (found.opacities >= 1 / 255).all()
+
+
+@pytest.mark.parametrize("k", [0, -1, 9])
+def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
+    with pytest.raises(ValueError, match=f'k: expected 1 to 8 or "auto", got {k}'):
+        decode(features, members, DecodeOptions(k=k))

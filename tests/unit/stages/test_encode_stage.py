@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import PixelScene
+from gsmerge.moments import feature_to_gaussians, scene_members
+from gsmerge.stages.encode import EncodeOptions, encode, group_rows
+from gsmerge.types import FeatureGaussians, Groups
+
+WIDTH, HEIGHT = 12, 8
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(2, WIDTH, HEIGHT), degree=1)
+
+
+@pytest.fixture(scope="module")
+def groups() -> Groups:
+    """Squares of four pixels."""
+    ys, xs = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    labels = (ys // 4 * (WIDTH // 4) + xs // 4).to(torch.int32)
+    return Groups(labels.expand(2, -1, -1).clone(), (6, 6))
+
+
+def encoded(scene: PixelScene, groups: Groups, rule: str = "depth") -> FeatureGaussians:
+    return encode(scene, scene_members(scene), groups, EncodeOptions(rule))  # type: ignore[arg-type]
+
+
+def test_rows_of_the_groups(scene: PixelScene, groups: Groups) -> None:
+    starts, ids, views = group_rows(scene, groups)
+    assert np.diff(starts).tolist() == [16] * 12
+    assert views.tolist() == [0] * 6 + [1] * 6
+    labels = groups.labels.reshape(-1).numpy()
+    for g in range(12):
+        own = ids[starts[g] : starts[g + 1]]
+        assert (labels[own] == g % 6).all()
+        assert (own // (WIDTH * HEIGHT) == g // 6).all()
+
+
+def test_invalid_pixels_are_left_out(scene: PixelScene, groups: Groups) -> None:
+    valid = scene.valid.clone()
+    valid[0, :4, :4] = False  # a whole superpixel
+    valid[1, 0, 0] = False
+    starts, ids, views = group_rows(replace(scene, valid=valid), groups)
+    assert np.diff(starts).tolist() == [16] * 5 + [15] + [16] * 5
+    assert views.tolist() == [0] * 5 + [1] * 6
+    assert valid.reshape(-1)[torch.from_numpy(ids)].all()
+    assert len(np.unique(ids)) == len(ids) == int(valid.sum())
+    features = encoded(replace(scene, valid=valid), groups)
+    assert len(features) == 11
+
+
+@pytest.mark.parametrize("rule", ["depth", "paper"])
+def test_no_valid_pixel(scene: PixelScene, groups: Groups, rule: str) -> None:
+    assert len(encoded(replace(scene, valid=torch.zeros_like(scene.valid)), groups, rule)) == 0
+
+
+def test_views_may_have_different_counts(scene: PixelScene, groups: Groups) -> None:
+    labels = groups.labels.clone()
+    labels[1] = 0
+    _, _, views = group_rows(scene, Groups(labels, (6, 1)))
+    assert views.tolist() == [0] * 6 + [1]
+
+
+def test_sums_add_up(scene: PixelScene, groups: Groups) -> None:
+    features = encoded(scene, groups)
+    assert len(features) == 12
+    assert float(features.weights.sum()) == pytest.approx(float(scene.gaussians.opacities.sum()), rel=1e-5)
+    scales = scene.gaussians.scales.double()
+    mass = (scene.gaussians.opacities * scales.prod(1)).sum() * (2 * np.pi) ** 1.5  # paper eq. mass
+    assert float(features.masses.sum()) == pytest.approx(float(mass), rel=1e-4)
+    largest = scales.sort(1).values[:, 1:].prod(1)
+    extinction = (-torch.log1p(-scene.gaussians.opacities.double()) * largest).sum()
+    assert float(features.extinctions.sum()) == pytest.approx(float(extinction), rel=1e-4)
+    assert torch.equal(features.gains, torch.ones(12))
+    assert torch.equal(features.spreads, torch.ones(12))
+    assert not features.backing.any()
+    assert features.shN.shape == (12, 3, 3)
+
+
+def test_paper_rule_is_moment_matching_with_the_mean_opacity(scene: PixelScene, groups: Groups) -> None:
+    features = encoded(scene, groups, "paper")
+    gaussians = feature_to_gaussians(features)
+    rows = group_rows(scene, groups)[1].reshape(12, 16)
+    members = scene.gaussians
+    for g, own in enumerate(torch.from_numpy(rows)):
+        weights = members.opacities[own].double() / members.opacities[own].double().sum()
+        mean = (weights[:, None] * members.means[own].double()).sum(0)
+        delta = members.means[own].double() - mean
+        covar = (weights[:, None, None] * delta[:, :, None] * delta[:, None]).sum(0)
+        floor = (0.1 * features.footprints[g].double()) ** 2 * torch.eye(3)
+        np.testing.assert_allclose(features.means[g], mean, atol=1e-5)
+        np.testing.assert_allclose(features.covars[g], covar + floor, rtol=1e-3, atol=1e-7)
+        assert float(gaussians.opacities[g]) == pytest.approx(float(members.opacities[own].mean()), rel=1e-4)
+
+
+def test_unknown_rule_is_refused(scene: PixelScene, groups: Groups) -> None:
+    with pytest.raises(ValueError, match="rule"):
+        encoded(scene, groups, "mean")

@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import make_features
+
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.types import FeatureGaussians
+
+METHODS = ["overlap", "aabb"]
+
+
+def sets(features: FeatureGaussians, **settings: object) -> set[frozenset[int]]:
+    found = match(features, MatchOptions(**settings))  # type: ignore[arg-type]
+    assert found.clusters.dtype == torch.int64
+    assert sorted(set(found.clusters.tolist())) == list(range(found.count))
+    clusters = found.clusters.numpy()
+    return {frozenset(np.nonzero(clusters == c)[0].tolist()) for c in range(found.count)}
+
+
+def alone(count: int) -> set[frozenset[int]]:
+    return {frozenset([i]) for i in range(count)}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_twins_of_two_views_match(method: str) -> None:
+    twins = make_features([[0, 0, 0], [0, 0, 1e-4], [1, 0, 0]])
+    assert sets(twins, match=method) == {frozenset([0, 1]), frozenset([2])}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_twins_of_one_view_do_not(method: str) -> None:
+    assert sets(make_features([[0, 0, 0], [0, 0, 0], [1, 0, 0]], views=[0, 0, 1]), match=method) == alone(3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_colours_must_agree(method: str) -> None:
+    means = np.zeros((2, 3))
+    near, far = (make_features(means, colors=np.array([[0.5, 0.5, 0.5], [0.5 + d, 0.5, 0.5]])) for d in (0.11, 0.13))
+    assert len(sets(near, match=method)) == 1
+    assert len(sets(far, match=method)) == 2
+
+
+def test_threshold_is_the_bhattacharyya_coefficient() -> None:
+    """Equal balls d standard deviations apart overlap by exp(-d^2 / 8)."""
+    pair = make_features([[0, 0, 0], [0.01, 0, 0]])
+    assert len(sets(pair, overlap=np.exp(-1 / 8) - 1e-3)) == 1
+    assert len(sets(pair, overlap=np.exp(-1 / 8) + 1e-3)) == 2
+
+
+def test_threshold_is_the_box_overlap() -> None:
+    """Boxes of 2 x 2 x 2, half a side apart: 4 shared of 12."""
+    pair = make_features([[0, 0, 0], [0.01, 0, 0]])
+    assert len(sets(pair, match="aabb", overlap=1 / 3 - 1e-3)) == 1
+    assert len(sets(pair, match="aabb", overlap=1 / 3 + 1e-3)) == 2
+
+
+def test_none_leaves_everything_alone() -> None:
+    assert sets(make_features(np.zeros((4, 3))), match="none") == alone(4)
+
+
+@pytest.mark.parametrize("method", [*METHODS, "none"])
+@pytest.mark.parametrize("count", [0, 1])
+def test_few(method: str, count: int) -> None:
+    assert sets(make_features(np.zeros((count, 3))), match=method) == alone(count)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_view_is_left_alone(method: str) -> None:
+    assert sets(make_features(np.zeros((5, 3)), views=[2] * 5), match=method) == alone(5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_backing_is_matched_by_itself(method: str) -> None:
+    features = make_features(np.zeros((4, 3)))
+    features = replace(features, backing=torch.tensor([False, True, False, True]))
+    assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1, 3])}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_transparent_ones_are_left_alone(method: str) -> None:
+    features = make_features(np.zeros((4, 3)), opacities=[0.8, 0.0, 0.8, 0.0])
+    assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1]), frozenset([3])}
+
+
+def test_as_many_to_a_cluster_as_there_are_views() -> None:
+    """Those of no view, merged before, count like any other."""
+    features = make_features(np.zeros((9, 3)), views=[-1, -1, -1, -1, -1, -1, 0, 1, 2])
+    assert sorted(map(len, sets(features))) == [1, 4, 4]
+
+
+def test_one_of_each_view() -> None:
+    features = make_features(np.zeros((6, 3)), views=[0, 1, 2, 0, 1, 2])
+    for cluster in sets(features, cluster_size=6):
+        assert len(cluster) == 3
+        assert len({i % 3 for i in cluster}) == 3
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_cluster_size_is_kept(size: int) -> None:
+    assert {len(c) for c in sets(make_features(np.zeros((6, 3))), cluster_size=size)} == {size}
+
+
+def test_heaviest_leads() -> None:
+    """A chain of three: the middle one takes both when it is the heaviest, else it goes to the heavier end."""
+    means = [[0, 0, 0], [0.012, 0, 0], [0.024, 0, 0]]
+    assert sets(make_features(means, opacities=[0.5, 0.9, 0.6])) == {frozenset([0, 1, 2])}
+    assert sets(make_features(means, opacities=[0.5, 0.2, 0.6])) == {frozenset([0]), frozenset([1, 2])}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_far_twins_are_found_among_many(method: str) -> None:
+    rng = np.random.default_rng(0)
+    means = rng.uniform(0, 10, (300, 3))
+    features = make_features(np.concatenate([means, means[::-1]]), views=[0] * 300 + [1] * 300)
+    assert sets(features, match=method) == {frozenset([i, 599 - i]) for i in range(300)}
+
+
+def test_unknown_method_is_refused() -> None:
+    with pytest.raises(ValueError, match='match: expected "overlap", "aabb" or "none", got "iou"'):
+        match(make_features(np.zeros((2, 3))), MatchOptions(match="iou"))  # type: ignore[arg-type]

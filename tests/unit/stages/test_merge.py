@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import make_features
+
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.stages.merge import merge, take
+from gsmerge.types import FeatureGaussians, Matches
+
+
+def matches(*clusters: int) -> Matches:
+    return Matches(torch.tensor(clusters, dtype=torch.int64), len(set(clusters)))
+
+
+def assert_equal(a: FeatureGaussians, b: FeatureGaussians) -> None:
+    for f in fields(FeatureGaussians):
+        assert torch.equal(getattr(a, f.name), getattr(b, f.name)), f.name
+
+
+def with_members(features: FeatureGaussians, sizes: list[int]) -> FeatureGaussians:
+    starts = torch.tensor([0, *np.cumsum(sizes).tolist()])
+    return replace(features, starts=starts, members=torch.arange(int(starts[-1])) + 100)
+
+
+def test_alone_pass_unchanged() -> None:
+    features = make_features(np.random.default_rng(0).normal(size=(4, 3)))
+    assert_equal(merge(features, matches(2, 0, 3, 1)), features)
+
+
+def test_no_features() -> None:
+    assert len(merge(make_features(np.zeros((0, 3))), Matches(torch.zeros(0, dtype=torch.int64), 0))) == 0
+
+
+def test_two_by_hand() -> None:
+    features = make_features([[0, 0, 0], [7, 7, 7], [4, 0, 0]], sizes=1.0, opacities=[0.6, 0.5, 0.2], degree=1)
+    features = replace(
+        with_members(features, [2, 1, 3]),
+        shN=torch.tensor([0.0, 5.0, 1.0])[:, None, None].expand(3, 3, 3),
+        spreads=torch.tensor([1.0, 1.0, 1.2]),
+    )
+    merged = merge(features, matches(0, 1, 0))
+    assert len(merged) == 2
+    assert_equal(take(merged, torch.tensor([0])), take(features, torch.tensor([1])))
+    np.testing.assert_allclose(merged.means[1], [1, 0, 0], atol=1e-6)  # weights 3 to 1
+    np.testing.assert_allclose(merged.covars[1], np.diag([4.0, 1, 1]), atol=1e-5)
+    np.testing.assert_allclose(merged.shN[1], 0.25)
+    assert float(merged.weights[1]) == pytest.approx(0.8)
+    assert float(merged.masses[1]) == pytest.approx(float(features.masses[[0, 2]].sum()))
+    assert float(merged.extinctions[1]) == pytest.approx(-np.log(0.4) - np.log(0.8), rel=1e-5)
+    assert float(merged.spreads[1]) == pytest.approx(1.2)
+    assert merged.views.tolist() == [1, -1]
+    assert merged.starts.tolist() == [0, 1, 6]
+    assert merged.members.tolist() == [102, 100, 101, 103, 104, 105]
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_stacked_ones_add_up_like_layers(count: int) -> None:
+    features = make_features(np.ones((count, 3)), opacities=np.linspace(0.1, 0.4, count))
+    merged = feature_to_gaussians(merge(features, matches(*[0] * count)))
+    assert float(merged.opacities[0]) == pytest.approx(1 - np.prod(1 - np.linspace(0.1, 0.4, count)), rel=1e-4)
+    np.testing.assert_allclose(merged.scales, 0.01, rtol=1e-4)
+
+
+def test_gains_weigh_and_carry_over() -> None:
+    """A Gaussian that the photos distrust counts less in the mean; gained optical depths add up."""
+    features = make_features([[0, 0, 0], [1, 0, 0]], opacities=0.5)
+    features = replace(features, gains=torch.tensor([3.0, 1.0]))
+    merged = merge(features, matches(0, 0))
+    np.testing.assert_allclose(merged.means[0], [0.25, 0, 0], atol=1e-6)
+    gained = (features.extinctions * features.gains).sum()
+    assert float(merged.extinctions[0] * merged.gains[0]) == pytest.approx(float(gained), rel=1e-5)
+
+
+def test_transparent_ones_merge_without_nan() -> None:
+    features = make_features([[0, 0, 0], [1, 0, 0]], opacities=0.0)
+    merged = merge(features, matches(0, 0))
+    for f in fields(FeatureGaussians):
+        assert torch.isfinite(getattr(merged, f.name).double()).all(), f.name
+    np.testing.assert_allclose(merged.means[0], [0.5, 0, 0], atol=1e-6)
+    assert feature_to_gaussians(merged).opacities.tolist() == [0]
+
+
+def test_far_from_the_origin_nothing_cancels() -> None:
+    features = make_features(np.array([[0, 0, 0], [0.02, 0, 0]]) + 1000.0, opacities=0.5)
+    merged = merge(features, matches(0, 0))
+    apart = float(features.means[1, 0] - features.means[0, 0])
+    np.testing.assert_allclose(np.diag(merged.covars[0]), [1e-4 + (apart / 2) ** 2, 1e-4, 1e-4], rtol=1e-3)
+
+
+def test_backing_stays_backing() -> None:
+    features = replace(make_features(np.zeros((3, 3))), backing=torch.tensor([False, True, False]))
+    assert merge(features, matches(0, 1, 0)).backing.tolist() == [True, False]
+
+
+def test_merged_backing_is_backing() -> None:
+    features = replace(make_features(np.zeros((5, 3))), backing=torch.tensor([True, False, True, False, True]))
+    merged = merge(features, matches(0, 1, 0, 1, 2))
+    assert merged.backing.tolist() == [True, True, False]
+    assert merged.views.tolist() == [4, -1, -1]
+
+
+def test_every_member_once_whatever_the_clusters() -> None:
+    rng = np.random.default_rng(0)
+    sizes = rng.integers(1, 5, 40).tolist()
+    features = with_members(make_features(rng.normal(size=(40, 3))), sizes)
+    labels = np.unique(rng.integers(0, 25, 40), return_inverse=True)[1]
+    found = Matches(torch.from_numpy(labels.reshape(-1)), int(labels.max()) + 1)
+    merged = merge(features, found)
+    assert len(merged) == found.count
+    assert sorted(merged.members.tolist()) == features.members.tolist()
+    assert float(merged.extinctions.sum()) == pytest.approx(float(features.extinctions.sum()), rel=1e-5)
+    assert float(merged.masses.sum()) == pytest.approx(float(features.masses.sum()), rel=1e-5)
+
+
+def test_take_brings_the_members() -> None:
+    features = with_members(make_features(np.eye(3)), [1, 2, 3])
+    taken = take(features, torch.tensor([2, 0]))
+    assert taken.starts.tolist() == [0, 3, 4]
+    assert taken.members.tolist() == [103, 104, 105, 100]
+    assert taken.means.tolist() == features.means[[2, 0]].tolist()
+    assert len(take(features, torch.zeros(0, dtype=torch.int64))) == 0

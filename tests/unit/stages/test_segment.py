@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density
+from gsmerge.stages.segment import SEGMENTATIONS, SegmentOptions, count_for, saliency, segment, superpixels
+
+
+def random_image(height: int, width: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((height, width, 3), dtype=np.float32)
+
+
+def test_two_colours_part_where_they_meet() -> None:
+    image = np.zeros((12, 17, 3))
+    image[:, 7:] = 1
+    labels = superpixels(image, 2).numpy()
+    assert len(np.unique(labels[:, :7])) == 1
+    assert len(np.unique(labels[:, 7:])) == 1
+    assert labels[0, 0] != labels[0, 16]
+
+
+def test_detail_gets_the_superpixels() -> None:
+    image = np.full((64, 64, 3), 0.5)
+    image[:, 32:] = random_image(64, 32)
+    for segmentation in ("rdseg", "bass-st"):
+        labels = superpixels(image, 200, segmentation)
+        assert len(labels[:, 34:].unique()) > 2 * len(labels[:, :30].unique()), segmentation
+
+
+def test_as_many_superpixels_as_pixels() -> None:
+    labels = superpixels(random_image(4, 5), 20)
+    assert sorted(labels.reshape(-1).tolist()) == list(range(20))
+
+
+def test_bytes_and_floats_are_the_same_picture() -> None:
+    image = (random_image(20, 30) * 255).astype(np.uint8)
+    expected = superpixels(image, 40)
+    assert torch.equal(superpixels(torch.from_numpy(image), 40), expected)
+    assert torch.equal(superpixels(image / 255.0, 40), expected)
+    assert torch.equal(superpixels(np.asfortranarray(image), 40), expected)
+    assert expected.dtype == torch.int32
+
+
+@pytest.mark.parametrize("segmentation", SEGMENTATIONS)
+def test_count_is_checked(segmentation: str) -> None:
+    image = random_image(4, 5)
+    with pytest.raises(ValueError, match=r"expected at most 20 superpixels \(5 x 4 pixels\), got 21"):
+        superpixels(image, 21, segmentation)
+    with pytest.raises(ValueError, match="expected at least 1 superpixel, got 0"):
+        superpixels(image, 0, segmentation)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 4)), r"expected shape \[h, w, 3\], got \[4, 4\]"),
+        (np.zeros((4, 4, 4)), r"got \[4, 4, 4\]"),
+        (np.zeros((0, 4, 3)), r"got \[0, 4, 3\]"),
+        (np.full((4, 4, 3), 255.0), r"expected values in \[0, 1\], got 255 to 255"),
+        (np.full((4, 4, 3), np.nan), r"expected values in \[0, 1\], got nan"),
+        (np.full((4, 4, 3), np.inf), r"expected values in \[0, 1\], got inf"),
+        (np.zeros((4, 4, 3), np.int64), "expected uint8 or float, got int64"),
+    ],
+)
+def test_image_is_checked(image: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        superpixels(image, 2)
+    with pytest.raises(ValueError, match=message):
+        saliency(image)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"segmentation": "watershed"},
+            "segmentation: expected one of rdseg, bass, bass-st, slic, grid, got 'watershed'",
+        ),
+        ({"effort": "slow"}, "effort: expected one of draft, fast, default, best, got 'slow'"),
+        ({"compactness": -1.0}, r"compactness: expected a number in \[0, 1\], got -1.0"),
+        ({"compactness": float("nan")}, "compactness: expected a number"),
+    ],
+)
+def test_options_are_checked(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        superpixels(random_image(4, 4), 2, **options)
+    with pytest.raises(ValueError, match=message):
+        SegmentOptions(**options)
+
+
+def test_counts_of_options() -> None:
+    assert count_for(SegmentOptions(superpixels=7), 100, 100) == 7
+    assert count_for(SegmentOptions(density=0.05), 20, 30) == 30
+    assert count_for(SegmentOptions(density=0.001), 5, 5) == 1
+    with pytest.raises(ValueError, match="superpixels: expected at least 1, got 0"):
+        SegmentOptions(superpixels=0)
+    with pytest.raises(ValueError, match=r"density: expected a number in \(0, 1\], got 0"):
+        SegmentOptions(density=0)
+
+
+def test_segment_treats_each_view_alone() -> None:
+    images = torch.from_numpy(np.stack([random_image(16, 24, seed) for seed in range(3)]))
+    groups = segment(images, SegmentOptions(density=0.1))
+    assert groups.counts == (38, 38, 38)
+    for view in range(3):
+        assert torch.equal(groups.labels[view], superpixels(images[view], 38))
+    assert segment(images, SegmentOptions(), count=5).counts == (5, 5, 5)
+    assert segment(images[:0], SegmentOptions()).labels.shape == (0, 16, 24)
+    with pytest.raises(ValueError, match=r"images: expected shape \[v, h, w, 3\], got \[16, 24, 3\]"):
+        segment(images[0], SegmentOptions())
+
+
+def test_saliency_is_high_at_a_corner_only() -> None:
+    image = np.zeros((21, 21, 3))
+    image[10:, 10:] = 1
+    response = saliency(image)
+    assert response.dtype == torch.float32
+    y, x = divmod(int(response.argmax()), 21)
+    assert abs(y - 10) <= 1
+    assert abs(x - 10) <= 1
+    assert response[0:5].max() == 0  # flat
+    assert response[20, 5:15].max() < 1e-6  # straight edge
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_flat_pictures_get_even_seeds(value: float) -> None:
+    response = saliency(np.full((40, 60, 3), value))
+    assert response.max() == 0
+    density = seed_density(response.numpy(), 240)
+    assert density == pytest.approx(np.full((40, 60), 0.1))
+    seeds = seeds_from_density(density, 240)
+    quarters = np.histogram2d(seeds[:, 0], seeds[:, 1], bins=2, range=[[0, 40], [0, 60]])[0]
+    assert quarters == pytest.approx(np.full((2, 2), 60), abs=6)
+
+
+def test_density_is_at_most_one_and_sums_to_the_count() -> None:
+    response = np.zeros((10, 10), np.float32)
+    response[3:5] = 100
+    for count in (1, 20, 50, 99, 100):
+        density = seed_density(response, count)
+        assert density.max() <= 1
+        assert density.min() >= 0
+        assert density.sum() == pytest.approx(count)
+
+
+def test_hexagonal_seeds_are_distinct_pixels() -> None:
+    for height, width in ((1, 9), (9, 1), (3, 3), (7, 12), (30, 8)):
+        for count in {1, 2, height * width // 3, height * width - 1, height * width}:
+            seeds = hexagonal_seeds(height, width, count)
+            assert len({(y, x) for y, x in seeds.tolist()}) == count
+            assert (seeds >= 0).all()
+            assert (seeds < [height, width]).all()
+
+
+def test_hexagonal_rows_are_shifted() -> None:
+    seeds = hexagonal_seeds(26, 30, 30)  # rows of hexagons of 26 pixels are 4.75 apart
+    rows = [seeds[seeds[:, 0] == y][:, 1] for y in np.unique(seeds[:, 0])]
+    assert len(rows) == 5
+    assert np.diff(rows[0]) == pytest.approx(5)
+    assert rows[1][0] - rows[0][0] == pytest.approx(2.5, abs=0.6)

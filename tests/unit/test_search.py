@@ -1,0 +1,145 @@
+"""How many Gaussians: limits, the scene's curve, and the search for a quality."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from gsmerge.budget import PRESETS, TargetOptions, exact_count, most_allowed
+from gsmerge.search import CurvePoint, count_within, curve_knee, level_counts, rungs, search_count
+
+
+def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
+    return [CurvePoint(*value) for value in values]
+
+
+@pytest.mark.parametrize(
+    ("settings", "exact", "most"),
+    [
+        ({}, None, 50_000_000),
+        ({"budget": "2%"}, 1_000_000, 1_000_000),
+        ({"budget": 400, "max_bytes": "1GB"}, 400, 400),
+        ({"preset": "quest3"}, None, PRESETS["quest3"]),
+        ({"preset": "desktop", "budget": 5000}, 5000, 5000),
+        ({"preset": "quest3", "budget": "2%"}, 1_000_000, PRESETS["quest3"]),
+    ],
+)
+def test_limits(settings: dict[str, object], exact: int | None, most: int) -> None:
+    options = TargetOptions(**settings)  # type: ignore[arg-type]
+    assert exact_count(options, 50_000_000, 0) == exact
+    assert most_allowed(options, 50_000_000, 0) == most
+
+
+def test_a_small_scene_is_its_own_limit() -> None:
+    assert most_allowed(TargetOptions(preset="mobile"), 777, 0) == 777
+    assert exact_count(TargetOptions(budget=9999), 777, 0) == 777
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"preset": "phone"}, "preset: expected one of quest3, mobile, desktop, got 'phone'"),
+        ({"max_drop": -0.1}, "max drop: expected at least 0 dB"),
+        ({"max_drop": math.nan}, "max drop"),
+        ({"target_psnr": 0.0}, "target psnr: expected more than 0 dB"),
+        ({"target_psnr": math.inf}, "target psnr"),
+        ({"target_psnr": 30.0, "max_drop": 0.2}, "one of max drop and target psnr"),
+        ({"levels": 0}, "levels: expected 1 to 8"),
+        ({"levels": 9}, "levels: expected 1 to 8"),
+        ({"budget": "lots"}, "budget: expected"),
+    ],
+)
+def test_refused(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TargetOptions(**settings)  # type: ignore[arg-type]
+
+
+def test_rungs_rise_within_their_limits() -> None:
+    assert rungs((0.25, 0.5, 1.0, 2.0), 1000, 10, 5000) == [250, 500, 1000, 2000]
+    assert rungs((0.25, 0.5, 1.0, 2.0), 1000, 300, 900) == [300, 500, 900]
+    assert rungs((0.25, 1.0), 1000, 100, 100) == [100]
+
+
+def test_levels_end_where_a_view_would_have_none() -> None:
+    assert level_counts(6400, 4, 12) == [1600, 400, 100]
+    assert level_counts(6400, 4, 200) == [1600, 400]
+    assert level_counts(6400, 1, 12) == []
+
+
+def test_count_within_is_read_off_the_curve() -> None:
+    curve = points((100, 20.0, 0), (200, 22.0, 0), (400, 23.0, 0), (800, 22.5, 0))
+    assert count_within(curve, 0.0) == 400
+    assert count_within(curve, 0.5) == math.ceil(200 * 2**0.5)
+    assert count_within(curve, 1.0) == 200
+    assert count_within(curve, 99.0) == 100
+    assert count_within(curve[:1], 0.0) == 100
+
+
+def test_count_within_falls_as_more_may_be_lost() -> None:
+    curve = points((100, 20.0, 0), (200, 24.0, 0), (400, 23.5, 0), (800, 26.0, 0), (1600, 26.1, 0))
+    counts = [count_within(curve, drop / 10) for drop in range(80)]
+    assert counts == sorted(counts, reverse=True)
+
+
+def test_knee_of_a_curve_that_stops_rising() -> None:
+    flat_after_400 = points((100, 20, 0.5), (200, 22, 0.6), (400, 23, 0.7), (800, 23, 0.7), (1600, 23, 0.7))
+    assert 283 <= curve_knee(flat_after_400) <= 566  # between the middles of the steep and of the flat part
+    assert curve_knee(points((100, 20, 0.5), (200, 22, 0.6), (400, 24, 0.7))) == 400
+    assert curve_knee(points((100, 24, 0.7), (200, 22, 0.6), (400, 20, 0.5))) == 100
+    assert curve_knee(points((100, 24, 0.7))) == 100
+
+
+def test_knee_weighs_structure_against_psnr() -> None:
+    """A blurred scene can have the better PSNR; it is not the knee while structure still grows."""
+    psnr_falls = [(100, 22.0), (200, 21.9), (400, 21.8), (800, 21.7)]
+    without = points(*((count, psnr, 0.7) for count, psnr in psnr_falls))
+    grows = points(*((count, psnr, 0.60 + 0.04 * i) for i, (count, psnr) in enumerate(psnr_falls)))
+    assert curve_knee(without) == 100
+    assert curve_knee(grows) == 800
+
+
+@pytest.mark.parametrize("function", [lambda p: count_within(p, 0.1), curve_knee])
+def test_a_curve_needs_a_point(function: Callable[[list[CurvePoint]], int]) -> None:
+    with pytest.raises(ValueError, match="expected at least one, got none"):
+        function([])
+
+
+def rises(count: int) -> float:
+    """2 dB per doubling."""
+    return 20 + 2 * math.log2(count / 1000)
+
+
+@pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
+@pytest.mark.parametrize("target", [17.0, 20.0, 23.3, 27.0])
+def test_search_finds_the_fewest(start: int, target: float) -> None:
+    found = search_count(rises, target, start, 10, 100_000)
+    fewest = 1000 * 2 ** ((target - 20) / 2)
+    assert found.met
+    assert found.psnr == rises(found.count) >= target
+    assert found.count <= max(2.5 * fewest, 10)
+    assert (found.count, found.psnr) in found.tried
+    assert len(found.tried) <= 6
+
+
+def test_search_near_the_answer_ends_close_to_it() -> None:
+    found = search_count(rises, 24.0, 3000, 10, 100_000)
+    assert 4000 <= found.count <= 4000 * 1.3
+
+
+def test_search_says_when_it_is_out_of_reach() -> None:
+    found = search_count(rises, 40.0, 1000, 10, 5000)
+    assert not found.met
+    assert (found.count, found.psnr) == (5000, rises(5000))
+
+
+def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
+    found = search_count(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
+    assert (found.met, found.count) == (False, 1000)
+
+
+def test_search_stays_within_its_limits() -> None:
+    tried = search_count(rises, 25.0, 10_000, 700, 900).tried
+    assert all(700 <= count <= 900 for count, _ in tried)
+    assert search_count(rises, 1.0, 5000, 700, 9000).count >= 700
