@@ -29,10 +29,10 @@ ROOT = Path(__file__).parents[2]
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
-PAGES = sorted(
-    str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
-)
-GENERATED = {page for page in PAGES if page.startswith(("docs/reference/commands/", "docs/reference/training-settings"))}
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
+GENERATED = {
+    page for page in PAGES if page.startswith(("docs/reference/commands/", "docs/reference/training-settings"))
+}
 WRITTEN = [page for page in PAGES if page not in GENERATED]
 # options of tools that pages name beside our own
 OTHER_OPTIONS = {"--version", "--help", "--install-completion", "--only", "--no-deps", "--force-reinstall", "--check"}
