@@ -129,7 +129,7 @@ def measure_curve(
         log: Takes the progress.
     """
     options = prepared.options
-    short = FitOptions(fit="full", fit_steps=steps, coarse=1.0, holdout=HOLDOUT, rates=options.fit.rates)
+    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
     limits = replace(prepared.limits, share=1.0)  # so short a fit does not grow
     quick = replace(prepared, options=replace(options, fit=short), limits=limits, checkpoint=None)
     photos = scene_photos(prepared.scene)

@@ -16,7 +16,7 @@ from gsmerge.networks import Learned, decode_described, described_by
 from gsmerge.render.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.fit import shown
+from gsmerge.stages.fit import visible_mask
 from gsmerge.types import Gaussians
 
 
@@ -113,7 +113,7 @@ def decode_scene(
         gaussians, _ = children_of(encoded, plan.counts)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
         if plan.prune > 0:
-            gaussians = gaussians[shown(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]
+            gaussians = gaussians[visible_mask(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]
         if encoded.kept is not None:
             gaussians = Gaussians.concat([gaussians, encoded.kept])
         return encoded.frame.leave(gaussians)

@@ -92,7 +92,7 @@ def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, lo
         k=options.decode.k,
         most=most,
         min_opacity=options.decode.min_opacity,
-        prune=options.fit.prune if prunes else 0.0,
+        prune=options.fit.min_contribution if prunes else 0.0,
         wanted=count if segmentation.exact else None,
         places=None if segmentation.exact or count is None else count // options.decode.count,
         knee=knee_count(prepared),

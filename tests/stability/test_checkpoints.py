@@ -95,8 +95,8 @@ def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:
 def test_weights_a_hundred_times_as_large_stay_within_the_bounds(tmp_path: Path, k: int) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", scaled(noisy(), 100))
-    before = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0, checkpoint="none")
-    after = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, prune=0.0, checkpoint=str(path))
+    before = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, min_contribution=0.0, checkpoint="none")
+    after = gsmerge.compact(scene, **PLAIN, k=k, min_opacity=0.0, min_contribution=0.0, checkpoint=str(path))
     assert_invariants(after.gaussians, scene)
     a, b, bounds = before.gaussians, after.gaussians, Bounds()
     assert len(a) == len(b)

@@ -37,7 +37,7 @@ from gsmerge.stages.decode import divide
 from gsmerge.stages.encode import encode
 from gsmerge.stages.fit.full import Masks, fit_full
 from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.stage import shown
+from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import segment
@@ -281,7 +281,7 @@ def _fitted(
     """Gaussians after a full fit without growth, and which of those given they are ``[n]``: what is not seen is not."""
     fit, photos = FitOptions(fit_steps=options.fit_steps), teacher.photos
     mask = start.opacities >= least
-    mask[mask.clone()] = shown(start[mask], photos[1], fit.prune)
+    mask[mask.clone()] = visible_mask(start[mask], photos[1], fit.min_contribution)
     fitted, report = fit_full(
         start[mask], photos, fit, seed=options.seed, progress=progress, masks=teacher.masks
     )  # fmt: skip

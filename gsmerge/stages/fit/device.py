@@ -19,7 +19,7 @@ from gsmerge.kernels.gaussians.optimise import C1, C2, COLOR, LOGIT, MAX_LOGIT, 
 from gsmerge.render.colored import draw_colored, seen_colors
 from gsmerge.stages.fit.full import KERNELS, Engine, Plan, step_sizes
 from gsmerge.stages.fit.loss import WINDOW
-from gsmerge.stages.fit.options import FitOptions, Rates
+from gsmerge.stages.fit.options import FitOptions, LearningRates
 from gsmerge.stages.fit.state import State, state_of
 from gsmerge.types import SH_C0
 
@@ -32,7 +32,7 @@ class Held:
         state: The state that they came from.
         x: ``[n,14]`` parameters, see :class:`gsmerge.stages.fit.state.State`, as are the following.
         x0: Where each began.
-        shares: ``[n,1]`` share of the box.
+        box_shares: ``[n,1]`` share of the box.
         m: First moment.
         v: Second moment.
         units: ``[n,1]`` size of each Gaussian.
@@ -42,7 +42,7 @@ class Held:
     state: State
     x: Tensor
     x0: Tensor
-    shares: Tensor
+    box_shares: Tensor
     m: Tensor
     v: Tensor
     units: Tensor
@@ -76,11 +76,11 @@ def torch_engine(device: torch.device) -> Engine:
             held[:] = [upload(state, device)]
         return torch_step(held[0], plan, view, step, progress, rng)
 
-    def settle(state: State) -> None:
+    def sync(state: State) -> None:
         if held and held[0].state is state:
             download(held[0])
 
-    return Engine(step_view, settle)
+    return Engine(step_view, sync)
 
 
 def upload(state: State, device: torch.device) -> Held:
@@ -89,7 +89,7 @@ def upload(state: State, device: torch.device) -> Held:
     def tensor(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(device, copy=True)
 
-    arrays = (state.x, state.x0, state.shares[:, None], state.m, state.v, state.units[:, None], state.splats.shN)
+    arrays = (state.x, state.x0, state.box_shares[:, None], state.m, state.v, state.units[:, None], state.splats.shN)
     return Held(state, *(tensor(array) for array in arrays))
 
 
@@ -106,7 +106,7 @@ def download(held: Held) -> None:
 
 def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """:func:`gsmerge.stages.fit.full.fit_step` on tensors -> mean squared error of the view's training pixels."""
-    level = 1 if progress < plan.options.coarse_share else 0
+    level = 1 if progress < plan.options.half_res_part else 0
     photos = plan.photos[level]
     photo = torch.from_numpy(photos.images[view]).to(held.x)
     weight = torch.from_numpy(plan.step_weights[level][view]).to(held.x)
@@ -123,12 +123,12 @@ def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rn
             for tensor in (means, quats, scales, drawn, view_colors(held, means, camera["viewmat"]))
         ]
         image, reached = draw_colored((leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], camera, background)
-        loss = image_loss(image, photo, weight, plan.options.dssim)
+        loss = image_loss(image, photo, weight, plan.options.ssim_lambda)
         wanted = torch.autograd.grad(loss, leaves)
     with torch.no_grad():
         slope, each = (opacities * (1 - opacities))[:, None], reached[:, None] / max(len(held.x), 1)
-        fade = wanted[3][:, None] + plan.options.opacity_pull * each
-        shrink = wanted[2] + plan.options.size_pull * each / held.units
+        fade = wanted[3][:, None] + plan.options.opacity_reg * each
+        shrink = wanted[2] + plan.options.scale_reg * each / held.units
         rows = (wanted[0] * held.units, shrink * scales, wanted[1], fade * slope, wanted[4])
         adam_step(held, torch.cat(rows, 1), plan.options, progress, step)
         return mean_error(image, photo, weight)
@@ -147,21 +147,21 @@ def view_colors(held: Held, means: Tensor, viewmat: np.ndarray) -> Tensor:
     return seen_colors(means, ((colors - 0.5) / SH_C0)[:, None], held.shN, viewmat)
 
 
-def image_loss(image: Tensor, photo: Tensor, weight: Tensor, dssim: float) -> Tensor:
+def image_loss(image: Tensor, photo: Tensor, weight: Tensor, ssim_lambda: float) -> Tensor:
     """The loss whose gradient :func:`gsmerge.stages.fit.loss.image_gradient` is: L1 and structural similarity.
 
     Args:
         image: ``[h,w,3]``.
         photo: ``[h,w,3]``.
         weight: ``[h,w]`` weights of the pixels.
-        dssim: Share of structural similarity, over windows of 7 x 7, zero beyond the border.
+        ssim_lambda: Share of structural similarity, over windows of 7 x 7, zero beyond the border.
     """
     stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
     mx, my, xx, yy, xy = avg_pool2d(stacked, WINDOW, 1, WINDOW[0] // 2).permute(0, 2, 3, 1)
     c1, c2 = float(C1), float(C2)
     above = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
     similarity = above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
-    each = (1 - dssim) * (image - photo).abs() + dssim * (1 - similarity)
+    each = (1 - ssim_lambda) * (image - photo).abs() + ssim_lambda * (1 - similarity)
     return (weight[..., None] * each).sum() / weight.numel()
 
 
@@ -184,16 +184,16 @@ def adam_step(held: Held, gradient: Tensor, options: FitOptions, progress: float
     confine(held, held.x - move, rates)
 
 
-def confine(held: Held, x: Tensor, rates: Rates) -> None:
+def confine(held: Held, x: Tensor, rates: LearningRates) -> None:
     """New parameters, brought into the box about the start."""
     x0 = held.x0
     offset = x[:, :SIZE] - x0[:, :SIZE]
-    far, reach = offset.norm(dim=1, keepdim=True), held.shares * rates.reach_mean * held.units
+    far, reach = offset.norm(dim=1, keepdim=True), held.box_shares * rates.max_mean_shift * held.units
     x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])
     sizes, logits, colors = x0[:, SIZE:QUAT], x0[:, LOGIT], x0[:, COLOR:]
-    grown = held.shares * rates.reach_size
+    grown = held.box_shares * rates.max_scale_change
     x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown)
-    logit = x[:, LOGIT].clamp(logits - rates.reach_logit, logits + rates.reach_logit)
+    logit = x[:, LOGIT].clamp(logits - rates.max_opacity_change, logits + rates.max_opacity_change)
     x[:, LOGIT] = logit.clamp(float(MIN_LOGIT), float(MAX_LOGIT))
     x[:, COLOR:] = x[:, COLOR:].clamp(colors.clamp_max(-0.05), colors.clamp_min(1.05))
     norm = x[:, QUAT:LOGIT].norm(dim=1, keepdim=True)

@@ -51,7 +51,7 @@ def fit_scene(
     if scene.images is None or not options.needs_photos:
         return gaussians
     if exact and not options.grows:  # nothing grows to the number asked for, so nothing may fall below it either
-        options = replace(options, prune=0.0)
+        options = replace(options, min_contribution=0.0)
     log.choices["begun_with"] = len(gaussians)
     with log.stage("fit"):
         photos = scene_photos(scene), scene_photos(scene, 2)
@@ -70,7 +70,7 @@ def fit(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
-    rival: Gaussians | None = None,
+    baseline_start: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
@@ -83,19 +83,22 @@ def fit(
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
         progress: Told after every step of the full fit.
-        rival: Another start that the full fit has to beat instead, see :func:`gsmerge.stages.fit.full.score_to_beat`.
+        baseline_start: Another start that the full fit may beat instead, see
+            :func:`gsmerge.stages.fit.full.score_to_beat`.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
-    keep = shown(gaussians, photos[1], options.prune)
+    keep = visible_mask(gaussians, photos[1], options.min_contribution)
     if options.fit == "none":
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device), None, rival)
+        fitted, report = fit_full(
+            kept, photos, options, count, seed, progress, engine_for(options.device), None, baseline_start
+        )
         fitted, report = _better_of(kept, fitted, report, photos[0])
         if report.accepted:
             return fitted, report
@@ -108,7 +111,7 @@ def fit(
     return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
 
 
-def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
+def visible_mask(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
     """``[n]`` mask of the Gaussians worth keeping.
 
     Args:

@@ -81,7 +81,7 @@ def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene
         {"robust": False, "match": "aabb", "k": 2},
         {"rule": "paper", "k": 2},
         {"min_opacity": 0.3, "k": 2},
-        {"prune": 0.2},
+        {"min_contribution": 0.2},
     ],
     ids=str,
 )

@@ -20,7 +20,7 @@ from gsmerge.stages.fit.device import engine_for, image_loss, start_gpu, torch_e
 from gsmerge.stages.fit.full import KERNELS, Engine, fit_full, plan_run
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import Rates
+from gsmerge.stages.fit.options import LearningRates
 from gsmerge.stages.fit.state import State, start_state
 
 Pair = tuple[Photos, Photos]
@@ -30,7 +30,7 @@ gpu = pytest.mark.skipif(
 )
 PULLS = FitOptions(fit_steps=8, holdout=0.2)
 # Without the pulls: where they are the whole gradient, Adam turns its last bit into a full step.
-QUICK = replace(PULLS, opacity_pull=0.0, size_pull=0.0)
+QUICK = replace(PULLS, opacity_reg=0.0, scale_reg=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +54,11 @@ def run(gaussians: Gaussians, photos: Pair, options: FitOptions, engine: Engine,
     errors = []
     for step in range(options.fit_steps):
         if grown and step == options.fit_steps // 2:
-            engine.settle(state)
+            engine.sync(state)
             state = grow_to(state, photos[1], len(state.x) + grown)
         part = step / options.fit_steps
         errors.append(engine.step(state, plan, step % len(photos[0]), step + 1, part, rng))
-    engine.settle(state)
+    engine.sync(state)
     return state, errors
 
 
@@ -76,7 +76,9 @@ def assert_same_state(found: State, wanted: State) -> None:
     np.testing.assert_array_equal(found.colors, found.x[:, 11:])
 
 
-@pytest.mark.parametrize("settings", [{}, {"dropout": 0.2}, {"dssim": 0.0}, {"coarse": 0.0}, {"coarse": 1.0}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"dropout": 0.2}, {"ssim_lambda": 0.0}, {"half_res_share": 0.0}, {"half_res_share": 1.0}], ids=str
+)
 def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
     options = replace(QUICK, **settings)
     (found, errors), (wanted, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
@@ -84,7 +86,7 @@ def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[st
     assert errors == pytest.approx(others, rel=1e-4)
 
 
-@pytest.mark.parametrize("pulls", [{"opacity_pull": 3.0}, {"size_pull": 3.0}, {}], ids=str)
+@pytest.mark.parametrize("pulls", [{"opacity_reg": 3.0}, {"scale_reg": 3.0}, {}], ids=str)
 def test_pulls_are_the_kernels(start: Gaussians, photos: Pair, pulls: dict[str, float]) -> None:
     """By the moments of one step, which are its gradient."""
     one = replace(PULLS if not pulls else QUICK, fit_steps=1, **pulls)
@@ -112,7 +114,15 @@ def test_growth_goes_on_from_the_tensors(start: Gaussians, photos: Pair) -> None
 
 def test_box_is_the_kernels(start: Gaussians, photos: Pair) -> None:
     """Everything at its border, colours beyond the range, a quaternion of length zero."""
-    rates = Rates(mean=3.0, size=3.0, logit=5.0, color=1.0, reach_mean=0.2, reach_size=0.1, reach_logit=0.3)
+    rates = LearningRates(
+        means_lr=3.0,
+        scales_lr=3.0,
+        opacities_lr=5.0,
+        colors_lr=1.0,
+        max_mean_shift=0.2,
+        max_scale_change=0.1,
+        max_opacity_change=0.3,
+    )
     options = replace(QUICK, fit_steps=3, rates=rates)
     odd = replace(start, sh0=start.sh0.clone(), quats=start.quats.clone())
     odd.sh0[:9], odd.quats[9:12] = 4.0, 0.0
@@ -149,15 +159,15 @@ def test_long_run_grows_to_the_count(scene: PixelScene, start: Gaussians, photos
 
 
 @pytest.mark.parametrize("size", [(20, 17), (7, 7), (3, 5), (1, 9)])
-@pytest.mark.parametrize("dssim", [0.0, 0.2, 1.0])
-def test_loss_is_the_kernels(size: tuple[int, int], dssim: float) -> None:
+@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
+def test_loss_is_the_kernels(size: tuple[int, int], ssim_lambda: float) -> None:
     rng = np.random.default_rng(0)
     photo = rng.uniform(0, 1, (*size, 3)).astype(np.float32)
     image = photo + 0.2 * rng.normal(size=photo.shape).astype(np.float32)
     weight = (rng.random(size) > 0.2).astype(np.float32)
     variable = torch.from_numpy(image).requires_grad_()
-    image_loss(variable, torch.from_numpy(photo), torch.from_numpy(weight), dssim).backward()
-    wanted = image_gradient(image, photo, weight, dssim)
+    image_loss(variable, torch.from_numpy(photo), torch.from_numpy(weight), ssim_lambda).backward()
+    wanted = image_gradient(image, photo, weight, ssim_lambda)
     assert variable.grad is not None
     assert np.linalg.norm(variable.grad.numpy() - wanted) <= 1e-3 * np.linalg.norm(wanted)
 
