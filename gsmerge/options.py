@@ -43,7 +43,7 @@ class CompactOptions:
         decode: Gaussians per group.
         fit: Fit to the photos.
         target: What decides the number of Gaussians.
-        method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
+        method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
             come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
@@ -51,7 +51,7 @@ class CompactOptions:
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
             faster on processors that know it.
-        seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
+        seed: Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:

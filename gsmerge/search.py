@@ -119,7 +119,7 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
-    PSNR and SSIM are those of blocks that the short fits do not look at, at full size; LPIPS needs whole pictures.
+    PSNR and SSIM are those of blocks that the short fits leave out, at full size; LPIPS needs whole pictures.
 
     Args:
         prepared: The scene, which must have photos.

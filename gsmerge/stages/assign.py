@@ -59,7 +59,7 @@ class ContributionOptions:
         if self.unseen not in ("drop", "keep"):
             raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
         if not self.min_owner_weight >= 0:
-            raise ValueError(f"min_contribution: expected at least 0, got {self.min_owner_weight}")
+            raise ValueError(f"min_owner_weight: expected at least 0, got {self.min_owner_weight}")
 
 
 def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: ContributionOptions) -> Members:
@@ -216,7 +216,7 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
     """
     labels = np.ascontiguousarray(labels, np.int32)
     num, room = len(plan.ids), max(FIRST_PAIRS, count)
-    values, found = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
     stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
     heads, active = np.full(num, -1, np.int32), np.empty(num + 1, np.int32)
     pairs, num_pairs, num_active = np.empty((room, PAIR)), 0, 0
@@ -227,9 +227,9 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
         )  # fmt: skip
         bottom = (line + 1) * TILE if line < plan.lines - 1 else MAX_SIZE
         pairs, num_pairs, num_active = settle_row(
-            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, found
+            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, owners
         )
-    return values, found
+    return values, owners
 
 
 def owner_pixels(owners: Owners, groups: Groups, min_owner_weight: float = 0.0) -> np.ndarray:
@@ -259,7 +259,7 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
     order = np.lexsort((dx * dx + dy * dy, flat))
-    found, at = np.unique(flat[order], return_index=True)
+    present, at = np.unique(flat[order], return_index=True)
     middles = np.zeros(count, np.int64)
-    middles[found] = order[at]
+    middles[present] = order[at]
     return middles

@@ -64,7 +64,7 @@ def decode(
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
-        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer are not looked at.
+        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter.
         rule: How children are pooled, the encoder's.
         learned: Networks whose heads correct the children; None: none does.
 
@@ -101,7 +101,7 @@ def decode_merged(merged: MergedViews, options: DecodeOptions, rule: Rule, *, gr
 
 
 def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions, rule: Rule) -> Gaussians:
-    """``count`` Gaussians, dealt out to where they lower distortion most; None: K of each Feature Gaussian."""
+    """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
     if count is None and options.count == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
     features, members = merged.features, merged.members
@@ -175,8 +175,8 @@ def halve(
         )
         return np.diff(child_starts), child_ids, rows[parents]
 
-    found = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
-    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
+    parts = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
+    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*parts, strict=True))
     return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
 
 

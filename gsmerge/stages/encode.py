@@ -48,7 +48,7 @@ def encode(
         members: Its Gaussians as arrays.
         groups: The superpixels of every view.
         options: The rule.
-        learned: Networks whose encoder looks at the members too; None: none does.
+        networks: Networks whose encoder corrects what is pooled; None: none does.
 
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.

@@ -44,14 +44,14 @@ class Drawn:
 class _System:
     """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``.
 
-    ``held [n,1]`` is the diagonal of the normal equations of photos that are gone, which the colours solve as they are.
+    ``color_precision [n,1]`` is the diagonal of the normal equations of earlier photos, which the present colours solve.
     """
 
     drawn: Drawn
     photos: np.ndarray
     weights: list[np.ndarray]
     gains: np.ndarray
-    held: np.ndarray
+    color_precision: np.ndarray
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
@@ -72,7 +72,7 @@ def fit_colors(
     photos: Photos,
     options: FitOptions,
     seed: int = 0,
-    held: np.ndarray | None = None,
+    color_precision: np.ndarray | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
 
@@ -82,13 +82,15 @@ def fit_colors(
         photos: The input views.
         options: The solver's settings.
         seed: Chooses the held-out blocks.
-        held: ``[n]`` pixels of photos that are gone which each colour was fitted to; None: of none.
+        color_precision: ``[n]`` pixels of photos that are gone which each colour was fitted to; None: of none.
 
     Returns:
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
-    before_these = np.zeros((drawn.count, 1)) if held is None else held[:, None].astype(np.float64)
+    before_these = (
+        np.zeros((drawn.count, 1)) if color_precision is None else color_precision[:, None].astype(np.float64)
+    )
     plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)), before_these)
     before = holdout_psnr(drawn.images, photos, train, options.min_gain)
     prior_weight = options.prior_weight
@@ -125,11 +127,14 @@ def _finish(system: _System, offsets: np.ndarray, options: FitOptions, prior_wei
 
 
 def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, prior_weight: float) -> np.ndarray:
-    """Jacobi-preconditioned CG on sum |gain (prior + W x) - photo|^2 + (pull mass + held) |x|^2, from ``x`` on."""
+    """Jacobi-preconditioned conjugate gradients from ``x`` on.
+
+    They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + color_precision) |x|^2.
+    """
     mass, r = _residual(system, x)
-    back = prior_weight * mass + system.held
+    back = prior_weight * mass + system.color_precision
     r -= back * x
-    inverse = 1 / (mass * (1 + prior_weight) + system.held + 1e-6)
+    inverse = 1 / (mass * (1 + prior_weight) + system.color_precision + 1e-6)
     z = inverse * r
     p, rz = z, (r * z).sum(0)
     for _ in range(iterations):

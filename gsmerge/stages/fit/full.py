@@ -28,8 +28,11 @@ from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
 GROWTH = 0.5  # part of the run after which Gaussians are added
-FEW_VIEWS, MANY_STEPS, DROPOUT, LONG_DROPOUT = 5, 150, 0.1, 0.05
-PROBE = 6  # steps that are timed to spend a time budget
+FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
+MANY_STEPS = 150
+DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
+LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS, whatever the views
+PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 
@@ -45,8 +48,8 @@ class Plan:
     Args:
         photos: At full and at half size.
         weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
-            neither steps nor scores look at, 1 elsewhere.
-        step_weights: The same as a step looks at them: 0 on hidden pixels, and full size looks at held-out blocks, too.
+            neither steps nor scores use, 1 elsewhere.
+        step_weights: The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too.
         options: What a step does.
         dropout: Share of the Gaussians that a step leaves out.
     """
@@ -59,11 +62,11 @@ class Plan:
 
 
 def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
-    """Held-out blocks, pixels that are not looked at, and dropout where there are few views."""
+    """Held-out blocks, hidden pixels, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
-    usual = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
-    dropout = usual if options.dropout is None else options.dropout
+    default = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
+    dropout = default if options.dropout is None else options.dropout
     weights = full, reduced(full, photos[1])
     if masks is not None:
         weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
@@ -117,7 +120,7 @@ class Engine:
 
     Args:
         step: One step on one view, as :func:`fit_step`, which may leave the state's arrays behind.
-        sync: Brings the state's arrays up to date, before anything else looks at them.
+        sync: Brings the state's arrays up to date, before anything else reads them.
     """
 
     step: Callable[[State, Plan, int, int, float, np.random.Generator], float]
@@ -165,10 +168,10 @@ def holdout_score(state: State, plan: Plan) -> float:
 
 
 def score_to_beat(own: float, baseline_start: Gaussians | None, plan: Plan) -> float:
-    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a rival that shows them worse.
+    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a worse baseline start.
 
-    Networks have learnt to show the photos whole. A fit of the rest takes from the blocks of what they made, and yet
-    helps new views; the start without networks is then what it is compared with.
+    Networks learn to show whole photos. A fit to the other blocks then makes the held-out ones worse and new views
+    better, so it is compared with the start without networks.
     """
     return own if baseline_start is None else min(own, holdout_score(start_state(baseline_start), plan))
 
@@ -186,8 +189,8 @@ def fit_full(
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
-    Two states can be returned, judged by blocks of the photos that the half-size steps do not look at: the start, or
-    the end if the blocks were better after those steps. The full-size steps then look at everything.
+    Two states can be returned, judged by blocks of the photos that the half-size steps leave out: the start, or
+    the end if the blocks were better after those steps. The full-size steps then use every block.
 
     Args:
         gaussians: Canonical Gaussians.
@@ -195,9 +198,9 @@ def fit_full(
         options: Steps, rates, limits.
         count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
         seed: Order of the views, backgrounds, dropout, held-out blocks.
-        progress: Told after every step.
-        engine: What it steps with.
-        masks: Pixels that are looked at; None: all. Where no Gaussian is, none should be drawn to.
+        progress: Called after every step.
+        engine: What takes the steps.
+        masks: Pixels that count; None: all. Where no Gaussian is, none should be drawn to.
         baseline_start: Another start that the fit may beat instead, see :func:`score_to_beat`.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)

@@ -108,14 +108,14 @@ class FitOptions:
 
     @property
     def half_res_part(self) -> float:
-        """Share of the steps that look at half-size photos."""
+        """Share of the steps on half-size photos."""
         if self.half_res_share is not None:
             return self.half_res_share
         return 1.0 if self.steps < HASTY_STEPS else 0.5 if self.steps >= LONG_STEPS else 0.7
 
     @property
     def needs_photos(self) -> bool:
-        """Whether the photos are looked at: to fit, or to leave out what none of them shows."""
+        """Whether the photos are needed: to fit, or to leave out what none of them shows."""
         return self.fit != "none" or (self.min_contribution > 0 and self.effort != "draft")
 
     @property

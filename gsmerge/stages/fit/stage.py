@@ -20,7 +20,7 @@ from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import gaussians_of, start_state
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
-CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
+CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
@@ -111,13 +111,13 @@ def fit(
     return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
 
 
-def visible_mask(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> torch.Tensor:
     """``[n]`` mask of the Gaussians worth keeping.
 
     Args:
         gaussians: n Gaussians.
         photos: The views that they may show in.
-        least: Largest blending weight at a pixel that is too little. What lies in no photo's frustum stays.
+        min_weight: Least blending weight at some pixel. What lies in no photo's frustum stays.
     """
     splats = prepare(gaussians)
 
@@ -129,16 +129,16 @@ def visible_mask(gaussians: Gaussians, photos: Photos, least: float) -> torch.Te
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
-    return torch.from_numpy(~inside | (peak >= least))
+    return torch.from_numpy(~inside | (peak >= min_weight))
 
 
 def _better_of(
     before: Gaussians, after: Gaussians, report: FitReport, photos: Photos, close: float = CLOSE
 ) -> tuple[Gaussians, FitReport]:
-    """The fitted Gaussians, but where they began if the held-out blocks hardly gained and the photos as a whole lost.
+    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
 
-    Gaussians that were fitted already are where steps of the usual size only stir. A gain of ``close`` dB or more is
-    not looked at twice.
+    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
+    more the photos are not compared.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report

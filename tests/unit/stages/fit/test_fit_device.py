@@ -62,17 +62,17 @@ def run(gaussians: Gaussians, photos: Pair, options: FitOptions, engine: Engine,
     return state, errors
 
 
-def assert_same_state(found: State, wanted: State) -> None:
+def assert_same_state(found: State, gradients: State) -> None:
     """Parameters to 1e-3, most of them far closer; what they mean to the rasterizer is up to date."""
-    assert found.x.shape == wanted.x.shape
-    moved = np.abs(wanted.x - wanted.x0).max(0)
+    assert found.x.shape == gradients.x.shape
+    moved = np.abs(gradients.x - gradients.x0).max(0)
     assert (moved > 0.01).all()
-    np.testing.assert_allclose(found.x, wanted.x, atol=1e-3)
-    assert np.median(np.abs(found.x - wanted.x)) < 1e-5
-    assert np.linalg.norm(found.m - wanted.m) <= 1e-3 * np.linalg.norm(wanted.m)
-    assert np.linalg.norm(found.v - wanted.v) <= 1e-3 * np.linalg.norm(wanted.v)
+    np.testing.assert_allclose(found.x, gradients.x, atol=1e-3)
+    assert np.median(np.abs(found.x - gradients.x)) < 1e-5
+    assert np.linalg.norm(found.m - gradients.m) <= 1e-3 * np.linalg.norm(gradients.m)
+    assert np.linalg.norm(found.v - gradients.v) <= 1e-3 * np.linalg.norm(gradients.v)
     for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_allclose(getattr(found.splats, name), getattr(wanted.splats, name), rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(getattr(found.splats, name), getattr(gradients.splats, name), rtol=1e-3, atol=1e-3)
     np.testing.assert_array_equal(found.colors, found.x[:, 11:])
 
 
@@ -81,8 +81,8 @@ def assert_same_state(found: State, wanted: State) -> None:
 )
 def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
     options = replace(QUICK, **settings)
-    (found, errors), (wanted, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
-    assert_same_state(found, wanted)
+    (found, errors), (gradients, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
+    assert_same_state(ours, expected)
     assert errors == pytest.approx(others, rel=1e-4)
 
 
@@ -90,26 +90,28 @@ def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[st
 def test_pulls_are_the_kernels(start: Gaussians, photos: Pair, pulls: dict[str, float]) -> None:
     """By the moments of one step, which are its gradient."""
     one = replace(PULLS if not pulls else QUICK, fit_steps=1, **pulls)
-    (found, _), (wanted, _), (without, _) = (
+    (found, _), (gradients, _), (without, _) = (
         run(start, photos, options, engine)
         for options, engine in ((one, torch_engine(CPU)), (one, KERNELS), (replace(QUICK, fit_steps=1), KERNELS))
     )
-    assert np.linalg.norm(found.m - wanted.m) <= 1e-4 * np.linalg.norm(wanted.m)
-    assert np.linalg.norm(without.m - wanted.m) > 1e-3 * np.linalg.norm(wanted.m)
+    assert np.linalg.norm(found.m - gradients.m) <= 1e-4 * np.linalg.norm(gradients.m)
+    assert np.linalg.norm(without.m - gradients.m) > 1e-3 * np.linalg.norm(gradients.m)
 
 
 @pytest.mark.parametrize("degree", [1, 3])
 def test_steps_are_the_kernels_with_harmonics(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
-    found, wanted = (run(scenes.spoil(truth), scenes.pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS))
-    assert_same_state(found, wanted)
-    np.testing.assert_array_equal(found.splats.shN, wanted.splats.shN)
+    found, gradients = (
+        run(scenes.spoil(truth), scenes.pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS)
+    )
+    assert_same_state(ours, expected)
+    np.testing.assert_array_equal(ours.splats.shN, expected.splats.shN)
 
 
 def test_growth_goes_on_from_the_tensors(start: Gaussians, photos: Pair) -> None:
-    found, wanted = (run(start, photos, QUICK, e, grown=30)[0] for e in (torch_engine(CPU), KERNELS))
+    ours, expected = (run(start, photos, QUICK, e, grown=30)[0] for e in (torch_engine(CPU), KERNELS))
     assert len(found.x) == len(start) + 30
-    assert_same_state(found, wanted)
+    assert_same_state(ours, expected)
 
 
 def test_box_is_the_kernels(start: Gaussians, photos: Pair) -> None:
@@ -126,8 +128,8 @@ def test_box_is_the_kernels(start: Gaussians, photos: Pair) -> None:
     options = replace(QUICK, fit_steps=3, rates=rates)
     odd = replace(start, sh0=start.sh0.clone(), quats=start.quats.clone())
     odd.sh0[:9], odd.quats[9:12] = 4.0, 0.0
-    found, wanted = (run(odd, photos, options, e)[0] for e in (torch_engine(CPU), KERNELS))
-    np.testing.assert_allclose(found.x, wanted.x, atol=1e-3)
+    ours, expected = (run(odd, photos, options, e)[0] for e in (torch_engine(CPU), KERNELS))
+    np.testing.assert_allclose(found.x, gradients.x, atol=1e-3)
     reached = np.abs(found.x - found.x0)[:, 3:6].max(1)
     assert np.isclose(reached, 0.1, atol=1e-5).mean() > 0.5
     assert found.x[:, 11:].max() > 1.05
@@ -138,14 +140,14 @@ def test_run_reaches_the_same(scene: PixelScene, start: Gaussians, photos: Pair)
     """The median of three, since a weight on the other side of 1/255 may tell two runs apart."""
     options, gaps = replace(QUICK, fit_steps=40), []
     for seed in range(3):
-        (found, report), (wanted, other) = (
+        (found, report), (gradients, other) = (
             fit_full(start, photos, options, seed=seed, engine=engine) for engine in (torch_engine(CPU), KERNELS)
         )
         assert (report.method, report.accepted, report.steps) == (other.method, other.accepted, other.steps)
         assert report.holdout_before == other.holdout_before
         assert report.holdout_after > report.holdout_before + 3
         scenes.assert_invariants(found, scene)
-        gaps.append(abs(scenes.psnr_of(found, scene) - scenes.psnr_of(wanted, scene)))
+        gaps.append(abs(scenes.psnr_of(found, scene) - scenes.psnr_of(gradients, scene)))
     assert np.median(gaps) < 0.1
     assert max(gaps) < 1.0
 
@@ -167,9 +169,9 @@ def test_loss_is_the_kernels(size: tuple[int, int], ssim_lambda: float) -> None:
     weight = (rng.random(size) > 0.2).astype(np.float32)
     variable = torch.from_numpy(image).requires_grad_()
     image_loss(variable, torch.from_numpy(photo), torch.from_numpy(weight), ssim_lambda).backward()
-    wanted = image_gradient(image, photo, weight, ssim_lambda)
+    gradients = image_gradient(image, photo, weight, ssim_lambda)
     assert variable.grad is not None
-    assert np.linalg.norm(variable.grad.numpy() - wanted) <= 1e-3 * np.linalg.norm(wanted)
+    assert np.linalg.norm(variable.grad.numpy() - gradients) <= 1e-3 * np.linalg.norm(gradients)
 
 
 def test_nothing_to_fit(start: Gaussians, photos: Pair) -> None:
@@ -194,9 +196,9 @@ def test_stage_steps_where_it_is_told(start: Gaussians, photos: Pair, monkeypatc
     assert asked == ["start cuda", "cuda"]
     assert report is not None
     assert report.accepted
-    wanted, _ = fit(start, photos, QUICK, seed=4)
+    gradients, _ = fit(start, photos, QUICK, seed=4)
     assert len(asked) == 2
-    torch.testing.assert_close(found.means, wanted.means, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(found.means, gradients.means, rtol=1e-3, atol=1e-3)
     assert engine_for("cpu") is KERNELS
 
 
@@ -222,10 +224,10 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
         return image, torch.ones(len(colors), dtype=torch.bool, device=colors.device)
 
     plan = plan_run(photos, replace(QUICK, dropout=0.2), 0)
-    held = module.upload(start_state(start), torch.device("meta"))
+    tensors = module.upload(start_state(start), torch.device("meta"))
     for progress in (0.0, 0.9):
-        assert module.torch_step(held, plan, 1, 1, progress, np.random.default_rng(0)) == "meta"
-    assert held.x.is_meta
+        assert module.torch_step(tensors, plan, 1, 1, progress, np.random.default_rng(0)) == "meta"
+    assert tensors.x.is_meta
 
 
 @gpu
