@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import torch
 
 from gsmerge.moments import Members, feature_to_gaussians
-from gsmerge.networks import Checkpoint, Learned
+from gsmerge.networks import Checkpoint, NetworkContext
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.run_log import RunLog
@@ -55,7 +55,7 @@ class Merged:
 
     features: FeatureGaussians
     members: Members
-    learned: Learned | None
+    learned: NetworkContext | None
     ones: Gaussians | None = None
 
 
@@ -95,7 +95,7 @@ def merged_groups(source: Source, grouping: Grouping, options: CompactOptions, l
     if source.checkpoint is None:
         return Merged(_merged_features(source.scene, members, grouping, options, log, None), members, None)
     networks, cameras = source.checkpoint.networks, source.scene.cameras
-    learned = Learned(networks, members, cameras, options.seed, options.precision)
+    learned = NetworkContext(networks, members, cameras, options.seed, options.precision)
     if options.checkpoint == "auto":
         return _better(source, (members, learned), grouping, options, log)
     log.choices["networks"] = source.checkpoint.facts()
@@ -104,7 +104,7 @@ def merged_groups(source: Source, grouping: Grouping, options: CompactOptions, l
 
 
 def _better(
-    source: Source, known: tuple[Members, Learned], grouping: Grouping, options: CompactOptions, log: RunLog
+    source: Source, known: tuple[Members, NetworkContext], grouping: Grouping, options: CompactOptions, log: RunLog
 ) -> Merged:
     """Feature Gaussians with and without networks: those whose Gaussians, one for each, show the views better.
 
@@ -150,7 +150,7 @@ def _merged_features(
     grouping: Grouping,
     options: CompactOptions,
     log: RunLog,
-    learned: Learned | None,
+    learned: NetworkContext | None,
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, the merge that the photos prefer, and merging across views."""
     with log.stage("encode"):
@@ -195,7 +195,7 @@ def _matched(
     features: FeatureGaussians,
     options: CompactOptions,
     log: RunLog,
-    learned: Learned | None,
+    learned: NetworkContext | None,
     finish: Callable[[FeatureGaussians], FeatureGaussians],
 ) -> FeatureGaussians:
     """Merged across views; where networks are loaded, in line with their neighbours; then what ``finish`` does."""

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from gsmerge.geometry import rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
-from gsmerge.networks.residuals import HALF, RESIDUAL, bounded, move_features, move_gaussians, squashed
+from gsmerge.networks.residuals import HALF, RESIDUAL, bounded, move_features, move_gaussians, tanh_bounded
 from gsmerge.networks.subsets import choose, point_dice, runs, tables
-from gsmerge.networks.tokens import Described, describe, member_tokens, part_tokens
+from gsmerge.networks.tokens import GroupFeatures, compute_group_features, member_tokens, part_tokens
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
@@ -22,7 +22,7 @@ Work = Callable[[np.ndarray, int], Tensor]  # rows of a table and its width -> [
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class NetworkContext:
     """The networks, and what they look at besides the Feature Gaussians.
 
     Args:
@@ -39,11 +39,11 @@ class Learned:
     seed: int = 0
     precision: str = "float32"
 
-    def describe(self, features: FeatureGaussians) -> Described:
+    def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """The Feature Gaussians as the networks see them."""
-        return describe(features, self.members, self.cameras)
+        return compute_group_features(features, self.members, self.cameras)
 
-    def through(self, network: nn.Module, *inputs: Tensor) -> Tensor:
+    def run(self, network: nn.Module, *inputs: Tensor) -> Tensor:
         """What one of the networks says: float32 on the CPU, wherever it runs; several outputs side by side."""
         device = next(network.parameters()).device
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
@@ -69,32 +69,32 @@ def by_table(sizes: np.ndarray, most: int, columns: int, work: Work) -> Tensor:
     return torch.zeros(len(sizes), columns).index_copy(0, order, torch.cat(parts))
 
 
-def encode_features(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
+def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Feature Gaussians with latents, and with means that the encoder has moved (paper section 4.2).
 
     Args:
         features: g analytic Feature Gaussians.
-        learned: The networks and the scene.
+        context: The networks and the scene.
     """
-    described = learned.describe(features)
-    encoded = encoder_outputs(features, described, learned)
-    return with_encoding(features, described, encoded, learned.networks)[0]
+    group_features = context.describe(features)
+    encoded = encoder_outputs(features, group_features, context)
+    return with_encoding(features, group_features, encoded, context.networks)[0]
 
 
-def encoder_outputs(features: FeatureGaussians, described: Described, learned: Learned) -> Tensor:
+def encoder_outputs(features: FeatureGaussians, group_features: GroupFeatures, context: NetworkContext) -> Tensor:
     """``[g,latent+3]`` raw latents and shifts."""
     starts, ids = features.starts.numpy(), features.members.numpy()
-    sizes, options = np.diff(starts), learned.networks.options
-    dice, axes = point_dice(features.means.numpy(), learned.seed), _longest_axes(described.base)
+    sizes, options = np.diff(starts), context.networks.options
+    dice, axes = point_dice(features.means.numpy(), context.seed), _longest_axes(group_features.base)
 
     def work(rows: np.ndarray, width: int) -> Tensor:
         found, owners = runs(starts[rows], sizes[rows])
-        away = learned.members.means[ids[found]] - described.base.means.numpy()[rows[owners]]
+        away = context.members.means[ids[found]] - group_features.base.means.numpy()[rows[owners]]
         picked, mask = choose((away * axes[rows[owners]]).sum(1), sizes[rows], width, dice[rows])
         own = torch.from_numpy(np.repeat(rows, width))
-        tokens = member_tokens(learned.members, ids[found][picked.reshape(-1)], described, own)
-        group = described.group[torch.from_numpy(rows)]
-        return learned.through(learned.networks.encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
+        tokens = member_tokens(context.members, ids[found][picked.reshape(-1)], group_features, own)
+        group = group_features.group[torch.from_numpy(rows)]
+        return context.run(context.networks.encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
 
     return by_table(sizes, options.members, options.latent + 3, work)
 
@@ -106,30 +106,30 @@ def _longest_axes(base: Gaussians) -> np.ndarray:
 
 
 def with_encoding(
-    features: FeatureGaussians, described: Described, encoded: Tensor, networks: Networks
+    features: FeatureGaussians, group_features: GroupFeatures, encoded: Tensor, networks: Networks
 ) -> tuple[FeatureGaussians, Tensor]:
     """The Feature Gaussians with what the encoder says of them, and the corrections ``[g,13]``.
 
     Gradients flow through the latents and the corrections, never through the geometry.
     """
-    shift = networks.options.bounds.mean * HALF * squashed(encoded[:, -3:])
+    shift = networks.options.bounds.mean * HALF * tanh_bounded(encoded[:, -3:])
     shift = torch.where(features.backing[:, None], 0, shift)
     residuals = torch.cat([shift, torch.zeros(len(features), RESIDUAL - 3)], 1)
-    moved = move_features(features, described.base, residuals.detach(), described.frames)
-    return replace(moved, latents=squashed(encoded[:, :-3])), residuals
+    moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
+    return replace(moved, latents=tanh_bounded(encoded[:, :-3])), residuals
 
 
-def match_geometry(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
+def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Feature Gaussians as the K = 1 head would decode them, for matching (paper section 4.3)."""
-    if learned.networks.options.outputs == "absolute":
+    if context.networks.options.outputs == "absolute":
         return features  # a head that begins at nothing says nothing of moments
-    described = learned.describe(features)
-    residuals = head_residuals(described.base, np.arange(len(features)), features, described, learned)
-    return move_features(features, described.base, residuals, described.frames)
+    group_features = context.describe(features)
+    residuals = head_residuals(group_features.base, np.arange(len(features)), features, group_features, context)
+    return move_features(features, group_features.base, residuals, group_features.frames)
 
 
 def merge_features(
-    pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, learned: Learned
+    pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
 ) -> FeatureGaussians:
     """Pooled Feature Gaussians with the merger's corrections (paper section 4.4).
 
@@ -138,51 +138,51 @@ def merge_features(
         parts: What was pooled.
         order: ``[n]`` rows of ``parts``, cluster by cluster.
         cuts: ``[c]`` where each cluster begins in ``order``.
-        learned: The networks and the scene.
+        context: The networks and the scene.
     """
-    described = learned.describe(pooled)
-    raw = merger_outputs(pooled, described, parts, order, cuts, learned)
-    return with_corrections(pooled, described, raw, learned.networks)[0]
+    group_features = context.describe(pooled)
+    raw = merger_outputs(pooled, group_features, parts, order, cuts, context)
+    return with_corrections(pooled, group_features, raw, context.networks)[0]
 
 
 def merger_outputs(
     pooled: FeatureGaussians,
-    described: Described,
+    group_features: GroupFeatures,
     parts: FeatureGaussians,
     order: np.ndarray,
     cuts: np.ndarray,
-    learned: Learned,
+    context: NetworkContext,
 ) -> Tensor:
     """``[c,13+latent]`` raw corrections of clusters, see :func:`merge_features`."""
     base = feature_to_gaussians(parts)
-    sizes, options = np.diff(np.append(cuts, len(order))), learned.networks.options
-    dice = point_dice(pooled.means.numpy(), learned.seed)
+    sizes, options = np.diff(np.append(cuts, len(order))), context.networks.options
+    dice = point_dice(pooled.means.numpy(), context.seed)
 
     def work(rows: np.ndarray, width: int) -> Tensor:
         found, owners = runs(cuts[rows], sizes[rows])
         keys = ((base.means.numpy()[order[found]] - pooled.means.numpy()[rows[owners]]) ** 2).sum(1)
         picked, mask = choose(keys, sizes[rows], width, dice[rows])
         ids = torch.from_numpy(order[found][picked.reshape(-1)])
-        beside = part_tokens(base[ids], described, torch.from_numpy(np.repeat(rows, width)))
+        beside = part_tokens(base[ids], group_features, torch.from_numpy(np.repeat(rows, width)))
         tokens = torch.cat([beside, parts.latents[ids]], 1).unflatten(0, mask.shape)
-        group = described.group[torch.from_numpy(rows)]
-        return learned.through(learned.networks.merger, tokens, torch.from_numpy(mask), group)
+        group = group_features.group[torch.from_numpy(rows)]
+        return context.run(context.networks.merger, tokens, torch.from_numpy(mask), group)
 
     return by_table(sizes, options.members, RESIDUAL + options.latent, work)
 
 
-def refine_features(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
+def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Feature Gaussians with what the refiner reads off their neighbours (paper section 4.5)."""
     if len(features) == 0:
         return features
-    neighbors = nearest(features, learned.networks.options.neighbors)
-    described = learned.describe(features)
-    raw = refiner_outputs(features, described, neighbors, learned)
-    return with_corrections(features, described, raw, learned.networks)[0]
+    neighbors = nearest(features, context.networks.options.neighbors)
+    group_features = context.describe(features)
+    raw = refiner_outputs(features, group_features, neighbors, context)
+    return with_corrections(features, group_features, raw, context.networks)[0]
 
 
 def refiner_outputs(
-    features: FeatureGaussians, described: Described, neighbors: np.ndarray, learned: Learned
+    features: FeatureGaussians, group_features: GroupFeatures, neighbors: np.ndarray, context: NetworkContext
 ) -> Tensor:
     """``[g,13+latent]`` raw corrections from ``neighbors [g,k]``, -1 where there are fewer."""
     count, width = len(features), neighbors.shape[1] + 1
@@ -193,13 +193,13 @@ def refiner_outputs(
         ids, own = torch.from_numpy(table[rows].reshape(-1)), torch.from_numpy(np.repeat(rows, width))
         mask = ids >= 0
         ids = torch.where(mask, ids, own)
-        beside = part_tokens(described.base[ids], described, own)
+        beside = part_tokens(group_features.base[ids], group_features, own)
         same = (views[ids] == views[own]).float()[:, None]
         tokens = torch.cat([beside, same, features.latents[ids]], 1).unflatten(0, (len(rows), width))
-        inside, group = mask.unflatten(0, (len(rows), width)), described.group[torch.from_numpy(rows)]
-        return learned.through(learned.networks.refiner, tokens, inside, group)
+        inside, group = mask.unflatten(0, (len(rows), width)), group_features.group[torch.from_numpy(rows)]
+        return context.run(context.networks.refiner, tokens, inside, group)
 
-    columns = RESIDUAL + learned.networks.options.latent
+    columns = RESIDUAL + context.networks.options.latent
     return by_table(np.full(count, width), 1 << (width - 1).bit_length(), columns, work)
 
 
@@ -223,7 +223,7 @@ def nearest(features: FeatureGaussians, count: int) -> np.ndarray:
 
 
 def with_corrections(
-    features: FeatureGaussians, described: Described, raw: Tensor, networks: Networks
+    features: FeatureGaussians, group_features: GroupFeatures, raw: Tensor, networks: Networks
 ) -> tuple[FeatureGaussians, Tensor]:
     """Feature Gaussians with the raw corrections of merger or refiner, and the bounded ones ``[g,13]``.
 
@@ -231,12 +231,12 @@ def with_corrections(
     """
     own = torch.where(features.backing[:, None], 0, raw)
     residuals = bounded(own[:, :RESIDUAL], networks.options.bounds, HALF)
-    moved = move_features(features, described.base, residuals.detach(), described.frames)
-    return replace(moved, latents=features.latents + squashed(own[:, RESIDUAL:])), residuals
+    moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
+    return replace(moved, latents=features.latents + tanh_bounded(own[:, RESIDUAL:])), residuals
 
 
 def decode_gaussians(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, learned: Learned
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, context: NetworkContext
 ) -> Gaussians:
     """Children of Feature Gaussians with the corrections of the head for their number (paper section 4.3).
 
@@ -246,22 +246,30 @@ def decode_gaussians(
         children: Analytic Gaussians, those of one Feature Gaussian next to each other.
         parents: ``[n]`` the Feature Gaussian of each, rising.
         features: The Feature Gaussians.
-        learned: The networks and the scene.
+        context: The networks and the scene.
     """
-    return decode_described(children, parents, features, learned.describe(features), learned)
+    return decode_with_group_features(children, parents, features, context.describe(features), context)
 
 
-def decode_described(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+def decode_with_group_features(
+    children: Gaussians,
+    parents: np.ndarray,
+    features: FeatureGaussians,
+    group_features: GroupFeatures,
+    context: NetworkContext,
 ) -> Gaussians:
     """:func:`decode_gaussians` of Feature Gaussians that are described already: no members are looked at."""
-    children = head_starts(children, parents, features, described, learned.networks)
-    residuals = head_residuals(children, parents, features, described, learned)
-    return move_gaussians(children, residuals, described.frames[torch.from_numpy(parents)])
+    children = head_starts(children, parents, features, group_features, context.networks)
+    residuals = head_residuals(children, parents, features, group_features, context)
+    return move_gaussians(children, residuals, group_features.frames[torch.from_numpy(parents)])
 
 
 def head_starts(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, networks: Networks
+    children: Gaussians,
+    parents: np.ndarray,
+    features: FeatureGaussians,
+    group_features: GroupFeatures,
+    networks: Networks,
 ) -> Gaussians:
     """What the heads correct: the children; for absolute outputs a round grey Gaussian in the place of each.
 
@@ -273,8 +281,8 @@ def head_starts(
     sizes = np.bincount(parents, minlength=len(features))[parents]
     taken = torch.from_numpy((sizes <= SLOTS[-1]) & ~features.backing.numpy()[parents])
     own = torch.from_numpy(parents)
-    place, size = described.base.means[own], described.sizes[own, None].expand(-1, 3)
-    axes = rotmat_to_quat(described.frames.double())[own].to(children.quats)
+    place, size = group_features.base.means[own], group_features.sizes[own, None].expand(-1, 3)
+    axes = rotmat_to_quat(group_features.frames.double())[own].to(children.quats)
     return replace(
         children,
         means=torch.where(taken[:, None], place, children.means),
@@ -286,10 +294,14 @@ def head_starts(
 
 
 def head_residuals(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+    children: Gaussians,
+    parents: np.ndarray,
+    features: FeatureGaussians,
+    group_features: GroupFeatures,
+    context: NetworkContext,
 ) -> Tensor:
     """``[n,13]`` bounded corrections of children; zero for the backing layer and for five or more of one parent."""
-    networks, count = learned.networks, len(children)
+    networks, count = context.networks, len(children)
     sizes = np.bincount(parents, minlength=len(features))
     first = np.cumsum(sizes) - sizes
     residuals = torch.zeros(count, RESIDUAL)
@@ -300,7 +312,7 @@ def head_residuals(
         places = np.arange(slots)[None]
         mask = places < sizes[rows, None]
         ids = first[rows, None] + np.where(mask, places, 0)
-        raw = _head_outputs(slots, children, (rows, ids, mask), features, described, learned)
+        raw = _head_outputs(slots, children, (rows, ids, mask), features, group_features, context)
         taken = torch.from_numpy(mask.reshape(-1))
         where = torch.from_numpy(ids.reshape(-1))[taken]
         residuals = residuals.index_copy(0, where, bounded(raw[taken], networks.options.head_bounds))
@@ -312,18 +324,20 @@ def _head_outputs(
     children: Gaussians,
     table: tuple[np.ndarray, np.ndarray, np.ndarray],
     features: FeatureGaussians,
-    described: Described,
-    learned: Learned,
+    group_features: GroupFeatures,
+    context: NetworkContext,
 ) -> Tensor:
     """``[r·slots,13]`` raw corrections of a table of parents' rows, children's rows and mask."""
     parents, ids, mask = table
-    head = learned.networks.heads[str(slots)]
+    head = context.networks.heads[str(slots)]
 
     def work(rows: np.ndarray, _: int) -> Tensor:
         own = torch.from_numpy(parents[rows])
         picked = torch.from_numpy(ids[rows].reshape(-1))
-        beside = part_tokens(children[picked], described, own.repeat_interleave(slots)).unflatten(0, (len(rows), slots))
-        known = features.latents[own], described.group[own]
-        return learned.through(head, *known, beside, torch.from_numpy(mask[rows])).flatten(1)
+        beside = part_tokens(children[picked], group_features, own.repeat_interleave(slots)).unflatten(
+            0, (len(rows), slots)
+        )
+        known = features.latents[own], group_features.group[own]
+        return context.run(head, *known, beside, torch.from_numpy(mask[rows])).flatten(1)
 
     return by_table(np.full(len(parents), slots), slots, slots * RESIDUAL, work).reshape(-1, RESIDUAL)

@@ -28,10 +28,10 @@ def limits(bounds: Bounds) -> Tensor:
 
 def bounded(raw: Tensor, bounds: Bounds, share: float = 1.0) -> Tensor:
     """Corrections ``[...,13]`` of raw outputs: within ``share`` of the bounds, whatever the network says."""
-    return share * limits(bounds).to(raw) * squashed(raw)
+    return share * limits(bounds).to(raw) * tanh_bounded(raw)
 
 
-def squashed(raw: Tensor) -> Tensor:
+def tanh_bounded(raw: Tensor) -> Tensor:
     """Raw outputs between -1 and 1; what is not a number becomes 0."""
     return torch.tanh(raw.nan_to_num())
 

@@ -15,18 +15,18 @@ from torch import Tensor
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import Members, feature_to_gaussians
-from gsmerge.networks.evidence import EVIDENCE, evidence
+from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
 from gsmerge.networks.residuals import sizes_of
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
 
 PART = 13  # of a Gaussian beside another one: place, log scales, opacity, colour, normal
 MEMBER = PART + 6  # and place in footprints, colour itself
-GROUP = 19 + EVIDENCE
+GROUP = 19 + NUM_STATS
 TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class GroupFeatures:
     """Feature Gaussians as the networks see them.
 
     Args:
@@ -46,24 +46,24 @@ class Described:
     group: Tensor
 
 
-def describe(features: FeatureGaussians, members: Members, cameras: Cameras) -> Described:
+def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
     """Feature Gaussians for the networks."""
     views = own_views(features, members, cameras)
-    bare = described_by(features, views, torch.zeros(len(features), 0), cameras)
+    bare = make_group_features(features, views, torch.zeros(len(features), 0), cameras)
     places = image_places(features.means, views, cameras)
-    told = evidence(features.means, features.sh0, views, members, cameras)
-    return replace(bare, group=torch.cat([_group_numbers(features, bare), places, told], 1).nan_to_num())
+    stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
+    return replace(bare, group=torch.cat([_group_numbers(features, bare), places, stats], 1).nan_to_num())
 
 
-def described_by(features: FeatureGaussians, views: Tensor, group: Tensor, cameras: Cameras) -> Described:
+def make_group_features(features: FeatureGaussians, views: Tensor, group: Tensor, cameras: Cameras) -> GroupFeatures:
     """Feature Gaussians whose ``views [g]`` and numbers ``group [g,GROUP]`` are known: no members are looked at."""
     base = feature_to_gaussians(features)
     sizes = sizes_of(base.scales / features.spreads[:, None]).clamp_min(TINY)
     frames = ray_frames(features.means, views, cameras)
-    return Described(base, frames, sizes, features.footprints.clamp_min(TINY), views, group)
+    return GroupFeatures(base, frames, sizes, features.footprints.clamp_min(TINY), views, group)
 
 
-def _group_numbers(features: FeatureGaussians, bare: Described) -> Tensor:
+def _group_numbers(features: FeatureGaussians, bare: GroupFeatures) -> Tensor:
     """``[g,17]``: scales, opacity, mass, optical depth, members, colour, covariance."""
     base, frames, sizes, footprints = bare.base, bare.frames, bare.sizes, bare.footprints
     num_members = (features.starts[1:] - features.starts[:-1]).float()
@@ -121,15 +121,15 @@ def image_places(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
     return (camera[:, :2] / camera[:, 2:].clamp_min(1e-6)).clamp(-3, 3)
 
 
-def part_tokens(parts: Gaussians, described: Described, owners: Tensor) -> Tensor:
+def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor) -> Tensor:
     """``[n,PART]``: Gaussians beside the Feature Gaussians that they belong to.
 
     Args:
         parts: n Gaussians.
-        described: The Feature Gaussians.
+        group_features: The Feature Gaussians.
         owners: ``[n]`` the Feature Gaussian of each.
     """
-    frames, d = described.frames[owners].transpose(1, 2), described
+    frames, d = group_features.frames[owners].transpose(1, 2), group_features
     normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
     axes = frames @ torch.stack([parts.means - d.base.means[owners], normals], 2)
     scales = parts.scales.sort(1).values.clamp_min(TINY)
@@ -145,17 +145,17 @@ def part_tokens(parts: Gaussians, described: Described, owners: Tensor) -> Tenso
     return torch.cat(columns, 1).nan_to_num()
 
 
-def member_tokens(members: Members, ids: np.ndarray, described: Described, owners: Tensor) -> Tensor:
+def member_tokens(members: Members, ids: np.ndarray, group_features: GroupFeatures, owners: Tensor) -> Tensor:
     """``[n,MEMBER]``: members of groups, relative to their Feature Gaussians.
 
     Args:
         members: The scene's Gaussians.
         ids: ``[n]`` rows of them.
-        described: The Feature Gaussians.
+        group_features: The Feature Gaussians.
         owners: ``[n]`` the group of each.
     """
     columns = (members.means, members.quats, members.scales, members.opacities, members.sh0, members.shN[:, :0])
     picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
-    tokens = part_tokens(picked, described, owners)
-    places = described.sizes[owners, None] / described.footprints[owners, None] * torch.sinh(tokens[:, :3])
+    tokens = part_tokens(picked, group_features, owners)
+    places = group_features.sizes[owners, None] / group_features.footprints[owners, None] * torch.sinh(tokens[:, :3])
     return torch.cat([tokens, torch.asinh(places), SH_C0 * picked.sh0[:, 0]], 1)

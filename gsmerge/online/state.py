@@ -16,7 +16,7 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredSettings, without_members
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.stages.prepare import Frame
@@ -102,7 +102,7 @@ class OnlineState:
 
 
 def baked(
-    features: FeatureGaussians, members: Members, learned: Learned | None, most: int, rule: Rule = "depth"
+    features: FeatureGaussians, members: Members, learned: NetworkContext | None, most: int, rule: Rule = "depth"
 ) -> Parts:
     """Groups as what they decode to: gains, spreads, latents and heads are in the result and needed no more.
 

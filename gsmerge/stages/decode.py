@@ -10,7 +10,7 @@ import torch
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
 
@@ -51,7 +51,7 @@ def decode(
     options: DecodeOptions,
     counts: np.ndarray | None = None,
     rule: Rule = "depth",
-    learned: Learned | None = None,
+    learned: NetworkContext | None = None,
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 

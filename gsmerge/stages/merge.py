@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks import Learned, merge_features
+from gsmerge.networks import NetworkContext, merge_features
 from gsmerge.types import FeatureGaussians, Matches
 
 
-def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None = None) -> FeatureGaussians:
+def merge(features: FeatureGaussians, matches: Matches, learned: NetworkContext | None = None) -> FeatureGaussians:
     """One Feature Gaussian per cluster; those that are alone pass unchanged.
 
     Members are weighted with their opacities times what the photos say of them (gains); masses and integrated

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from gsmerge.networks import Learned, refine_features
+from gsmerge.networks import NetworkContext, refine_features
 from gsmerge.types import FeatureGaussians
 
 
-def refine(features: FeatureGaussians, learned: Learned | None) -> FeatureGaussians:
+def refine(features: FeatureGaussians, learned: NetworkContext | None) -> FeatureGaussians:
     """Feature Gaussians with the refiner's corrections (paper section 4.5); as they are without networks.
 
     Args:

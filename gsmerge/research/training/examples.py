@@ -28,7 +28,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.evaluate import Views
 from gsmerge.moments import Members
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, sizes_of
-from gsmerge.networks.tokens import describe
+from gsmerge.networks.tokens import compute_group_features
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.options import TrainOptions
@@ -245,7 +245,7 @@ def _worked_out(
     merged = merge(features, matches)
     columns: dict[str, Any] = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
     columns |= {"clusters": matches.clusters.numpy(), "centres": merged.means.numpy()}
-    frames = describe(merged, members, scene.cameras).frames
+    frames = compute_group_features(merged, members, scene.cameras).frames
     masks = covered(subject)
     columns["masks"] = reduced_masks(masks, subject.photos(options.photo_scale))
     teacher = _teacher(subject, masks, name)

@@ -10,7 +10,7 @@ from learned import SMALL, Made, made, noisy
 
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import (
-    Learned,
+    NetworkContext,
     NetworkOptions,
     Networks,
     decode_gaussians,
@@ -236,7 +236,7 @@ def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
         f, means=f.means * factor, covars=f.covars * factor**2, masses=f.masses * factor**3,
         extinctions=f.extinctions * factor**2, footprints=f.footprints * factor,
     )  # fmt: skip
-    other = Learned(learned.networks, members, replace(cameras, viewmats=viewmats))
+    other = NetworkContext(learned.networks, members, replace(cameras, viewmats=viewmats))
     a, b = encode_features(f, learned), encode_features(larger, other)
     torch.testing.assert_close(a.means * factor, b.means, rtol=1e-5, atol=1e-5 * factor)
 
@@ -244,15 +244,15 @@ def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
 def test_gradients_reach_every_parameter(scene: Made) -> None:
     networks = noisy().requires_grad_(True)
     learned = scene.learned(networks)
-    described = learned.describe(scene.features)
-    encoded = encoder_outputs(scene.features, described, learned)
+    group_features = learned.describe(scene.features)
+    encoded = encoder_outputs(scene.features, group_features, learned)
     features = replace(scene.features, latents=torch.tanh(encoded[:, :-3]))
     total = encoded.square().sum()
     for k in (1, 2, 4):
         sizes = np.full(len(features), k)
         parents = np.repeat(np.arange(len(features)), sizes)
         base = feature_to_gaussians(scene.features)[torch.from_numpy(parents)]
-        total = total + head_residuals(base, parents, features, described, learned).square().sum()
+        total = total + head_residuals(base, parents, features, group_features, learned).square().sum()
     merged = merge(features, pairs(features), learned)
     total = total + refine_features(merged, learned).latents.square().sum()
     total.backward()

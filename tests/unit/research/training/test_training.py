@@ -14,7 +14,7 @@ from training_runs import OPTIONS, TINY
 
 import gsmerge
 from gsmerge.errors import SceneError
-from gsmerge.networks import Learned, NetworkOptions, Networks, load_checkpoint
+from gsmerge.networks import NetworkContext, NetworkOptions, Networks, load_checkpoint
 from gsmerge.networks.apply import encode_features, head_residuals, refine_features
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussians
 from gsmerge.research.training import (
@@ -94,7 +94,7 @@ def test_owners_are_the_rows_after_merging(example: Example) -> None:
 def test_what_is_trained_is_what_runs(example: Example) -> None:
     """The corrections of a crop that holds everything are those that the stages make."""
     networks = noisy(TINY)
-    learned = Learned(networks, example.members, example.cameras, 5)
+    learned = NetworkContext(networks, example.members, example.cameras, 5)
     everything = torch.arange(len(example.centres))
     encoded = encode_features(example.features, learned)
     refined = refine_features(merge(encoded, example.matches, learned), learned)
@@ -102,8 +102,8 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     crop = Crop(example, 2, everything, torch.arange(len(level.children)), level.mask)
     with torch.no_grad():
         found = predicted(crop, networks, 5)
-    described = learned.describe(refined)
-    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, learned)
+    group_features = learned.describe(refined)
+    wanted = head_residuals(level.children, level.parents.numpy(), refined, group_features, learned)
     torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
     first = replace(crop, k=1, children=everything, judged=example.levels[1].mask)
     with torch.no_grad():
