@@ -95,7 +95,7 @@ def merged_groups(source: Source, grouping: Grouping, options: CompactOptions, l
     if source.checkpoint is None:
         return Merged(_merged_features(source.scene, members, grouping, options, log, None), members, None)
     networks, cameras = source.checkpoint.networks, source.scene.cameras
-    learned = NetworkContext(networks, members, cameras, options.seed, options.precision)
+    learned = NetworkContext(networks, members, cameras, options.seed)
     if options.checkpoint == "auto":
         return _better(source, (members, learned), grouping, options, log)
     log.choices["networks"] = source.checkpoint.facts()

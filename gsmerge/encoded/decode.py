@@ -128,6 +128,6 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
     if heads is not None:
         group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-        learned = NetworkContext(heads.networks, nothing, encoded.cameras, precision=heads.precision)
+        learned = NetworkContext(heads.networks, nothing, encoded.cameras)
         gaussians = decode_with_group_features(gaussians, parents, features, group_features, learned)
     return gaussians, parents

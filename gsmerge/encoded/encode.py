@@ -100,7 +100,7 @@ def _kept(work: Work, grouping: Grouping, merged: Merged, max_k: int | None, log
     heads = None
     if learned is not None:
         group_features = learned.describe(features)
-        heads = StoredHeads(learned.networks, learned.precision, group_features.views, group_features.group)
+        heads = StoredHeads(learned.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, most, options.encode.rule),

@@ -1,4 +1,4 @@
-"""The paper's networks as bounded corrections of the analytic stages, and the checkpoints that hold them."""
+"""The paper's networks as bounded corrections of the analytic stages, and their checkpoints."""
 
 from gsmerge.networks.apply import (
     NetworkContext,
