@@ -99,8 +99,8 @@ def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, lo
     )
     heads = None
     if networks is not None:
-        described = networks.describe(features)
-        heads = StoredHeads(networks.networks, networks.precision, described.views, described.group)
+        group_features = networks.describe(features)
+        heads = StoredHeads(networks.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, most, options.encode.rule),

@@ -91,7 +91,8 @@ def rasterize(
         with_depths: Also the mean depth.
 
     Returns:
-        Images, alphas and depths, on the device of the tensors, the depths without gradients; and ``[c,n]`` bool: which Gaussians have a footprint in which view.
+        Images, alphas and depths, on the device of the tensors, the depths without gradients; and ``[c,n]`` bool: which
+        Gaussians have a footprint in which view.
 
     Raises:
         GsmergeError: If gsplat is not installed.

@@ -10,7 +10,7 @@ import torch
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import FeatureGaussians, Gaussians
@@ -53,7 +53,7 @@ def decode(
     options: DecodeOptions,
     counts: np.ndarray | None = None,
     rule: Rule = "depth",
-    learned: Learned | None = None,
+    networks: NetworkContext | None = None,
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 
@@ -66,7 +66,7 @@ def decode(
         options: K and the least opacity.
         counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter.
         rule: How children are pooled, the encoder's.
-        learned: Networks whose heads correct the children; None: none does.
+        networks: Networks whose heads correct the children; None: none does.
 
     Returns:
         The Gaussians, those of one group next to each other.
@@ -79,8 +79,8 @@ def decode(
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
-    if learned is not None:
-        gaussians = decode_gaussians(gaussians, parents, features, learned)
+    if networks is not None:
+        gaussians = decode_gaussians(gaussians, parents, features, networks)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
-from gsmerge.networks import Learned, match_geometry
+from gsmerge.networks import NetworkContext, match_geometry
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
@@ -64,14 +64,14 @@ class MatchOptions:
         return self.match or ("none" if self.effort == "draft" else "overlap")
 
 
-def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | None = None) -> Matches:
+def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
     """Clusters of Feature Gaussians of different views.
 
     The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
     are taken by weight, ties by position. What is fully transparent is left alone.
     """
-    if learned is not None and options.geometry == "decoded" and options.method != "none":
-        features = match_geometry(features, learned)
+    if networks is not None and options.geometry == "decoded" and options.method != "none":
+        features = match_geometry(features, networks)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0

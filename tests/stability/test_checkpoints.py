@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from learned import noisy, scaled, written
 from loose import shuffled
+from networks import noisy, scaled, written
 from safetensors.torch import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
 
@@ -28,14 +28,14 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
     scene = make_scene(room(), arc(3))
     path = written(tmp_path / "a.safetensors", Networks())
     chosen = {"robust": False, "superpixels": 80, "fit": "color", **settings}
-    plain, learned = (
+    plain, networks = (
         gsmerge.compact(scene, **chosen, checkpoint="none"),
         gsmerge.compact(scene, **chosen, checkpoint=str(path)),
     )
-    assert identical(plain.gaussians, learned.gaussians)
-    assert learned.report.choices["networks"]["checkpoint"] == str(path)
+    assert identical(plain.gaussians, networks.gaussians)
+    assert networks.report.choices["networks"]["checkpoint"] == str(path)
     assert "networks" not in plain.report.choices
-    assert "refine" in learned.report.seconds
+    assert "refine" in networks.report.seconds
 
 
 def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ C1, C2 = f4(1e-4), f4(9e-4)  # SSIM's constants for a data range of 1
 
 
 @kernel
-def _gather(row, row_x, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scale, opacity):
+def _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scale, opacity):
     """Gradient row of a Gaussian in the optimiser's parameters: means in units of its size, log, logit."""
     for c in range(3):
         row[MEAN + c] = g_means[k, c] * unit
@@ -73,7 +73,7 @@ def adam(
     for i in range(first, last):
         unit = units[i]
         if k < ids.shape[0] and ids[k] == i:
-            _gather(row, x[i], unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
+            _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
             k += 1
         else:
             row[:] = f4(0.0)

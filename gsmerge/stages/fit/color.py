@@ -44,7 +44,7 @@ class Drawn:
 class _System:
     """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``.
 
-    ``color_precision [n,1]`` is the diagonal of the normal equations of earlier photos, which the present colours solve.
+    ``color_precision [n,1]`` is the diagonal of earlier photos' normal equations, which the present colours solve.
     """
 
     drawn: Drawn

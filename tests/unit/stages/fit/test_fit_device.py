@@ -62,18 +62,18 @@ def run(gaussians: Gaussians, photos: Pair, options: FitOptions, engine: Engine,
     return state, errors
 
 
-def assert_same_state(found: State, gradients: State) -> None:
+def assert_same_state(ours: State, expected: State) -> None:
     """Parameters to 1e-3, most of them far closer; what they mean to the rasterizer is up to date."""
-    assert found.x.shape == gradients.x.shape
-    moved = np.abs(gradients.x - gradients.x0).max(0)
+    assert ours.x.shape == expected.x.shape
+    moved = np.abs(expected.x - expected.x0).max(0)
     assert (moved > 0.01).all()
-    np.testing.assert_allclose(found.x, gradients.x, atol=1e-3)
-    assert np.median(np.abs(found.x - gradients.x)) < 1e-5
-    assert np.linalg.norm(found.m - gradients.m) <= 1e-3 * np.linalg.norm(gradients.m)
-    assert np.linalg.norm(found.v - gradients.v) <= 1e-3 * np.linalg.norm(gradients.v)
+    np.testing.assert_allclose(ours.x, expected.x, atol=1e-3)
+    assert np.median(np.abs(ours.x - expected.x)) < 1e-5
+    assert np.linalg.norm(ours.m - expected.m) <= 1e-3 * np.linalg.norm(expected.m)
+    assert np.linalg.norm(ours.v - expected.v) <= 1e-3 * np.linalg.norm(expected.v)
     for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_allclose(getattr(found.splats, name), getattr(gradients.splats, name), rtol=1e-3, atol=1e-3)
-    np.testing.assert_array_equal(found.colors, found.x[:, 11:])
+        np.testing.assert_allclose(getattr(ours.splats, name), getattr(expected.splats, name), rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(ours.colors, ours.x[:, 11:])
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def assert_same_state(found: State, gradients: State) -> None:
 )
 def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
     options = replace(QUICK, **settings)
-    (found, errors), (gradients, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
+    (ours, errors), (expected, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
     assert_same_state(ours, expected)
     assert errors == pytest.approx(others, rel=1e-4)
 
@@ -90,18 +90,18 @@ def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[st
 def test_pulls_are_the_kernels(start: Gaussians, photos: Pair, pulls: dict[str, float]) -> None:
     """By the moments of one step, which are its gradient."""
     one = replace(PULLS if not pulls else QUICK, fit_steps=1, **pulls)
-    (found, _), (gradients, _), (without, _) = (
+    (ours, _), (expected, _), (without, _) = (
         run(start, photos, options, engine)
         for options, engine in ((one, torch_engine(CPU)), (one, KERNELS), (replace(QUICK, fit_steps=1), KERNELS))
     )
-    assert np.linalg.norm(found.m - gradients.m) <= 1e-4 * np.linalg.norm(gradients.m)
-    assert np.linalg.norm(without.m - gradients.m) > 1e-3 * np.linalg.norm(gradients.m)
+    assert np.linalg.norm(ours.m - expected.m) <= 1e-4 * np.linalg.norm(expected.m)
+    assert np.linalg.norm(without.m - expected.m) > 1e-3 * np.linalg.norm(expected.m)
 
 
 @pytest.mark.parametrize("degree", [1, 3])
 def test_steps_are_the_kernels_with_harmonics(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
-    found, gradients = (
+    ours, expected = (
         run(scenes.spoil(truth), scenes.pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS)
     )
     assert_same_state(ours, expected)
@@ -110,7 +110,7 @@ def test_steps_are_the_kernels_with_harmonics(degree: int) -> None:
 
 def test_growth_goes_on_from_the_tensors(start: Gaussians, photos: Pair) -> None:
     ours, expected = (run(start, photos, QUICK, e, grown=30)[0] for e in (torch_engine(CPU), KERNELS))
-    assert len(found.x) == len(start) + 30
+    assert len(ours.x) == len(start) + 30
     assert_same_state(ours, expected)
 
 
@@ -129,25 +129,25 @@ def test_box_is_the_kernels(start: Gaussians, photos: Pair) -> None:
     odd = replace(start, sh0=start.sh0.clone(), quats=start.quats.clone())
     odd.sh0[:9], odd.quats[9:12] = 4.0, 0.0
     ours, expected = (run(odd, photos, options, e)[0] for e in (torch_engine(CPU), KERNELS))
-    np.testing.assert_allclose(found.x, gradients.x, atol=1e-3)
-    reached = np.abs(found.x - found.x0)[:, 3:6].max(1)
+    np.testing.assert_allclose(ours.x, expected.x, atol=1e-3)
+    reached = np.abs(ours.x - ours.x0)[:, 3:6].max(1)
     assert np.isclose(reached, 0.1, atol=1e-5).mean() > 0.5
-    assert found.x[:, 11:].max() > 1.05
-    assert np.isfinite(found.x).all()
+    assert ours.x[:, 11:].max() > 1.05
+    assert np.isfinite(ours.x).all()
 
 
 def test_run_reaches_the_same(scene: PixelScene, start: Gaussians, photos: Pair) -> None:
     """The median of three, since a weight on the other side of 1/255 may tell two runs apart."""
     options, gaps = replace(QUICK, fit_steps=40), []
     for seed in range(3):
-        (found, report), (gradients, other) = (
+        (ours, report), (expected, other) = (
             fit_full(start, photos, options, seed=seed, engine=engine) for engine in (torch_engine(CPU), KERNELS)
         )
         assert (report.method, report.accepted, report.steps) == (other.method, other.accepted, other.steps)
         assert report.holdout_before == other.holdout_before
         assert report.holdout_after > report.holdout_before + 3
-        scenes.assert_invariants(found, scene)
-        gaps.append(abs(scenes.psnr_of(found, scene) - scenes.psnr_of(gradients, scene)))
+        scenes.assert_invariants(ours, scene)
+        gaps.append(abs(scenes.psnr_of(ours, scene) - scenes.psnr_of(expected, scene)))
     assert np.median(gaps) < 0.1
     assert max(gaps) < 1.0
 
@@ -169,9 +169,9 @@ def test_loss_is_the_kernels(size: tuple[int, int], ssim_lambda: float) -> None:
     weight = (rng.random(size) > 0.2).astype(np.float32)
     variable = torch.from_numpy(image).requires_grad_()
     image_loss(variable, torch.from_numpy(photo), torch.from_numpy(weight), ssim_lambda).backward()
-    gradients = image_gradient(image, photo, weight, ssim_lambda)
+    expected = image_gradient(image, photo, weight, ssim_lambda)
     assert variable.grad is not None
-    assert np.linalg.norm(variable.grad.numpy() - gradients) <= 1e-3 * np.linalg.norm(gradients)
+    assert np.linalg.norm(variable.grad.numpy() - expected) <= 1e-3 * np.linalg.norm(expected)
 
 
 def test_nothing_to_fit(start: Gaussians, photos: Pair) -> None:
@@ -192,13 +192,13 @@ def test_stage_steps_where_it_is_told(start: Gaussians, photos: Pair, monkeypatc
     monkeypatch.setattr(cuda_module, "find_spec", lambda name: name)
     monkeypatch.setattr(module, "start_gpu", lambda device: asked.append(f"start {device}"))
     monkeypatch.setattr(module, "torch_engine", lambda device: asked.append(str(device)) or torch_engine(CPU))
-    found, report = fit(start, photos, replace(QUICK, device="cuda"), seed=4)
+    ours, report = fit(start, photos, replace(QUICK, device="cuda"), seed=4)
     assert asked == ["start cuda", "cuda"]
     assert report is not None
     assert report.accepted
-    gradients, _ = fit(start, photos, QUICK, seed=4)
+    expected, _ = fit(start, photos, QUICK, seed=4)
     assert len(asked) == 2
-    torch.testing.assert_close(found.means, gradients.means, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(ours.means, expected.means, rtol=1e-3, atol=1e-3)
     assert engine_for("cpu") is KERNELS
 
 
