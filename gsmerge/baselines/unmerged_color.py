@@ -13,7 +13,7 @@ from gsmerge.types import Gaussians
 
 def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The colour fit on all Gaussians, none left out; whatever the count."""
-    return fit_input(prepared, replace(prepared.options.fit, fit="color", prune=0.0), log)
+    return fit_input(prepared, replace(prepared.options.fit, fit="color", min_contribution=0.0), log)
 
 
 UNMERGED_COLOR = Baseline(
@@ -21,5 +21,5 @@ UNMERGED_COLOR = Baseline(
     "the input with colours solved on the photos",
     run,
     needs=("photos",),
-    uses=("iterations", "pull", "huber", "min_gain", "max_gain", "holdout"),
+    uses=("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout"),
 )

@@ -92,15 +92,15 @@ def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, lo
         k=options.decode.k,
         most=most,
         min_opacity=options.decode.min_opacity,
-        prune=options.fit.prune if prunes else 0.0,
+        prune=options.fit.min_contribution if prunes else 0.0,
         wanted=count if segmentation.exact else None,
         places=None if segmentation.exact or count is None else count // options.decode.count,
         knee=knee_count(prepared),
     )
     heads = None
     if networks is not None:
-        described = networks.describe(features)
-        heads = StoredHeads(networks.networks, networks.precision, described.views, described.group)
+        group_features = networks.describe(features)
+        heads = StoredHeads(networks.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, most, options.encode.rule),

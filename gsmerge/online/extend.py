@@ -25,7 +25,7 @@ from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
-from gsmerge.stages.fit import shown
+from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.merge import MergedViews, take
 from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
@@ -203,10 +203,10 @@ def _entered(
     parts = absorb(state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most)
     alone = pick(new, torch.nonzero(~joins)[:, 0])
     counts = {"num_joined": int(joins.sum())}
-    if options.fit.prune > 0 and scene.images is not None:
+    if options.fit.min_contribution > 0 and scene.images is not None:
         beside = take(parts.features, rows)
         every = Gaussians.concat([feature_to_gaussians(beside), feature_to_gaussians(alone.features)])
-        shows = shown(every, shots.photos(2), options.fit.prune)[len(beside) :]
+        shows = visible_mask(every, shots.photos(2), options.fit.min_contribution)[len(beside) :]
         counts["num_hidden"] = int((~shows).sum())
         alone = pick(alone, torch.nonzero(shows)[:, 0])
     kept = [one for one in (state.kept, prepared.hidden) if one is not None]
@@ -230,7 +230,7 @@ def _begun(new: Parts, prepared: PreparedScene, online: OnlineOptions) -> Online
         k=options.decode.k,
         most=online.max_k,
         min_opacity=options.decode.min_opacity,
-        prune=options.fit.prune if prepared.given.images is not None else 0.0,
+        prune=options.fit.min_contribution if prepared.given.images is not None else 0.0,
         wanted=None,
         places=None,
         knee=0,

@@ -20,9 +20,8 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.cli.network_options import Precision
 from gsmerge.io import ReadHints
-from gsmerge.options import METHODS, PRECISIONS
+from gsmerge.options import METHODS
 from gsmerge.report import report_document
 
 ROOT = Path(__file__).parents[2]
@@ -53,10 +52,6 @@ def calls_in(page: str) -> list[str]:
     blocks = re.findall(r"```(?:bash|console)\n(.*?)```", read(page), re.DOTALL)
     calls = (part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&"))
     return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
-
-
-def test_precisions_are_the_library_s() -> None:
-    assert tuple(choice.value for choice in Precision) == PRECISIONS
 
 
 def test_commands_are_the_documented_ones() -> None:
@@ -180,7 +175,7 @@ def test_defaults_in_help_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     in_help = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device", "checkpoint", "precision", "geometry"}
+    known |= {"levels", "device", "checkpoint", "geometry"}
     assert set(in_help) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from learned import Made, made
+from networks import Made, made
 
 from gsmerge.encoded.divide import divide_all, pick_children
 from gsmerge.encoded.encoded import Division
