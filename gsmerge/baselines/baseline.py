@@ -1,4 +1,4 @@
-"""What a rival method is: a name, what it needs, which settings it looks at, and a function."""
+"""What a baseline (another method) is: a name, what it needs, which settings it uses, and a function."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from typing import Literal
 from gsmerge.build import Source
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.group import Canvas
-from gsmerge.types import Gaussians, PixelScene
+from gsmerge.stages.unaligned import members_of
+from gsmerge.types import Gaussians, Groups, PixelScene
 
 Need = Literal["photos", "pixels", "node"]
 Run = Callable[[Source, Canvas, CompactOptions, int, RunLog], Gaussians]
@@ -20,15 +23,15 @@ COUNTS = ("budget", "max_bytes", "preset", "superpixels", "density", "k")  # set
 
 @dataclass(frozen=True)
 class Baseline:
-    """One rival method.
+    """One other method.
 
     Args:
         name: As on the command line.
         title: What it does, in a few words.
-        run: Source, canvas, options, number of Gaussians, journal -> canonical Gaussians, at most that many unless
-            the method keeps the input's. It times itself, by stages of the journal.
+        run: Source, canvas, options, number of Gaussians, run log -> canonical Gaussians, at most that many unless
+            the method keeps the input's. It times itself, by stages of the run log.
         needs: ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js.
-        uses: Settings that it looks at, by flat name; seed and threads are everybody's.
+        uses: Settings that it uses, by flat name, besides those that all methods use.
     """
 
     name: str
@@ -46,6 +49,17 @@ def own_gaussians(source: Source) -> Gaussians:
     return scene.gaussians
 
 
-def view_shares(count: int, num_views: int, most: int) -> list[int]:
-    """A number dealt out evenly over the views, at most ``most`` each; the first views get the rest."""
-    return [min(most, count // num_views + (view < count % num_views)) for view in range(num_views)]
+def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
+    """A number divided evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
+    return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
+
+
+def merge_groups(
+    source: Source, groups: Groups, options: CompactOptions, log: RunLog, rule: Literal["depth", "paper"] = "depth"
+) -> Gaussians:
+    """One Gaussian for each group, without matching across views; groups that hold nothing are left out."""
+    with log.stage("encode"):
+        members = members_of(source.scene, groups, options) if source.members is None else source.members
+        features = encode(source.scene, members, groups, EncodeOptions(rule=rule))
+    with log.stage("decode"):
+        return decode(features, members, DecodeOptions(min_opacity=0.0), rule=rule)

@@ -1,0 +1,126 @@
+"""Baselines of a few lines: the input as it is or fitted, pruned, or merged over blocks of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.baselines.baseline import Baseline, merge_groups, own_gaussians, view_shares
+from gsmerge.build import Source
+from gsmerge.options import CompactOptions
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render.photos import scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.fit import FitOptions, fit
+from gsmerge.stages.group import Canvas
+from gsmerge.stages.region_tree import trim
+from gsmerge.stages.segment import grid_labels
+from gsmerge.types import Cameras, Gaussians, Groups
+
+MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
+
+
+def unmerged(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+    """All Gaussians, whatever the count."""
+    return own_gaussians(source)
+
+
+def unmerged_color(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+    """The colour fit on all Gaussians, none left out; whatever the count."""
+    return _fit_input(source, replace(options.fit, fit="color", prune=0.0), options.seed, log)
+
+
+def unmerged_fit(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+    """The full fit, with as many steps or as much time as ours; whatever the count.
+
+    Gaussians that no photo shows are replaced by others, so the number stays.
+    """
+    return _fit_input(source, replace(options.fit, fit="full"), options.seed, log)
+
+
+def _fit_input(source: Source, settings: FitOptions, seed: int, log: RunLog) -> Gaussians:
+    """All Gaussians, fitted to the photos."""
+    gaussians = own_gaussians(source)
+    with log.stage("fit"):
+        photos = scene_photos(source.scene), scene_photos(source.scene, 2)
+        gaussians, report = fit(gaussians, photos, settings, len(gaussians), seed, log.fit_progress)
+    if report:
+        log.choices["fit"] = asdict(report)
+        if not report.accepted:
+            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+    return gaussians
+
+
+def prune_by_opacity(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+    """The most opaque, unchanged and in their order; of equal ones the first of the file."""
+    gaussians = own_gaussians(source)
+    with log.stage("reduce"):
+        return gaussians[trim(gaussians.opacities, count)]
+
+
+def prune_by_contribution(
+    source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog
+) -> Gaussians:
+    """Those that add most to the views (Mini-Splatting), unchanged and in their order; of equal ones the first."""
+    gaussians = own_gaussians(source)
+    with log.stage("reduce"):
+        return gaussians[trim(summed_weights(gaussians, source.scene.cameras), count)]
+
+
+def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
+    """``[n]`` float64 blending weights summed over the pixels of all views; the same on any number of threads."""
+    splats = prepare(gaussians)
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+
+    def one_view(view: int) -> np.ndarray:
+        sums, _ = contributions(plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
+        return sums
+
+    total, step = np.zeros(len(splats)), max(1, MAX_PLANNED // max(len(splats), 1))
+    for first in range(0, len(cameras), step):
+        for sums in parallel_map(one_view, range(first, min(first + step, len(cameras)))):
+            total += sums
+    return total
+
+
+def prune_at_random(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+    """A random choice that depends only on the seed, unchanged and in their order."""
+    gaussians = own_gaussians(source)
+    with log.stage("reduce"):
+        rng = np.random.default_rng(options.seed)
+        return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
+
+
+def merge_blocks(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+    """As many blocks as Gaussians, the same number in every view; those without a valid pixel are left out."""
+    scene = source.scene
+    height, width = scene.cameras.height, scene.cameras.width
+    with log.stage("segment"):
+        counts = view_shares(count, len(scene), height * width)
+        labels: Tensor = torch.from_numpy(np.stack([grid_labels(height, width, own) for own in counts]))
+    return merge_groups(source, Groups(labels, tuple(counts)), options, log)
+
+
+UNMERGED = Baseline("unmerged", "the input as it is", unmerged, uses=())
+UNMERGED_COLOR = Baseline(
+    "unmerged-color",
+    "the input with colours solved on the photos",
+    unmerged_color,
+    needs=("photos",),
+    uses=("iterations", "pull", "huber", "min_gain", "max_gain", "holdout"),
+)
+UNMERGED_FIT = Baseline(  # what merging has to be better than
+    "unmerged-fit",
+    "the input after the same full fit",
+    unmerged_fit,
+    needs=("photos",),
+    uses=tuple(f.name for f in fields(FitOptions) if f.name != "fit"),
+)
+OPACITY = Baseline("opacity", "keep the most opaque", prune_by_opacity)
+CONTRIBUTION = Baseline("contribution", "keep those with the largest summed blending weight", prune_by_contribution)
+RANDOM = Baseline("random", "keep a random choice", prune_at_random)
+BLOCKS = Baseline("blocks", "uniform pixel blocks, our moment rule", merge_blocks, needs=("pixels",))
