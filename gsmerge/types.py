@@ -255,6 +255,23 @@ class Groups:
 
 
 @dataclass(frozen=True)
+class Segmentation:
+    """The superpixels of a scene and the number of Gaussians that they become.
+
+    Args:
+        groups: Superpixels of every view.
+        coarse: Coarse ones for the backing layer; None: no such layer.
+        count: Gaussians in the end; never more.
+        exact: Whether that number was asked for as such, and is to be met.
+    """
+
+    groups: Groups
+    coarse: Groups | None
+    count: int
+    exact: bool
+
+
+@dataclass(frozen=True)
 class Matches:
     """Clusters of Feature Gaussians that show the same piece of surface.
 

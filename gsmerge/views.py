@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsmerge.runtime.estimate import MOST_JUDGED
+from gsmerge.runtime.estimate import MAX_SCORED_VIEWS
 from gsmerge.types import PixelScene, UnalignedScene
 
 
@@ -26,12 +26,12 @@ def even_views(num_views: int, count: int) -> list[int]:
     return [round(i * (num_views - 1) / (count - 1)) for i in range(count)]
 
 
-def judged_views(num_views: int) -> list[int]:
+def scored_views(num_views: int) -> list[int]:
     """The views that whole scenes are judged by: all, of many evenly spread ones.
 
     Rendering the unmerged input costs as many views as Gaussians, so with all of many views it would be most of a run.
     """
-    return even_views(num_views, min(num_views, MOST_JUDGED))
+    return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
 def pick_views(num_views: int, most: int) -> list[int]:

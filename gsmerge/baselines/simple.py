@@ -2,73 +2,60 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.baselines.baseline import Baseline, merge_groups, own_gaussians, view_shares
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
+from gsmerge.baselines.baseline import Baseline, merge_groups, most_important, own_gaussians, view_shares
 from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit import FitOptions, fit
-from gsmerge.stages.group import Canvas
-from gsmerge.stages.region_tree import trim
+from gsmerge.stages.fit import FitOptions, fit_scene
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import grid_labels
 from gsmerge.types import Cameras, Gaussians, Groups
 
 MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
 
 
-def unmerged(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def unmerged(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """All Gaussians, whatever the count."""
-    return own_gaussians(source)
+    return own_gaussians(prepared.scene)
 
 
-def unmerged_color(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def unmerged_color(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The colour fit on all Gaussians, none left out; whatever the count."""
-    return _fit_input(source, replace(options.fit, fit="color", prune=0.0), options.seed, log)
+    return _fit_input(prepared, replace(prepared.options.fit, fit="color", prune=0.0), log)
 
 
-def unmerged_fit(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def unmerged_fit(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The full fit, with as many steps or as much time as ours; whatever the count.
 
     Gaussians that no photo shows are replaced by others, so the number stays.
     """
-    return _fit_input(source, replace(options.fit, fit="full"), options.seed, log)
+    return _fit_input(prepared, replace(prepared.options.fit, fit="full"), log)
 
 
-def _fit_input(source: Source, settings: FitOptions, seed: int, log: RunLog) -> Gaussians:
+def _fit_input(prepared: PreparedScene, options: FitOptions, log: RunLog) -> Gaussians:
     """All Gaussians, fitted to the photos."""
-    gaussians = own_gaussians(source)
-    with log.stage("fit"):
-        photos = scene_photos(source.scene), scene_photos(source.scene, 2)
-        gaussians, report = fit(gaussians, photos, settings, len(gaussians), seed, log.fit_progress)
-    if report:
-        log.choices["fit"] = asdict(report)
-        if not report.accepted:
-            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
-    return gaussians
+    gaussians = own_gaussians(prepared.scene)
+    return fit_scene(gaussians, prepared.scene, options, len(gaussians), seed=prepared.options.seed, log=log)
 
 
-def prune_by_opacity(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def prune_by_opacity(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The most opaque, unchanged and in their order; of equal ones the first of the file."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        return gaussians[trim(gaussians.opacities, count)]
+        return gaussians[most_important(gaussians.opacities, count)]
 
 
-def prune_by_contribution(
-    source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog
-) -> Gaussians:
+def prune_by_contribution(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Those that add most to the views (Mini-Splatting), unchanged and in their order; of equal ones the first."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        return gaussians[trim(summed_weights(gaussians, source.scene.cameras), count)]
+        return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
 
 
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
@@ -87,22 +74,22 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     return total
 
 
-def prune_at_random(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def prune_at_random(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """A random choice that depends only on the seed, unchanged and in their order."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        rng = np.random.default_rng(options.seed)
+        rng = np.random.default_rng(prepared.options.seed)
         return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
 
 
-def merge_blocks(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def merge_blocks(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """As many blocks as Gaussians, the same number in every view; those without a valid pixel are left out."""
-    scene = source.scene
+    scene = prepared.scene
     height, width = scene.cameras.height, scene.cameras.width
     with log.stage("segment"):
         counts = view_shares(count, len(scene), height * width)
         labels: Tensor = torch.from_numpy(np.stack([grid_labels(height, width, own) for own in counts]))
-    return merge_groups(source, Groups(labels, tuple(counts)), options, log)
+    return merge_groups(prepared, Groups(labels, tuple(counts)), log)
 
 
 UNMERGED = Baseline("unmerged", "the input as it is", unmerged, uses=())

@@ -9,19 +9,21 @@ from typing import Any
 import torch
 
 from gsmerge import __version__
-from gsmerge.build import Merged, merged_groups, wanted_count
 from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
+from gsmerge.pipeline import build, merge_views
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.group import Grouping, knee_count, scene_tree
+from gsmerge.search import choose_count
+from gsmerge.stages.decode import MAX_CHILDREN, merged_count
+from gsmerge.stages.group import knee_count
+from gsmerge.stages.merge import MergedViews
+from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.types import PixelScene, UnalignedScene
 
-USUAL_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
+DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
 
 
 def encode_scene(
@@ -56,14 +58,13 @@ def encode_scene(
         raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {max_k}")
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, log)
-        count = decide(work, log)
-        if keeps_all(work, count):
+        prepared = prepare(scene, options, log)
+        count = choose_count(prepared, build, log)
+        if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
-        grouping = choose_groups(work, count, log)
-        merged = merged_groups(work.source, grouping, work.options, log)
+        merged = merge_views(prepared, count, log)
         with log.stage("decode"):
-            return _to_encoded(work, grouping, merged, max_k, log)
+            return _to_encoded(prepared, merged, max_k, log)
 
 
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
@@ -78,37 +79,36 @@ def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOp
     return replace(options, fit=replace(options.fit, fit="none"))
 
 
-def _to_encoded(work: Work, grouping: Grouping, merged: Merged, max_k: int | None, log: RunLog) -> Encoded:
+def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, log: RunLog) -> Encoded:
     """Everything that decoding needs of the merged Feature Gaussians."""
-    features, learned = merged.features, merged.learned
-    options, scene = work.options, work.source.scene
-    count = wanted_count(merged, grouping, options)
-    max_k = max_k or (USUAL_MAX_K if count is None and options.decode.count <= USUAL_MAX_K else MAX_CHILDREN)
-    tree = work.tree or scene_tree(scene, work.canvas, options, work.canvas.usual)
+    features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
+    options, scene = prepared.options, prepared.scene
+    count = merged_count(merged, options.decode, grows=options.fit.grows)
+    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.count <= DEFAULT_MAX_K else MAX_CHILDREN)
     prunes = scene.images is not None and options.fit.effort != "draft"
     settings = StoredSettings(
-        num_input=work.scene.num_gaussians,
+        num_input=prepared.given.num_gaussians,
         k=options.decode.k,
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
         min_contribution=options.fit.prune if prunes else 0.0,
-        target_count=count if grouping.exact else None,
-        num_slots=None if grouping.exact or count is None else count // options.decode.count,
-        knee_count=knee_count(tree, work.canvas, options),
+        target_count=count if exact else None,
+        num_slots=None if exact or count is None else count // options.decode.count,
+        knee_count=knee_count(prepared),
     )
     heads = None
-    if learned is not None:
-        described = learned.describe(features)
-        heads = StoredHeads(learned.networks, learned.precision, described.views, described.group)
+    if networks is not None:
+        described = networks.describe(features)
+        heads = StoredHeads(networks.networks, networks.precision, described.views, described.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, max_k, options.encode.rule),
-        kept=work.kept,
-        frame=work.frame,
+        kept=prepared.hidden,
+        frame=prepared.frame,
         cameras=scene.cameras,
         settings=settings,
         heads=heads,
-        about=_about(work.settings, log),
+        about=_about(prepared.settings, log),
     )
 
 

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
-from gsmerge.build import Merged, merged_groups
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
@@ -38,13 +37,15 @@ from gsmerge.online.state import (
     with_fitted_colors,
 )
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
+from gsmerge.pipeline import build, merge_views
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
+from gsmerge.search import choose_count
 from gsmerge.stages.fit import shown
 from gsmerge.stages.match import MatchOptions, match
-from gsmerge.stages.merge import merge, take
+from gsmerge.stages.merge import MergedViews, merge, take
+from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelScene, UnalignedScene
 
 
@@ -104,38 +105,17 @@ def extend(
             is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
-    max_k = online.max_k if state is None else state.settings.max_k
-    _check(state, scene, options, max_k)
+    _check(state, scene, options, online.max_k if state is None else state.settings.max_k)
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, log, None if state is None else state.frame)
-        work = replace(work, canvas=replace(work.canvas, share=1.0))  # nothing grows here
-        merged = _merge_views(work, log)
-        canonical = work.source.scene
-        size = canonical.cameras if state is None else state.cameras
-        photos = resize_photos(scene_pictures(canonical), canonical.cameras, size.width, size.height)
-        counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
-        rows = torch.zeros(0, dtype=torch.int64)
-        if state is not None:
-            with log.stage("cover"):
-                rows = rows_in_view(state.groups.features, photos.cameras)
-                there = feature_to_gaussians(with_fitted_colors(select_groups(state.groups, rows)).features)
-                novel = novel_rows(there, merged.features, merged.members, photos.photos(2), canonical.cameras, online)
-                counts["num_covered"] = len(merged.features) - len(novel)
-                merged = replace(merged, features=take(merged.features, novel))
-        with log.stage("decode"):
-            new = bake(merged.features, merged.members, merged.learned, max_k, options.encode.rule)
-        ids = np.arange(len(photos)) if state is None else view_ids(state.cameras, photos.cameras)
-        with log.stage("join"):
-            if state is None:
-                state = _first_state(new, work, max_k)
-            else:
-                groups, joined = _enter(state.groups, new, work, photos, rows, max_k)
-                state = _grown_state(state, groups, work, photos.cameras[torch.from_numpy(ids >= len(state.cameras))])
-                counts |= joined
-        if work.scene.images is not None:
-            state = _with_photos(state, photos, ids, work.options, online, log)
-    numbers = {"num_views": len(canonical), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
+        prepared = prepare(scene, options, log, None if state is None else state.frame)
+        prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
+        count = choose_count(prepared, build, log)
+        if prepared.keeps_all(count):
+            raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
+        merged = merge_views(prepared, count, log)
+        state, counts = _add_batch(state, prepared, merged, online, log)
+    numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = options.to_dict() | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
     about = {"gsmerge": __version__, "options": stored, "batches": [*state.about.get("batches", []), numbers]}
@@ -145,16 +125,43 @@ def extend(
     return replace(state, about=about), report
 
 
-def _merge_views(work: Work, log: RunLog) -> Merged:
-    """The batch's groups, merged across its own views.
-
-    Raises:
-        UsageError: If a budget keeps every Gaussian.
-    """
-    count = decide(work, log)
-    if keeps_all(work, count):
-        raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-    return merged_groups(work.source, choose_groups(work, count, log), work.options, log)
+def _add_batch(
+    state: OnlineState | None, prepared: PreparedScene, merged: MergedViews, online: OnlineOptions, log: RunLog
+) -> tuple[OnlineState, dict[str, int]]:
+    """The state with a batch in it, and what became of the batch's groups by key of the report."""
+    scene, options = prepared.scene, prepared.options
+    max_k = online.max_k if state is None else state.settings.max_k
+    size = scene.cameras if state is None else state.cameras
+    photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
+    counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+    features, rows = merged.features, torch.zeros(0, dtype=torch.int64)
+    if state is not None:
+        with log.stage("cover"):
+            rows = rows_in_view(state.groups.features, photos.cameras)
+            there = feature_to_gaussians(with_fitted_colors(select_groups(state.groups, rows)).features)
+            novel = novel_rows(there, features, merged.members, photos.photos(2), scene.cameras, online)
+            counts["num_covered"] = len(features) - len(novel)
+            features = take(features, novel)
+    with log.stage("decode"):
+        new = bake(features, merged.members, merged.networks, max_k, options.encode.rule)
+    ids = np.arange(len(photos)) if state is None else view_ids(state.cameras, photos.cameras)
+    with log.stage("join"):
+        if state is None:
+            state = _first_state(new, prepared, max_k)
+        else:
+            groups, entered = _enter(state.groups, new, prepared, photos, rows, max_k)
+            new_views = torch.from_numpy(ids >= len(state.cameras))
+            state = _grown_state(state, groups, prepared, photos.cameras[new_views])
+            counts |= entered
+    if prepared.given.images is None:
+        return state, counts
+    groups = state.groups
+    if options.fit.fit == "color":
+        with log.stage("fit"):
+            groups, report = fit_batch_colors(groups, photos, options.fit, options.seed)
+            log.choices["fit"] = asdict(report)
+    replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
+    return replace(state, groups=groups, replay=replay), counts
 
 
 def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, options: CompactOptions, max_k: int) -> None:
@@ -178,26 +185,26 @@ def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, option
 
 
 def _enter(
-    groups: GroupSet, new: GroupSet, work: Work, photos: BatchPhotos, rows: Tensor, max_k: int
+    groups: GroupSet, new: GroupSet, prepared: PreparedScene, photos: BatchPhotos, rows: Tensor, max_k: int
 ) -> tuple[GroupSet, dict[str, int]]:
     """The state's groups with new ones among them, and how many were merged and how many no view shows.
 
     Args:
         groups: The state's groups.
         new: The batch's groups.
-        work: The batch.
+        prepared: The batch.
         photos: Its photos.
         rows: The state's groups that its views may see.
         max_k: Most children of a group.
     """
-    options = work.options
+    options = prepared.options
     partners = find_partners(take(groups.features, rows), new.features, options.match)
     has_partner = partners >= 0
     joining = select_groups(new, torch.nonzero(has_partner)[:, 0])
     groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
     alone = select_groups(new, torch.nonzero(~has_partner)[:, 0])
     counts = {"num_joined": int(has_partner.sum())}
-    if options.fit.prune > 0 and work.source.scene.images is not None:
+    if options.fit.prune > 0 and prepared.scene.images is not None:
         in_view = feature_to_gaussians(take(groups.features, rows))
         both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
         visible = shown(both, photos.photos(2), options.fit.prune)[len(in_view) :]
@@ -245,23 +252,23 @@ def merge_into(groups: GroupSet, new: GroupSet, rows: Tensor, max_k: int) -> Gro
     return replace_groups(groups, rows, limit_children(merged, max_k))
 
 
-def _first_state(groups: GroupSet, work: Work, max_k: int) -> OnlineState:
+def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> OnlineState:
     """The state that a first batch makes."""
-    options, cameras = work.options, work.source.scene.cameras
+    options, cameras = prepared.options, prepared.scene.cameras
     settings = StoredSettings(
-        num_input=work.scene.num_gaussians,
+        num_input=prepared.given.num_gaussians,
         k=options.decode.k,
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
-        min_contribution=options.fit.prune if work.scene.images is not None else 0.0,
+        min_contribution=options.fit.prune if prepared.given.images is not None else 0.0,
         target_count=None,
         num_slots=None,
         knee_count=0,
     )
     return OnlineState(
         groups=groups,
-        kept=work.kept,
-        frame=work.frame,
+        kept=prepared.hidden,
+        frame=prepared.frame,
         cameras=resize_cameras(cameras, cameras.width, cameras.height),
         replay=no_photos(cameras),
         settings=settings,
@@ -269,32 +276,14 @@ def _first_state(groups: GroupSet, work: Work, max_k: int) -> OnlineState:
     )
 
 
-def _grown_state(state: OnlineState, groups: GroupSet, work: Work, new_cameras: Cameras) -> OnlineState:
+def _grown_state(state: OnlineState, groups: GroupSet, prepared: PreparedScene, new_cameras: Cameras) -> OnlineState:
     """The state with other groups, and with the views and the unseen Gaussians of a further batch."""
-    kept = [gaussians for gaussians in (state.kept, work.kept) if gaussians is not None]
-    num_input = state.settings.num_input + work.scene.num_gaussians
+    kept = [gaussians for gaussians in (state.kept, prepared.hidden) if gaussians is not None]
+    num_input = state.settings.num_input + prepared.given.num_gaussians
     return replace(
         state,
         groups=groups,
         kept=Gaussians.concat(kept) if kept else None,
         cameras=concat_cameras(state.cameras, new_cameras),
-        settings=replace(state.settings, num_input=num_input, k=work.options.decode.k),
+        settings=replace(state.settings, num_input=num_input, k=prepared.options.decode.k),
     )
-
-
-def _with_photos(
-    state: OnlineState,
-    photos: BatchPhotos,
-    ids: np.ndarray,
-    options: CompactOptions,
-    online: OnlineOptions,
-    log: RunLog,
-) -> OnlineState:
-    """The state after its colours were fitted to new photos, with some of them stored; ``ids [v]``: their views."""
-    groups = state.groups
-    if options.fit.fit == "color":
-        with log.stage("fit"):
-            groups, report = fit_batch_colors(groups, photos, options.fit, options.seed)
-            log.choices["fit"] = asdict(report)
-    replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
-    return replace(state, groups=groups, replay=replay)

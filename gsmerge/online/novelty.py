@@ -9,8 +9,7 @@ from torch import Tensor
 
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
-from gsmerge.render import composite, plan_view, prepare
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import Photos, photo_errors
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
@@ -57,14 +56,12 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
         height: Of the result.
         width: Of the result.
     """
-    splats = prepare(gaussians)
 
-    def one_view(view: int) -> np.ndarray:
-        image, transmittance = composite(plan_view(splats, **photos.camera(view)))
+    def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
         errors = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(-1) + transmittance**2
         return cv2.resize(errors.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
 
-    return np.stack(parallel_map(one_view, range(len(photos))))
+    return np.stack(photo_errors(gaussians, photos, score))
 
 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:

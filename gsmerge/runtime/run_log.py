@@ -13,8 +13,8 @@ from gsmerge.runtime.memory import release_memory
 Progress = Callable[[str, int, int], None]
 RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
 STAGES = (
-    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "cover", "decode",
-    "choose", "join", "fit", "score", "input",
+    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "close",
+    "cover", "decode", "choose", "join", "fit", "score", "input",
 )  # fmt: skip
 
 

@@ -1,13 +1,39 @@
-"""feature gaussians + matches -> feature gaussians: pool every cluster into one."""
+"""feature gaussians + matches -> feature gaussians: every cluster pooled into one, then in line with its neighbours."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks import Learned, merge_features
-from gsmerge.types import FeatureGaussians, Matches
+from gsmerge.moments import Members
+from gsmerge.networks import Learned, merge_features, refine_features
+from gsmerge.types import FeatureGaussians, Gaussians, Matches, Segmentation
+
+
+@dataclass(frozen=True, eq=False)
+class MergedViews:
+    """Feature Gaussians merged across views, and what decoding them takes.
+
+    Args:
+        features: The Feature Gaussians.
+        members: The scene's Gaussians that ``features.members`` points into.
+        segmentation: The superpixels that they come from, and how many Gaussians they are to become.
+        networks: Networks that correct; None: those are not used.
+        choices: What the stages decided, for the report.
+        k1_gaussians: What they become at K = 1, where that had to be known to choose them; None elsewhere.
+    """
+
+    features: FeatureGaussians
+    members: Members
+    segmentation: Segmentation
+    networks: Learned | None = None
+    choices: Mapping[str, Any] = field(default_factory=dict)
+    k1_gaussians: Gaussians | None = None
 
 
 def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None = None) -> FeatureGaussians:
@@ -32,6 +58,16 @@ def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None 
     if learned is not None:
         pooled = merge_features(pooled, features, order.numpy(), cuts, learned)
     return FeatureGaussians.concat([take(features, alone), pooled])
+
+
+def refine(features: FeatureGaussians, learned: Learned | None) -> FeatureGaussians:
+    """Feature Gaussians with the refiner's corrections (paper section 4.5); as they are without networks.
+
+    Args:
+        features: Merged Feature Gaussians of all views.
+        learned: Networks and the scene, or None.
+    """
+    return features if learned is None else refine_features(features, learned)
 
 
 def cluster_runs(matches: Matches) -> tuple[Tensor, Tensor, np.ndarray]:

@@ -30,7 +30,7 @@ from gsmerge.moments import Members
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, sizes_of
 from gsmerge.networks.tokens import describe
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import Photos, scene_pictures
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.subjects import Subject, covered, make_subject, reduced_masks, view_subsets
 from gsmerge.stages.decode import divide
@@ -38,9 +38,9 @@ from gsmerge.stages.encode import encode
 from gsmerge.stages.fit.full import Masks, fit_full
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.stage import shown
-from gsmerge.stages.group import group_scene, scene_canvas
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
+from gsmerge.stages.segment import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
 
 Told = Callable[[int, int], None]
@@ -239,7 +239,7 @@ def _worked_out(
     settings = {"density": density, "match": options.match, "fit": "none", "robust": False}
     chosen = CompactOptions().with_settings({**settings, "seed": options.seed})
     scene, members = subject.scene, subject.members
-    groups = group_scene(scene_canvas(scene, chosen), chosen).groups
+    groups = segment(scene_pictures(scene), chosen.segment)
     features = encode(scene, members, groups, chosen.encode)
     matches = match(features, chosen.match)
     merged = merge(features, matches)

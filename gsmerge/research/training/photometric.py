@@ -13,11 +13,11 @@ from torch import Tensor
 from gsmerge.measure.lpips import lpips_loss
 from gsmerge.networks import Networks
 from gsmerge.render.autograd import render_differentiable
+from gsmerge.render.photos import NEAR
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import foreseen
 from gsmerge.research.training.windows import Window
 from gsmerge.stages.fit.loss import loss_ssim
-from gsmerge.stages.prepare import NEAR
 from gsmerge.types import Gaussians
 
 BEST = 100.0  # dB: PSNR of windows without an error

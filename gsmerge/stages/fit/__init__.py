@@ -2,6 +2,6 @@
 
 from gsmerge.stages.fit.options import Fit, FitOptions, Rates
 from gsmerge.stages.fit.report import FitReport
-from gsmerge.stages.fit.stage import fit, shown, start_share
+from gsmerge.stages.fit.stage import fit, fit_scene, shown, start_share
 
-__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit", "shown", "start_share"]
+__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit", "fit_scene", "shown", "start_share"]

@@ -16,7 +16,7 @@ import numpy as np
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.gradient import plan_gradients
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
@@ -160,14 +160,8 @@ def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
 
 def holdout_score(state: State, plan: Plan) -> float:
     """PSNR (dB) of the half-size held-out blocks."""
-    photos, colors = plan.photos[1], state.view_colors()
-
-    def one_view(view: int) -> np.ndarray:
-        drawn = plan_view(state.splats, **photos.camera(view))
-        return composite(drawn, colors)[0]
-
-    images = parallel_map(one_view, range(len(photos)))
-    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain)
+    images = render_photos(state.splats, plan.photos[1], colors=state.view_colors())
+    return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.min_gain)
 
 
 def score_to_beat(own: float, rival: Gaussians | None, plan: Plan) -> float:

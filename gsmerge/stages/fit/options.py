@@ -113,7 +113,7 @@ class FitOptions:
         return 1.0 if self.steps < HASTY_STEPS else 0.5 if self.steps >= LONG_STEPS else 0.7
 
     @property
-    def looks(self) -> bool:
+    def needs_photos(self) -> bool:
         """Whether the photos are looked at: to fit, or to leave out what none of them shows."""
         return self.fit != "none" or (self.prune > 0 and self.effort != "draft")
 

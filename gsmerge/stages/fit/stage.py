@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import torch
 
-from gsmerge.render import composite, contributions, plan_view, prepare
-from gsmerge.render.photos import Photos
-from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render.photos import Photos, photo_errors, scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.device import engine_for
 from gsmerge.stages.fit.full import Progress, fit_full
@@ -17,11 +18,49 @@ from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import gaussians_of, start_state
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
+
+
+def fit_scene(
+    gaussians: Gaussians,
+    scene: PixelScene | UnalignedScene,
+    options: FitOptions,
+    count: int,
+    *,
+    exact: bool = False,
+    seed: int = 0,
+    log: RunLog,
+    baseline_start: Gaussians | None = None,
+) -> Gaussians:
+    """Leave out what no photo of a scene shows, and fit the rest to the photos; nothing without photos.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        scene: The canonical scene.
+        options: What to fit.
+        count: Number of Gaussians that the full fit may grow to.
+        exact: Whether that number is to be met.
+        seed: Everything random.
+        log: Takes seconds, progress, what was done, and a note where the fit was not accepted.
+        baseline_start: See :func:`fit`.
+    """
+    if scene.images is None or not options.needs_photos:
+        return gaussians
+    if exact and not options.grows:  # nothing grows to the number asked for, so nothing may fall below it either
+        options = replace(options, prune=0.0)
+    log.choices["begun_with"] = len(gaussians)
+    with log.stage("fit"):
+        photos = scene_photos(scene), scene_photos(scene, 2)
+        gaussians, report = fit(gaussians, photos, options, count, seed, log.fit_progress, baseline_start)
+    if report:
+        log.choices["fit"] = asdict(report)
+        if not report.accepted:
+            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+    return gaussians
 
 
 def fit(
@@ -49,7 +88,7 @@ def fit(
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    if not options.looks:  # it costs as much as all that was done before
+    if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
     keep = shown(gaussians, photos[1], options.prune)
     if options.fit == "none":
@@ -107,13 +146,11 @@ def _better_of(
 
 def _photos_error(gaussians: Gaussians, photos: Photos) -> float:
     """Mean squared error of all photos."""
-    splats = prepare(gaussians)
 
-    def one_view(view: int) -> float:
-        image, _ = composite(plan_view(splats, **photos.camera(view)))
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
 
-    return float(np.mean(parallel_map(one_view, range(len(photos)))))
+    return float(np.mean(photo_errors(gaussians, photos, score)))
 
 
 def start_share(options: FitOptions) -> float:
