@@ -231,7 +231,7 @@ class GenerateOptions:
                 raise ValueError(f"{name}: expected 16 to 2048 pixels, got {getattr(self, name)}")
         for name, known in (("style", STYLES), ("path", PATHS)):
             if getattr(self, name) not in (MIXED, *known):
-                raise ValueError(f"{name}: expected {', '.join((ANY, *known))}, got {getattr(self, name)!r}")
+                raise ValueError(f"{name}: expected {', '.join((MIXED, *known))}, got {getattr(self, name)!r}")
         if not 0 <= self.noise <= 10:
             raise ValueError(f"noise: expected 0 to 10, got {self.noise:g}")
 
