@@ -23,19 +23,12 @@ FITTED = ("unmerged-fit",)  # baselines that effort changes
 
 @dataclass(frozen=True)
 class Experiment:
-    """One run.
+    """One run."""
 
-    Args:
-        scene: A ``.ply`` or the folder that it is in.
-        method: ``gsmerge``, the name of a baseline, or ``input``: nothing is merged, only measured.
-        settings: Settings that differ from the defaults, by flat name.
-        views: Number of views, evenly spread; None: all.
-    """
-
-    scene: Path
-    method: str = OURS
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    views: int | None = None
+    scene: Path  # A .ply or the folder that it is in
+    method: str = OURS  # gsmerge, the name of a baseline, or input: nothing is merged, only measured
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings that differ from the defaults, by flat name
+    views: int | None = None  # number of views, evenly spread; None: all
 
 
 @dataclass(frozen=True)

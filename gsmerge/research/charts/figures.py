@@ -47,83 +47,49 @@ INTERVAL_NOTE = (
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes.
+    """One pair of axes."""
 
-    Args:
-        y_label: With unit.
-        higher: Whether higher is better.
-        lines: The lines.
-        reference: A level to compare with: its name and value.
-    """
-
-    y_label: str
-    higher: bool
-    lines: tuple[Line, ...]
-    reference: tuple[str, float] | None = None
+    y_label: str  # with unit
+    higher: bool  # whether higher is better
+    lines: tuple[Line, ...]  # the lines
+    reference: tuple[str, float] | None = None  # a level to compare with: its name and value
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Lines over one x.
+    """Lines over one x."""
 
-    Args:
-        name: Of its files.
-        title: Of the section.
-        caption: Of the figure.
-        x_label: With unit.
-        panels: Side by side.
-        x_scale: ``log`` or ``linear``.
-        y_scale: The same.
-        percent: Whether x is a share, shown in per cent.
-        front: Whether the Pareto front is marked.
-    """
-
-    name: str
-    title: str
-    caption: str
-    x_label: str
-    panels: tuple[Panel, ...]
-    x_scale: str = "log"
-    y_scale: str = "linear"
-    percent: bool = False
-    front: bool = False
+    name: str  # of its files
+    title: str  # of the section
+    caption: str  # of the figure
+    x_label: str  # with unit
+    panels: tuple[Panel, ...]  # side by side
+    x_scale: str = "log"  # log or linear
+    y_scale: str = "linear"  # the same
+    percent: bool = False  # whether x is a share, shown in per cent
+    front: bool = False  # whether the Pareto front is marked
 
 
 @dataclass(frozen=True)
 class Bars:
-    """Stacked bars: seconds by stage.
+    """Stacked bars: seconds by stage."""
 
-    Args:
-        name: Of its files.
-        title: Of the section.
-        caption: Of the figure.
-        rows: Names of the bars, ours first.
-        stages: Seconds of each row by stage, in the order of the stages.
-    """
-
-    name: str
-    title: str
-    caption: str
-    rows: tuple[str, ...]
-    stages: dict[str, tuple[float, ...]]
+    name: str  # of its files
+    title: str  # of the section
+    caption: str  # of the figure
+    rows: tuple[str, ...]  # names of the bars, ours first
+    stages: dict[str, tuple[float, ...]]  # seconds of each row by stage, in the order of the stages
 
 
 @dataclass(frozen=True)
 class BreakEven:
-    """When merging has saved as much render time as it took.
+    """When merging has saved as much render time as it took."""
 
-    Args:
-        name: Of its files.
-        title: Of the section.
-        caption: Of the figure.
-        input_ms: Milliseconds per view of the input.
-        rows: Name, seconds of the merge, milliseconds per view afterwards, frames to break even (None: never).
-    """
-
-    name: str
-    title: str
-    caption: str
-    input_ms: float
+    name: str  # of its files
+    title: str  # of the section
+    caption: str  # of the figure
+    input_ms: float  # milliseconds per view of the input
+    # name, seconds of the merge, milliseconds per view afterwards, frames to break even (None: never)
     rows: tuple[tuple[str, float, float, float | None], ...]
 
 
@@ -315,17 +281,11 @@ def _break_even(records: Sequence[RunRecord]) -> BreakEven | None:
 
 @dataclass(frozen=True)
 class VerdictTable:
-    """Points of baselines compared with ours at equal cost.
+    """Points of baselines compared with ours at equal cost."""
 
-    Args:
-        title: Metric and cost.
-        rows: One per point of a baseline, with the label of its size.
-        decimals: Of the metric.
-    """
-
-    title: str
-    rows: tuple[tuple[str, Verdict], ...]
-    decimals: int
+    title: str  # metric and cost
+    rows: tuple[tuple[str, Verdict], ...]  # one per point of a baseline, with the label of its size
+    decimals: int  # of the metric
 
 
 def make_verdict_tables(records: Sequence[RunRecord]) -> list[VerdictTable]:

@@ -15,15 +15,10 @@ PX_PER_PT = 1.75  # largest magnification of drawings, pixels per point
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table.
+    """A cell of a table."""
 
-    Args:
-        text: Not escaped yet.
-        kind: CSS class.
-    """
-
-    text: str
-    kind: str = ""
+    text: str  # not escaped yet
+    kind: str = ""  # CSS class
 
 
 Row = Sequence[str | Cell]

@@ -62,11 +62,7 @@ def measure(
 ) -> dict[str, float]:
     """Scores by name (``psnr_target_visible``, ...), means over the views; what cannot be measured is left out.
 
-    Args:
-        scene: The input; its views are the context.
-        gaussians: The result; None: the scene's own.
-        targets: Held-out views; None without any.
-        options: Which of the slow metrics are measured.
+    Without ``gaussians`` the scene's own are measured.
     """
     if gaussians is None:
         evaluation = evaluate(scene, {}, targets, options)

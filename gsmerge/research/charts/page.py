@@ -43,13 +43,7 @@ def make_page(
 ) -> str:
     """The whole page; it loads nothing from the network, and its policy forbids that.
 
-    Args:
-        records: All runs, with the failed ones.
-        figures: The figures.
-        drawings: The SVG of each figure by name.
-        verdicts: Baselines compared with ours.
-        folder: The results folder, which has the pictures.
-        command: The command line that draws the page again.
+    ``drawings`` are the SVG of each figure by name; ``command`` is the command line that draws the page again.
     """
     done = successful(records)
     scenes = list(dict.fromkeys(record.scene for record in records))

@@ -18,19 +18,12 @@ MAX_RESULTS = 5  # pictures of a view in addition to the photo and the input
 
 @dataclass(frozen=True)
 class PictureSet:
-    """The pictures of one view of one scene.
+    """The pictures of one view of one scene."""
 
-    Args:
-        scene: Its name.
-        view: Its name.
-        layers: Name and file of each picture: photo, input, ours, baselines.
-        errors: The same of the error maps.
-    """
-
-    scene: str
-    view: str
-    layers: tuple[tuple[str, Path], ...]
-    errors: tuple[tuple[str, Path], ...]
+    scene: str  # its name
+    view: str  # its name
+    layers: tuple[tuple[str, Path], ...]  # name and file of each picture: photo, input, ours, baselines
+    errors: tuple[tuple[str, Path], ...]  # the same of the error maps
 
 
 def find_pictures(records: Sequence[RunRecord], folder: Path) -> list[PictureSet]:

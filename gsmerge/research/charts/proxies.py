@@ -27,35 +27,19 @@ SHARES = (0.0025, 0.005, 0.01, 0.02, 0.044, 0.1)  # superpixels per pixel
 
 @dataclass(frozen=True)
 class Proxy:
-    """One point of the proxy curve.
+    """One point of the proxy curve."""
 
-    Args:
-        key: Hash of scene, segmentation, share and number of photos.
-        scene: Its name.
-        segmentation: Superpixel method.
-        superpixels: Of each view.
-        share: Superpixels per pixel.
-        views: Photos that were measured.
-        psnr: Mean over those, dB.
-    """
-
-    key: str
-    scene: str
-    segmentation: str
-    superpixels: int
-    share: float
-    views: int
-    psnr: float
+    key: str  # hash of scene, segmentation, share and number of photos
+    scene: str  # its name
+    segmentation: str  # superpixel method
+    superpixels: int  # of each view
+    share: float  # superpixels per pixel
+    views: int  # photos that were measured
+    psnr: float  # mean over those, dB
 
 
 def proxy_psnr(image: Tensor, count: int, segmentation: str) -> float:
-    """PSNR (dB) of a photo whose superpixels are filled with their mean colours.
-
-    Args:
-        image: ``[h,w,3]`` sRGB in [0, 1].
-        count: Superpixels.
-        segmentation: ``rdseg``, ``bass``, ``bass-st`` or ``slic``.
-    """
+    """PSNR (dB) of a photo ``[h,w,3]`` (sRGB in [0, 1]) with ``count`` superpixels in their mean colours."""
     means = draw_means(image, superpixels(image, count, segmentation))
     return psnr(means.astype(np.float64) / 255, image.double().numpy())
 
@@ -78,16 +62,7 @@ def measure_proxies(
     max_views: int,
     progress: Callable[[], None],
 ) -> None:
-    """Measure points and store each as soon as it is done.
-
-    Args:
-        folder: The results folder.
-        scene: The scene's name.
-        images: ``[v,h,w,3]`` photos.
-        points: Segmentation and share of the points by key, see :func:`proxy_points`.
-        max_views: Photos at most, evenly spread.
-        progress: Called after each point.
-    """
+    """Measure points, see :func:`proxy_points`, on photos ``[v,h,w,3]``, and store each as soon as it is done."""
     views = pick_views(len(images), max_views)
     pixels = images.shape[1] * images.shape[2]
     for key, (name, share) in points.items():

@@ -49,49 +49,27 @@ class RunRecord:
 
     Scores are means over the views of a split: ``context`` are the views that the scene was made of, ``target``
     held-out ones; ``_visible`` counts only pixels that the context views see. None where nothing was measured.
-
-    Args:
-        key: Of the experiment, see :func:`experiment_key`.
-        scene: Its name.
-        scene_sha256: Hash of everything that was read.
-        method: ``gsmerge``, the name of a baseline, or ``input``: the scene as it is.
-        settings: Settings by flat name; the rest are defaults.
-        views_asked: Number of views that was asked for; None: all.
-        command: The command line of the run.
-        environment: Processor, threads and versions.
-        views: Views that went in.
-        num_input: Gaussians of those views.
-        count: Gaussians of the result.
-        ratio: ``count / num_input``.
-        bytes: Size of the result as a ``.ply``.
-        seconds: Wall time of the merge with everything but reading, writing and scoring.
-        stages: The same by stage, scoring included.
-        render_ms: Milliseconds that one view takes to render, the median.
-        pictures: Names of the views whose pictures were kept.
-        notes: Of the reader and of the run.
-        error: Why the run failed, in one line; None if it did not.
-        schema_version: Of this record.
     """
 
-    key: str
-    scene: str
-    scene_sha256: str
-    method: str
-    settings: Mapping[str, Any]
-    views_asked: int | None
-    command: str
-    environment: Mapping[str, str]
-    views: int | None = None
-    num_input: int | None = None
-    count: int | None = None
-    ratio: float | None = None
-    bytes: int | None = None
-    seconds: float | None = None
-    stages: Mapping[str, float] = field(default_factory=dict)
-    render_ms: float | None = None
-    pictures: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    error: str | None = None
+    key: str  # of the experiment, see experiment_key
+    scene: str  # its name
+    scene_sha256: str  # hash of everything that was read
+    method: str  # gsmerge, the name of a baseline, or input: the scene as it is
+    settings: Mapping[str, Any]  # settings by flat name; the rest are defaults
+    views_asked: int | None  # number of views that was asked for; None: all
+    command: str  # the command line of the run
+    environment: Mapping[str, str]  # processor, threads and versions
+    views: int | None = None  # views that went in
+    num_input: int | None = None  # Gaussians of those views
+    count: int | None = None  # Gaussians of the result
+    ratio: float | None = None  # count / num_input
+    bytes: int | None = None  # size of the result as a .ply
+    seconds: float | None = None  # wall time of the merge with everything but reading, writing and scoring
+    stages: Mapping[str, float] = field(default_factory=dict)  # the same by stage, scoring included
+    render_ms: float | None = None  # milliseconds that one view takes to render, the median
+    pictures: tuple[str, ...] = ()  # names of the views whose pictures were kept
+    notes: tuple[str, ...] = ()  # of the reader and of the run
+    error: str | None = None  # why the run failed, in one line; None if it did not
     psnr_context: float | None = None
     psnr_context_visible: float | None = None
     psnr_target: float | None = None
@@ -108,7 +86,7 @@ class RunRecord:
     lpips_alex_context_visible: float | None = None
     lpips_alex_target: float | None = None
     lpips_alex_target_visible: float | None = None
-    schema_version: int = SCHEMA_VERSION
+    schema_version: int = SCHEMA_VERSION  # of this record
 
     def score(self, name: str) -> float | None:
         """A score by its name, such as ``psnr_target_visible``."""

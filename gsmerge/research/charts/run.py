@@ -94,19 +94,13 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """The runs of a grid, and which of them are still to be done.
+    """The runs of a grid, and which of them are still to be done."""
 
-    Args:
-        runs: Key, experiment and scene of every run; one for each key.
-        pending: Keys of the runs that are not done yet, or failed.
-        proxies: Segmentation and share by key of the proxy points that are not measured yet, by scene.
-        notes: What was left out.
-    """
-
-    runs: tuple[tuple[str, Experiment, SceneSource], ...]
-    pending: frozenset[str]
+    runs: tuple[tuple[str, Experiment, SceneSource], ...]  # key, experiment and scene of every run; one for each key
+    pending: frozenset[str]  # keys of the runs that are not done yet, or failed
+    # segmentation and share by key of the proxy points that are not measured yet, by scene
     proxies: Mapping[str, Mapping[str, tuple[str, float]]]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was left out
 
     @property
     def total(self) -> int:
@@ -306,15 +300,7 @@ def estimate_seconds(
     lpips: Sequence[str] = (),
     lpips_views: int | None = None,
 ) -> float:
-    """Wall time of runs, within a factor of about two; from the folder's times of the same scene and method if any.
-
-    Args:
-        runs: Key, experiment and scene of the runs.
-        stored: Finished runs by key, whose times are used.
-        threads: Threads of the runs.
-        lpips: Networks of the perceptual distance.
-        lpips_views: Views of each split that are measured with them; None: all.
-    """
+    """Wall time of runs, within a factor of about two; from times of the same scene and method in ``stored`` if any."""
     known: dict[tuple[str, str], list[float]] = {}
     for record in stored.values():
         if record.seconds is not None and record.error is None:

@@ -15,25 +15,15 @@ from gsmerge.io.content_hash import cameras_of, content_hash, filled, photos_of,
 
 @dataclass(frozen=True)
 class SceneSource:
-    """A scene before it is read.
+    """A scene before it is read."""
 
-    Args:
-        path: As given.
-        name: Short name, different for every scene of a grid.
-        files: Gaussians, cameras, photos.
-        targets: Cameras of the held-out views; None without any.
-        target_images: Folder of their photos; None: found by their cameras.
-        num_views: Views of its camera file, an upper bound for those of the scene; None if unknown.
-        sha256: Of everything that is read.
-    """
-
-    path: Path
-    name: str
-    files: SceneFiles
-    targets: Path | None
-    target_images: Path | None
-    num_views: int | None
-    sha256: str
+    path: Path  # as given
+    name: str  # short name, different for every scene of a grid
+    files: SceneFiles  # gaussians, cameras, photos
+    targets: Path | None  # cameras of the held-out views; None without any
+    target_images: Path | None  # folder of their photos; None: found by their cameras
+    num_views: int | None  # views of its camera file, an upper bound for those of the scene; None if unknown
+    sha256: str  # of everything that is read
 
 
 def find_scenes(

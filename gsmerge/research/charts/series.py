@@ -35,34 +35,21 @@ Getter = Callable[[RunRecord], float | None]
 
 @dataclass(frozen=True)
 class Point:
-    """A method at one size or number of views, over all scenes.
+    """A method at one size or number of views, over all scenes."""
 
-    Args:
-        label: Size or number of views.
-        x: Mean cost over the scenes (geometric).
-        y: Mean quality with its interval.
-        by_scene: (x, y) of every scene.
-    """
-
-    label: str
-    x: float
-    y: Interval
-    by_scene: Mapping[str, tuple[float, float]]
+    label: str  # size or number of views
+    x: float  # mean cost over the scenes (geometric)
+    y: Interval  # mean quality with its interval
+    by_scene: Mapping[str, tuple[float, float]]  # (x, y) of every scene
 
 
 @dataclass(frozen=True)
 class Line:
-    """A method with its settings, from size to size.
+    """A method with its settings, from size to size."""
 
-    Args:
-        name: Of the method and its settings.
-        ours: Whether it is ours, not a baseline's.
-        points: By ascending size or number of views.
-    """
-
-    name: str
-    ours: bool
-    points: tuple[Point, ...]
+    name: str  # of the method and its settings
+    ours: bool  # whether it is ours, not a baseline's
+    points: tuple[Point, ...]  # by ascending size or number of views
 
 
 def line_key(record: RunRecord) -> LineKey:
@@ -104,9 +91,6 @@ def newest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
 
     A folder has several where the files of a scene changed, other scenes of the same name were run by another command,
     or LPIPS or seed were set differently.
-
-    Args:
-        records: In the order in which they were written.
 
     Returns:
         The records, and a note for each name of scenes with records that were left out.

@@ -15,40 +15,24 @@ LEVEL = 0.95  # confidence of the intervals
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its confidence interval.
+    """A mean and its confidence interval."""
 
-    Args:
-        mean: Over the scenes.
-        low: Lower end of the interval; equal to the mean where there is only one scene.
-        high: Upper end.
-        count: Scenes.
-    """
-
-    mean: float
-    low: float
-    high: float
-    count: int
+    mean: float  # over the scenes
+    low: float  # lower end of the interval; equal to the mean where there is only one scene
+    high: float  # upper end
+    count: int  # scenes
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A point of a baseline compared with our curve at the same cost.
+    """A point of a baseline compared with our curve at the same cost."""
 
-    Args:
-        baseline: Name of the baseline's line.
-        cost: Mean cost of the point.
-        quality: Mean quality of the point, over the scenes where ours is known at that cost.
-        ours: Our quality at the same cost; None where no scene has so cheap a result of ours.
-        ahead: Our quality less the baseline's, paired by scene; None with ``ours``.
-        words: ``ours above``, ``baseline above``, ``undecided`` or ``ours has none so cheap``.
-    """
-
-    baseline: str
-    cost: float
-    quality: float
-    ours: float | None
-    ahead: Interval | None
-    words: str
+    baseline: str  # name of the baseline's line
+    cost: float  # mean cost of the point
+    quality: float  # mean quality of the point, over the scenes where ours is known at that cost
+    ours: float | None  # our quality at the same cost; None where no scene has so cheap a result of ours
+    ahead: Interval | None  # our quality less the baseline's, paired by scene; None with ours
+    words: str  # ours above, baseline above, undecided or ours has none so cheap
 
 
 def t_factor(count: int, level: float = LEVEL) -> float:
@@ -82,13 +66,10 @@ def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float], le
 
 
 def paired_intervals(values: NDArray[np.float64], level: float = LEVEL) -> list[Interval]:
-    """Intervals of conditions that were measured on the same scenes, without the differences between scenes.
+    """Intervals of ``values [scenes, conditions]`` without the differences between scenes.
 
     Scenes differ by several dB and conditions by tenths, so plain intervals would hide the conditions. Here every
     scene's own mean is subtracted first (Cousineau 2005), with the correction for it (Morey 2008).
-
-    Args:
-        values: ``[scenes, conditions]``.
 
     Raises:
         ValueError: If there are no scenes or no conditions.
@@ -108,11 +89,7 @@ def _widened(interval: Interval, factor: float) -> tuple[float, float]:
 
 
 def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
-    """Points that no other dominates: none is as cheap and better, or cheaper and as good.
-
-    Args:
-        costs: Lower is better.
-        qualities: Higher is better.
+    """Points that no other dominates: none is as cheap and better (a higher quality), or cheaper and as good.
 
     Returns:
         Indices by ascending cost; of equal points the first.
@@ -128,12 +105,7 @@ def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int
 def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
     """Quality of a method at a cost: its front, linear over the logarithm of the cost between two points.
 
-    Beyond the most expensive point the quality is constant.
-
-    Args:
-        costs: Positive.
-        qualities: Higher is better.
-        cost: Where to evaluate it.
+    Costs are positive, and a higher quality is better. Beyond the most expensive point the quality is constant.
 
     Returns:
         None below the cheapest point.

@@ -172,13 +172,7 @@ class Noise:
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
-    """Values for one scene.
-
-    Args:
-        options: The ranges.
-        rng: Source of randomness.
-        factor: Of the errors; habits of the exporter stay. Shares and ``bleed`` are limited to 1.
-    """
+    """Values for one scene, with all errors times ``factor``, but not habits; shares and ``bleed`` are limited to 1."""
     drawn: dict[str, float] = {}
     for f in fields(Noise):
         if f.name == "sh_degree":

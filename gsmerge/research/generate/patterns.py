@@ -28,7 +28,6 @@ def noise(
     """Octaves of random cells, each ``fade`` times as strong as the previous one.
 
     Args:
-        rng: Source of randomness.
         size: Side, pixels.
         first: Cells of the coarsest octave along a side.
         fade: 0.3 gives clouds, 0.9 grit.
@@ -66,7 +65,6 @@ def courses(
     """Bricks or tiles: a random tone for each, and 1 on the joints.
 
     Args:
-        rng: Source of randomness.
         size: Side, pixels.
         rows: Courses.
         columns: Stones in a course.

@@ -57,48 +57,28 @@ FIT_COLUMNS = ("parents_", "targets_", "mask_")
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """K Gaussians for each merged Feature Gaussian, and their corrections by the fit.
+    """K Gaussians for each merged Feature Gaussian, and their corrections by the fit."""
 
-    Args:
-        children: n analytic Gaussians.
-        parents: ``[n]`` int64, the merged Feature Gaussian of each, ascending.
-        targets: ``[n,13]`` corrections by the fit.
-        mask: ``[n]`` whether there is a target.
-    """
-
-    children: Gaussians
-    parents: Tensor
-    targets: Tensor
-    mask: Tensor
+    children: Gaussians  # n analytic Gaussians
+    parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
+    targets: Tensor  # [n,13] corrections by the fit
+    mask: Tensor  # [n] whether there is a target
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene to learn from.
+    """A scene to learn from."""
 
-    Args:
-        name: Of the scene.
-        sha256: Hash of the scene's content and of the settings.
-        members: The scene's Gaussians.
-        cameras: Its views.
-        features: ``g`` analytic Feature Gaussians before merging.
-        matches: The cluster of each.
-        centres: ``[r,3]`` means after merging.
-        levels: By number of children K.
-        photos: At the size that renders are scaled_corrections at; those of the views come first, then novel ones.
-        masks: ``[p,h,w]`` bool: pixels of the photos that the scene covers.
-    """
-
-    name: str
-    sha256: str
-    members: Members
-    cameras: Cameras
-    features: FeatureGaussians
-    matches: Matches
-    centres: Tensor
-    levels: Mapping[int, Level]
-    photos: Photos
-    masks: np.ndarray
+    name: str  # of the scene
+    sha256: str  # hash of the scene's content and of the settings
+    members: Members  # the scene's Gaussians
+    cameras: Cameras  # its views
+    features: FeatureGaussians  # g analytic Feature Gaussians before merging
+    matches: Matches  # the cluster of each
+    centres: Tensor  # [r,3] means after merging
+    levels: Mapping[int, Level]  # by number of children K
+    photos: Photos  # at the size that renders are scaled_corrections at; those of the views come first, then novel ones
+    masks: np.ndarray  # [p,h,w] bool: pixels of the photos that the scene covers
 
     def photo_ids(self, *, novel: bool) -> list[int]:
         """Photos with a mask that is not empty, of the views or of novel ones."""

@@ -56,29 +56,17 @@ class TrainingState:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """The files and figures of a run.
+    """The files and figures of a run."""
 
-    Args:
-        best: Checkpoint with the highest PSNR of validation; before renders are compared, with the least loss.
-        last: Checkpoint of the last step.
-        losses: CSV, one row for each validation.
-        step: Steps done.
-        loss: The last training loss.
-        validation_loss: The least validation loss.
-        psnr_analytic: PSNR (dB) of the windows of validation without networks.
-        psnr_learned: The best PSNR with networks.
-        resumed: Step from which the run was resumed; 0 for a new one.
-    """
-
-    best: Path
-    last: Path
-    losses: Path
-    step: int
-    loss: float
-    validation_loss: float
-    psnr_analytic: float
-    psnr_learned: float
-    resumed: int
+    best: Path  # checkpoint with the highest PSNR of validation; before renders are compared, with the least loss
+    last: Path  # checkpoint of the last step
+    losses: Path  # CSV, one row for each validation
+    step: int  # steps done
+    loss: float  # the last training loss
+    validation_loss: float  # the least validation loss
+    psnr_analytic: float  # PSNR (dB) of the windows of validation without networks
+    psnr_learned: float  # the best PSNR with networks
+    resumed: int  # step from which the run was resumed; 0 for a new one
 
 
 def train(

@@ -79,13 +79,7 @@ def window_loss(
 ) -> Tensor:
     """Loss of a window of a photo: its render on a random background, and the regularizers of its Gaussians.
 
-    Args:
-        networks: The networks.
-        window: The window.
-        scales: Standard deviations of the targets of each K.
-        options: Weights of the losses.
-        step: On which some weights depend.
-        rng: Chooses the background.
+    ``scales`` are the standard deviations of the targets of each K, see :func:`target_scales`.
     """
     crop = window.crop
     prediction = predict(crop, networks, step)
@@ -169,13 +163,10 @@ GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversificatio
 
 
 def teacher_loss(corrections: Tensor) -> Tensor:
-    """Distance from the analytic Gaussians: the angle of the rotation, and L1 of everything else.
+    """Size of corrections ``[n,13]``: the angle of the rotation, and L1 of everything else.
 
     The analytic ones are the moment-matched teacher of the paper; corrections are the difference to it, in sizes of
     the Gaussian, logarithms and logits. The length of a rotation vector is the geodesic distance of the quaternions.
-
-    Args:
-        corrections: ``[n,13]``.
     """
     if len(corrections) == 0:
         return corrections.new_zeros(())
@@ -184,14 +175,10 @@ def teacher_loss(corrections: Tensor) -> Tensor:
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor) -> Tensor:
-    """Pairs of children that overlap too much, too little, or of which one is much more opaque (paper supplement).
+    """Pairs of siblings (``parents [n]``) that overlap too much or too little, or differ in opacity (paper supplement).
 
     Pairs are weighted by their volumes, divided by their mean over all pairs and without gradient: otherwise the loss
     would depend on the scale of the world, and shrinking would be the easiest way to lower it.
-
-    Args:
-        gaussians: n children, those of one group next to each other.
-        parents: ``[n]`` the group of each.
     """
     one, other = sibling_pairs(parents)
     if len(one) == 0:

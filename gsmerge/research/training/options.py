@@ -194,11 +194,7 @@ class TrainOptions:
 
 
 def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
-    """Training settings from a TOML or JSON file whose keys are the fields of :class:`TrainOptions`.
-
-    Args:
-        path: The file.
-        start: Settings that the file does not name; None: the defaults.
+    """``start``, or the defaults, with settings of a TOML or JSON file, named as the fields of :class:`TrainOptions`.
 
     Raises:
         SceneError: If the file cannot be read or a setting is unknown or out of range.

@@ -45,12 +45,9 @@ def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
 
 
 def make_training_scene(scene: PixelScene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
-    """Some views of a scene, with all photos.
+    """The views ``ids`` of a scene with one Gaussian per pixel, with all its photos.
 
-    Args:
-        scene: One Gaussian per pixel, with photos.
-        ids: The views to keep.
-        held_out: More photos in the scene's frame, resized to the scene's own.
+    Photos of ``held_out`` views are added, resized to the scene's own.
     """
     assert scene.images is not None
     part = subset(scene, ids)

@@ -107,12 +107,7 @@ def _names(figure: figures.Figure) -> list[tuple[str, bool]]:
 
 
 def draw(figure: figures.Figure, common: Styles) -> tuple[bytes, bytes]:
-    """A figure as PNG and SVG; the same numbers give the same bytes.
-
-    Args:
-        figure: What to draw.
-        common: Styles of lines, used if they include all of the figure's.
-    """
+    """A figure as PNG and SVG; the same numbers give the same bytes. ``common`` styles are used if complete."""
     names = _names(figure)
     styles = common if all(name in common for name, _ in names) else line_styles(names)
     with matplotlib.rc_context():
