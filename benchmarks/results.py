@@ -21,8 +21,7 @@ from result_tables import page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
-from gsmerge.research.charts.record import RunRecord
-from gsmerge.research.charts.store import CHARTS, read_runs
+from gsmerge.research.charts.record import CHARTS, RunRecord, read_runs
 
 ROOT = Path(__file__).parents[1]
 FAST_BASELINES = "random,opacity,contribution,blocks,voxel,paper"

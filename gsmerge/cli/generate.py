@@ -17,7 +17,7 @@ from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.research.generate import Generated, GenerateOptions
+    from gsmerge.research.generate import GenerateOptions, SceneFolder
 
 SCENE, ERRORS = "Scenes", "Errors"
 
@@ -89,7 +89,7 @@ def _made(
     threads: int | None,
     dry_run: bool,
     quiet: bool,
-) -> list[Generated]:
+) -> list[SceneFolder]:
     """Make the scenes, or say which there would be."""
     from gsmerge.research.generate import generate as make_scenes
     from gsmerge.research.generate import plan

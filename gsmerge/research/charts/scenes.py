@@ -14,34 +14,26 @@ from gsmerge.io.content_hash import cameras_of, content_hash, filled, photos_of,
 
 
 @dataclass(frozen=True)
-class Place:
-    """A scene before it is read.
+class SceneSource:
+    """A scene before it is read."""
 
-    Args:
-        path: As given.
-        name: For people; no two scenes of a grid have the same.
-        files: Gaussians, cameras, photos.
-        targets: Cameras of the held-out views; None without any.
-        target_images: Folder of their photos; None: found by their cameras.
-        num_views: Views of its camera file, an upper bound for those of the scene; None if unknown.
-        sha256: Of everything that is read.
-    """
-
-    path: Path
-    name: str
-    files: SceneFiles
-    targets: Path | None
-    target_images: Path | None
-    num_views: int | None
-    sha256: str
+    path: Path  # as given
+    name: str  # short name, different for every scene of a grid
+    files: SceneFiles  # gaussians, cameras, photos
+    targets: Path | None  # cameras of the held-out views; None without any
+    target_images: Path | None  # folder of their photos; None: found by their cameras
+    num_views: int | None  # views of its camera file, an upper bound for those of the scene; None if unknown
+    sha256: str  # of everything that is read
 
 
-def find_places(scenes: Sequence[Path], targets: str | None = None, target_images: str | None = None) -> list[Place]:
-    """Find the files of all scenes.
+def find_scenes(
+    scenes: Sequence[Path], targets: str | None = None, target_images: str | None = None
+) -> list[SceneSource]:
+    """The files of all scenes.
 
     Args:
         scenes: ``.ply`` files, or the folders that they are in.
-        targets: Cameras of the held-out views: one path for all scenes, or with ``{scene}`` (the scene as given),
+        targets: Cameras of the held-out views: one path for all scenes, or a template with ``{scene}`` (as given),
             ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it.
         target_images: The same for the folder of their photos.
 
@@ -51,13 +43,13 @@ def find_places(scenes: Sequence[Path], targets: str | None = None, target_image
     """
     names = scene_names(scenes)
     return [
-        _place(scene, name, filled(targets, scene), filled(target_images, scene))
+        _make_source(scene, name, filled(targets, scene), filled(target_images, scene))
         for scene, name in zip(scenes, names, strict=True)
     ]
 
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:
-    """A short name for every scene: its own, or as many folders before it as tell them apart.
+    """A short name for every scene: its own, with as many folders before it as it takes to distinguish them.
 
     Raises:
         UsageError: If a scene is given twice.
@@ -72,7 +64,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
     raise UsageError("expected every scene once, got one twice")
 
 
-def _place(scene: Path, name: str, targets: Path | None, target_images: Path | None) -> Place:
+def _make_source(scene: Path, name: str, targets: Path | None, target_images: Path | None) -> SceneSource:
     files = find_scene_files(scene)
     if targets is not None and not targets.exists():
         raise SceneError(targets, f"expected cameras of held-out views of {scene}, found nothing")
@@ -81,10 +73,10 @@ def _place(scene: Path, name: str, targets: Path | None, target_images: Path | N
     cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
     num_views = None if cameras is None else len(cameras)
     once = dict.fromkeys(path for path in read if path is not None)
-    return Place(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
+    return SceneSource(scene, name, files, targets, target_images, num_views, content_hash(list(once)))
 
 
 def _cameras_inside(path: Path) -> Path:
-    """The cameras that are read from a folder: what else lies in it, such as results, does not count."""
-    found = find_cameras(path) if path.is_dir() and not is_colmap(path) else None
-    return path if found is None else found
+    """The cameras that are read from a folder: other files in it, such as results, do not change the hash."""
+    cameras = find_cameras(path) if path.is_dir() and not is_colmap(path) else None
+    return path if cameras is None else cameras

@@ -1,4 +1,4 @@
-"""Scenes with some of their views, and every photo that is known of them."""
+"""Scenes of which the networks get some views, with all their photos."""
 
 from __future__ import annotations
 
@@ -23,41 +23,31 @@ OPAQUE = 0.5  # alpha from which the Gaussians cover a pixel
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
-    """A canonical scene of some views, and the photos of all.
+class TrainingScene:
+    """Some views of a scene, in the canonical frame, and the photos of all."""
 
-    Args:
-        scene: The chosen views, canonical.
-        members: Its Gaussians.
-        cameras: Those of all photos, canonical; the scene's own come first.
-        images: ``[p,h,w,3]`` float32, at the size of the scene's own.
-    """
-
-    scene: PixelScene
-    members: Members
-    cameras: Cameras
-    images: np.ndarray
+    scene: PixelScene  # the chosen views
+    members: Members  # its Gaussians
+    cameras: Cameras  # of all photos, those of the chosen views first
+    images: np.ndarray  # [p,h,w,3] float32, at the size of the scene's own
 
     def photos(self, level: int = 1) -> Photos:
         """All photos, each side divided by ``level``."""
         names = tuple(map(str, range(len(self.cameras))))
-        every = UnalignedScene(self.scene.gaussians[:0], self.cameras, torch.from_numpy(self.images), names)
-        return scene_photos(every, level)
+        unaligned = UnalignedScene(self.scene.gaussians[:0], self.cameras, torch.from_numpy(self.images), names)
+        return scene_photos(unaligned, level)
 
 
 def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
-    """Views of each count, evenly spread: 0, and a count that there are not as many for, means all; none twice."""
+    """Views of each count, evenly spread; 0, or more than there are, means all. Every selection is returned once."""
     chosen = [even_views(num_views, count if 0 < count < num_views else num_views) for count in counts]
     return [ids for i, ids in enumerate(chosen) if ids not in chosen[:i]]
 
 
-def make_subject(scene: PixelScene, ids: Sequence[int], held_out: Views | None = None) -> Subject:
-    """A scene as if only some of its views had been given; the other photos are known nevertheless.
+def make_training_scene(scene: PixelScene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
+    """The views ``ids`` of a scene with one Gaussian per pixel, with all its photos.
 
-    Args:
-        scene: One Gaussian per pixel, with photos.
-        ids: The views that are given.
-        held_out: More photos in the scene's frame; brought to the size of the scene's own.
+    Photos of ``held_out`` views are added, resized to the scene's own.
     """
     assert scene.images is not None
     part = subset(scene, ids)
@@ -74,36 +64,36 @@ def make_subject(scene: PixelScene, ids: Sequence[int], held_out: Views | None =
             viewmats=torch.cat([cameras.viewmats.double(), held_out.cameras.viewmats.double()]),
             Ks=torch.cat([cameras.Ks.double(), held_out.cameras.Ks.double() * ratio.double()[:, None]]),
         )
-        fitting = [_at_size(image, width, height) for image in held_out.images.numpy()]
-        images = np.concatenate([images, np.stack(fitting)])
-    return Subject(canonical, scene_members(canonical), frame.enter_cameras(cameras), images)
+        resized = [_resize(image, width, height) for image in held_out.images.numpy()]
+        images = np.concatenate([images, np.stack(resized)])
+    return TrainingScene(canonical, scene_members(canonical), frame.enter_cameras(cameras), images)
 
 
-def _at_size(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The photo at another size; area averages where it shrinks."""
+def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The photo at another size, by area averages where it shrinks."""
     if image.shape[:2] == (height, width):
         return image
     smaller = width * height < image.shape[0] * image.shape[1]
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
 
 
-def covered(subject: Subject) -> np.ndarray:
-    """``[p,h,w]`` bool: pixels that show what the given views have seen, and that their Gaussians cover."""
-    own, cameras = len(subject.scene), subject.cameras
-    splats, photos = prepare(subject.scene.gaussians, np.zeros(3)), subject.photos()
+def coverage_masks(training: TrainingScene) -> np.ndarray:
+    """``[p,h,w]`` bool: pixels of surfaces that the chosen views see, and that their Gaussians cover."""
+    own, cameras = len(training.scene), training.cameras
+    splats, photos = prepare(training.scene.gaussians, np.zeros(3)), training.photos()
 
     def opaque(view: int) -> np.ndarray:
         return 1 - composite(plan_view(splats, **photos.camera(view), near=NEAR))[1] >= OPAQUE
 
     masks = np.stack(parallel_map(opaque, range(len(cameras))))
     if len(cameras) > own:
-        points = context_points(subject.scene, NEAR)
-        masks[own:] &= visible_pixels(points, cameras[own:], NEAR, subject.scene.cameras)
+        points = context_points(training.scene, NEAR)
+        masks[own:] &= visible_pixels(points, cameras[own:], NEAR, training.scene.cameras)
     return masks
 
 
 def reduced_masks(masks: np.ndarray, photos: Photos) -> np.ndarray:
-    """Masks ``[p,h,w]`` of full-size photos for the same photos at a smaller size: most of a pixel must count."""
+    """Masks ``[p,h,w]`` of full-size photos for smaller ones: pixels of which more than half is in the mask."""
     size = photos.width, photos.height
     small = [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for mask in masks]
     return np.stack(small)
