@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.content_hash import cameras_of
 from gsmerge.report import human_bytes
-from gsmerge.runtime.estimate import COST_FIXED, work_seconds
+from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.threads import available_threads
 
 SHARE = 0.8  # of the memory that is free, where no limit is told
@@ -85,7 +85,7 @@ def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, shape: Shape) -
         views = max(1, _num_views(job))
         seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
         total += seconds / min(shape.threads, views)
-    return COST_FIXED * bool(jobs) + total / max(1, min(shape.jobs, len(jobs)))
+    return IMPORT_SECONDS * bool(jobs) + total / max(1, min(shape.jobs, len(jobs)))
 
 
 def _num_views(job: Job) -> int:

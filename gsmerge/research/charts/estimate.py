@@ -9,16 +9,16 @@ from gsmerge.research.charts.experiment import OURS, Experiment
 from gsmerge.research.charts.places import Place
 from gsmerge.research.charts.record import INPUT, RunRecord
 from gsmerge.runtime.estimate import (
+    COST_BASELINES,
     COST_COLOR_FIT,
-    COST_FIT_LOOKS,
+    COST_FIT_RENDERS,
     COST_FULL_FIT,
     COST_MERGE,
+    COST_OTHER_BASELINE,
     COST_READ,
-    COST_RIVAL,
-    COST_RIVAL_STEP,
-    COST_RIVALS,
     COST_ROBUST,
     COST_SEGMENT,
+    COST_UNMERGED_STEP,
     score_cost,
 )
 from gsmerge.stages.fit.options import STEPS
@@ -73,7 +73,7 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     fit = settings.get("fit", "full")
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
-        work += pixels * COST_FIT_LOOKS
+        work += pixels * COST_FIT_RENDERS
     else:
         work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
     return work / threads
@@ -81,8 +81,8 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
 
 def _rival_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
     """The same of another method than ours."""
-    work = COST_RIVALS.get(method, COST_RIVAL) + score_cost(views) + COST_COLOR_FIT * (method == "unmerged-color")
-    work *= pixels
+    work = COST_BASELINES.get(method, COST_OTHER_BASELINE) + score_cost(views)
+    work = pixels * (work + COST_COLOR_FIT * (method == "unmerged-color"))
     if method == "unmerged-fit":
-        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_RIVAL_STEP)
+        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_UNMERGED_STEP)
     return work / threads
