@@ -23,7 +23,6 @@ METHODS = (
 )  # fmt: skip
 
 CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
-PRECISIONS = ("float32", "bfloat16")
 AUTO_STEPS = 2  # times the usual ones
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 
@@ -43,15 +42,13 @@ class CompactOptions:
         decode: Gaussians per group.
         fit: Fit to the photos.
         target: What decides the number of Gaussians.
-        method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
+        method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
             come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
             analytic start shows the views better, see :meth:`networks`.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
-        precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
-            faster on processors that know it.
-        seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
+        seed: Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:
@@ -72,15 +69,12 @@ class CompactOptions:
     method: str = "gsmerge"
     checkpoint: str = "auto"
     require_checkpoint: bool = False
-    precision: str = "float32"
     seed: int = 0
     threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
-        if self.precision not in PRECISIONS:
-            raise ValueError(f"precision: expected {' or '.join(PRECISIONS)}, got {self.precision!r}")
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":

@@ -119,7 +119,7 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
-    PSNR and SSIM are those of blocks that the short fits do not look at, at full size; LPIPS needs whole pictures.
+    PSNR and SSIM are those of blocks that the short fits leave out, at full size; LPIPS needs whole pictures.
 
     Args:
         prepared: The scene, which must have photos.
@@ -129,7 +129,7 @@ def measure_curve(
         log: Takes the progress.
     """
     options = prepared.options
-    short = FitOptions(fit="full", fit_steps=steps, coarse=1.0, holdout=HOLDOUT, rates=options.fit.rates)
+    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
     limits = replace(prepared.limits, share=1.0)  # so short a fit does not grow
     quick = replace(prepared, options=replace(options, fit=short), limits=limits, checkpoint=None)
     photos = scene_photos(prepared.scene)

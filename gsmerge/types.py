@@ -76,7 +76,7 @@ class Gaussians:
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Rows of all parts in order; all must have the same SH degree."""
+        """Rows of all parts, one part after the other; all must have the same SH degree."""
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
 
 
@@ -339,7 +339,7 @@ class FeatureGaussians:
 
     @staticmethod
     def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
-        """All groups of all parts in order."""
+        """All groups, one part after the other."""
         names = [f.name for f in fields(FeatureGaussians) if f.name != "starts"]
         columns = {name: torch.cat([getattr(p, name) for p in parts]) for name in names}
         sizes = torch.cat([p.starts[1:] - p.starts[:-1] for p in parts])

@@ -1,4 +1,4 @@
-"""Which views go in, which are held out (the paper's rule, supplement A, "View sampling"), and which are looked at."""
+"""Which views go in, which are held out (the paper's rule, supplement A, "View sampling"), and which are scored."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _equal_views(scene: PixelScene | UnalignedScene, one: int, other: int) -> bo
 def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> PixelScene | UnalignedScene:
     """The scene as if only some of its views had been given: their Gaussians, cameras and photos.
 
-    Gaussians in no order belong to no view, and all stay.
+    Unaligned Gaussians belong to no view, and all stay.
     """
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]

@@ -27,7 +27,7 @@ def unmerged(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
 
 def unmerged_color(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The colour fit on all Gaussians, none left out; whatever the count."""
-    return _fit_input(prepared, replace(prepared.options.fit, fit="color", prune=0.0), log)
+    return _fit_input(prepared, replace(prepared.options.fit, fit="color", min_contribution=0.0), log)
 
 
 def unmerged_fit(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
@@ -98,7 +98,7 @@ UNMERGED_COLOR = Baseline(
     "the input with colours solved on the photos",
     unmerged_color,
     needs=("photos",),
-    uses=("iterations", "pull", "huber", "min_gain", "max_gain", "holdout"),
+    uses=("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout"),
 )
 UNMERGED_FIT = Baseline(  # what merging has to be better than
     "unmerged-fit",

@@ -12,11 +12,11 @@ from gsmerge.encoded.divide import pick_children
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_described, described_by
+from gsmerge.networks import NetworkContext, decode_with_group_features, make_group_features
 from gsmerge.render.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.fit import shown
+from gsmerge.stages.fit import visible_mask
 from gsmerge.types import Gaussians
 
 
@@ -112,7 +112,7 @@ def decode_scene(
         gaussians, _ = children_of(encoded, plan.counts)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
         if plan.min_contribution > 0:
-            gaussians = gaussians[shown(gaussians, blank_photos(encoded.cameras, 2), plan.min_contribution)]
+            gaussians = gaussians[visible_mask(gaussians, blank_photos(encoded.cameras, 2), plan.min_contribution)]
         if encoded.kept is not None:
             gaussians = Gaussians.concat([gaussians, encoded.kept])
         return encoded.frame.leave(gaussians)
@@ -124,8 +124,8 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
     rows, parents = pick_children(encoded.division, counts)
     gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[torch.from_numpy(rows)]
     if heads is not None:
-        described = described_by(features, heads.views, heads.group, encoded.cameras)
+        group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-        learned = Learned(heads.networks, nothing, encoded.cameras, precision=heads.precision)
-        gaussians = decode_described(gaussians, parents, features, described, learned)
+        networks = NetworkContext(heads.networks, nothing, encoded.cameras)
+        gaussians = decode_with_group_features(gaussians, parents, features, group_features, networks)
     return gaussians, parents

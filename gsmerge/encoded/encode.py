@@ -91,15 +91,15 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
         k=options.decode.k,
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
-        min_contribution=options.fit.prune if prunes else 0.0,
+        min_contribution=options.fit.min_contribution if prunes else 0.0,
         target_count=count if exact else None,
         num_slots=None if exact or count is None else count // options.decode.count,
         knee_count=knee_count(prepared),
     )
     heads = None
     if networks is not None:
-        described = networks.describe(features)
-        heads = StoredHeads(networks.networks, networks.precision, described.views, described.group)
+        group_features = networks.describe(features)
+        heads = StoredHeads(networks.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, max_k, options.encode.rule),

@@ -39,7 +39,6 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_file
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.tokens import GROUP
-from gsmerge.options import PRECISIONS
 from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
@@ -60,7 +59,7 @@ SETTING_KEYS = {
 }
 COMMON_ENTRIES = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}
 ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind of content
-    ENCODED: COMMON_ENTRIES | {"networks": dict | None, "precision": str},
+    ENCODED: COMMON_ENTRIES | {"networks": dict | None},
     STATE: COMMON_ENTRIES,
 }
 PREFIXES = (
@@ -143,7 +142,6 @@ def save_encoded(
     entries = {
         "networks": None if heads is None else asdict(heads.networks.options),
         "about": {**encoded.about, **({} if source is None else {"source": dict(source)})},
-        "precision": "float32" if heads is None else heads.precision,
     }
     tensors = {
         "division.splits": division.splits,
@@ -343,8 +341,6 @@ def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> St
     header, prefix = file.header, "networks."
     if header["networks"] is None:
         return None
-    if header["precision"] not in PRECISIONS:
-        raise file.error(f"precision: expected {' or '.join(PRECISIONS)}, found {header['precision']!r:.40}")
     weights = {name.removeprefix(prefix): t for name, t in file.tensors.items() if name.startswith(prefix)}
     networks = build_networks(file.path, header["networks"], weights, REMEDY)
     views = file.tensor("heads.views", torch.int32, len(features)).long()
@@ -354,4 +350,4 @@ def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> St
     if latent != expected:
         raise file.error(f"features.latents: expected {expected} numbers, as of its networks, found {latent}")
     group = file.tensor("heads.group", torch.float32, len(features), GROUP)
-    return StoredHeads(networks, header["precision"], views, group)
+    return StoredHeads(networks, views, group)

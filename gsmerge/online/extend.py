@@ -42,7 +42,7 @@ from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
-from gsmerge.stages.fit import shown
+from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
 from gsmerge.stages.prepare import PreparedScene, prepare
@@ -204,10 +204,10 @@ def _enter(
     groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
     alone = select_groups(new, torch.nonzero(~has_partner)[:, 0])
     counts = {"num_joined": int(has_partner.sum())}
-    if options.fit.prune > 0 and prepared.scene.images is not None:
+    if options.fit.min_contribution > 0 and prepared.scene.images is not None:
         in_view = feature_to_gaussians(take(groups.features, rows))
         both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
-        visible = shown(both, photos.photos(2), options.fit.prune)[len(in_view) :]
+        visible = visible_mask(both, photos.photos(2), options.fit.min_contribution)[len(in_view) :]
         counts["num_hidden"] = int((~visible).sum())
         alone = select_groups(alone, torch.nonzero(visible)[:, 0])
     return concat_groups([groups, alone]), counts
@@ -260,7 +260,7 @@ def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> Onlin
         k=options.decode.k,
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
-        min_contribution=options.fit.prune if prepared.given.images is not None else 0.0,
+        min_contribution=options.fit.min_contribution if prepared.given.images is not None else 0.0,
         target_count=None,
         num_slots=None,
         knee_count=0,

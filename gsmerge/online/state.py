@@ -14,7 +14,7 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
@@ -92,14 +92,14 @@ class OnlineState(StoredScene):
 
 
 def bake(
-    features: FeatureGaussians, members: Members, learned: Learned | None, max_k: int, rule: Rule = "depth"
+    features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int, rule: Rule = "depth"
 ) -> GroupSet:
     """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more.
 
     Args:
         features: g Feature Gaussians with their members.
         members: The Gaussians that they point to.
-        learned: Networks whose heads correct what is decoded; None: none do.
+        networks: Networks whose heads correct what is decoded; None: none do.
         max_k: Most children that are stored of a group.
         rule: How children are pooled.
     """
@@ -107,9 +107,9 @@ def bake(
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
         children, parents = divide(features, members, np.full(len(features), max_k), rule)
-    if learned is not None:
-        ones = decode_gaussians(ones, np.arange(len(features)), features, learned)
-        children = decode_gaussians(children, parents, features, learned)
+    if networks is not None:
+        ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
+        children = decode_gaussians(children, parents, features, networks)
     return _group_set(features, ones, children, parents)
 
 

@@ -101,7 +101,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: int = 1) -> Photos:
 
 
 def blank_photos(cameras: Cameras, level: int = 1) -> Photos:
-    """Black photos, which take no memory, for what only looks at cameras; each side divided by ``level``."""
+    """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     w, h = cameras.width, cameras.height
     size = (w, h) if level == 1 else (max(1, round(w / level)), max(1, round(h / level)))

@@ -1,4 +1,4 @@
-"""What a run notes down: seconds by stage, choices, sentences for the user; and whom it tells."""
+"""The record of a run: seconds by stage, choices, notes for the user, and progress."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAGES = (
 
 @dataclass
 class RunLog:
-    """Clock and notebook of one run.
+    """Clock and record of one run.
 
     Args:
         progress: Called with (stage, done, total).

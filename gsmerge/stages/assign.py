@@ -46,20 +46,20 @@ class ContributionOptions:
     Args:
         unseen: ``"drop"``: Gaussians that no view sees are left out. ``"keep"``: they are merged among their neighbours
             in space, at the rate of the others, and added to the result.
-        min_contribution: Blending weight, in pixels of one view, below which a Gaussian counts as unseen.
+        min_owner_weight: Blending weight, in pixels of one view, below which a Gaussian counts as unseen.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
     """
 
     unseen: Unseen = "drop"
-    min_contribution: float = 0.0
+    min_owner_weight: float = 0.0
 
     def __post_init__(self) -> None:
         if self.unseen not in ("drop", "keep"):
             raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
-        if not self.min_contribution >= 0:
-            raise ValueError(f"min_contribution: expected at least 0, got {self.min_contribution}")
+        if not self.min_owner_weight >= 0:
+            raise ValueError(f"min_owner_weight: expected at least 0, got {self.min_owner_weight}")
 
 
 def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: ContributionOptions) -> Members:
@@ -69,7 +69,7 @@ def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: 
         UsageError: If no view sees any Gaussian.
     """
     assert isinstance(scene, UnalignedScene)  # a scene with one Gaussian per pixel has its members
-    pixels = owner_pixels(find_owners(scene, groups), groups, options.min_contribution)
+    pixels = owner_pixels(find_owners(scene, groups), groups, options.min_owner_weight)
     if not (pixels >= 0).any():
         raise UsageError(
             f"expected views that see the scene, found that none of {len(scene)} sees any of {len(pixels)} Gaussians: "
@@ -94,7 +94,7 @@ def split_unseen(
     if options.contribution.unseen != "keep":
         return scene, options, None
     weights = seen_weights(scene)
-    seen = torch.from_numpy((weights > 0) & (weights >= options.contribution.min_contribution))
+    seen = torch.from_numpy((weights > 0) & (weights >= options.contribution.min_owner_weight))
     num_unseen = int((~seen).sum())
     log.notes.append(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
     if num_unseen in (0, len(seen)):
@@ -216,7 +216,7 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
     """
     labels = np.ascontiguousarray(labels, np.int32)
     num, room = len(plan.ids), max(FIRST_PAIRS, count)
-    values, found = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
     stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
     heads, active = np.full(num, -1, np.int32), np.empty(num + 1, np.int32)
     pairs, num_pairs, num_active = np.empty((room, PAIR)), 0, 0
@@ -227,18 +227,18 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
         )  # fmt: skip
         bottom = (line + 1) * TILE if line < plan.lines - 1 else MAX_SIZE
         pairs, num_pairs, num_active = settle_row(
-            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, found
+            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, owners
         )
-    return values, found
+    return values, owners
 
 
-def owner_pixels(owners: Owners, groups: Groups, min_contribution: float = 0.0) -> np.ndarray:
+def owner_pixels(owners: Owners, groups: Groups, min_owner_weight: float = 0.0) -> np.ndarray:
     """The pixel in the middle of each Gaussian's superpixel, ``[n]`` int64 over all views; -1 for unseen ones.
 
     Args:
         owners: The dominant superpixels.
         groups: The superpixels.
-        min_contribution: Those with less are taken for unseen, too.
+        min_owner_weight: Those with less are taken for unseen, too.
     """
     counts = np.asarray(groups.counts)
     size, first = groups.labels[0].numel(), np.cumsum(counts) - counts
@@ -247,7 +247,7 @@ def owner_pixels(owners: Owners, groups: Groups, min_contribution: float = 0.0) 
         return middle_pixels(groups.labels[view].numpy(), groups.counts[view]) + view * size
 
     middles = np.concatenate(parallel_map(one_view, range(len(counts))))
-    seen = (owners.labels >= 0) & (owners.values >= min_contribution)
+    seen = (owners.labels >= 0) & (owners.values >= min_owner_weight)
     return np.where(seen, middles[first[owners.views] + owners.labels], -1)
 
 
@@ -259,7 +259,7 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
     order = np.lexsort((dx * dx + dy * dy, flat))
-    found, at = np.unique(flat[order], return_index=True)
+    present, at = np.unique(flat[order], return_index=True)
     middles = np.zeros(count, np.int64)
-    middles[found] = order[at]
+    middles[present] = order[at]
     return middles

@@ -10,7 +10,7 @@ import torch
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import FeatureGaussians, Gaussians
@@ -53,7 +53,7 @@ def decode(
     options: DecodeOptions,
     counts: np.ndarray | None = None,
     rule: Rule = "depth",
-    learned: Learned | None = None,
+    networks: NetworkContext | None = None,
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 
@@ -64,9 +64,9 @@ def decode(
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
-        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer are not looked at.
+        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter.
         rule: How children are pooled, the encoder's.
-        learned: Networks whose heads correct the children; None: none does.
+        networks: Networks whose heads correct the children; None: none does.
 
     Returns:
         The Gaussians, those of one group next to each other.
@@ -79,8 +79,8 @@ def decode(
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
-    if learned is not None:
-        gaussians = decode_gaussians(gaussians, parents, features, learned)
+    if networks is not None:
+        gaussians = decode_gaussians(gaussians, parents, features, networks)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
@@ -101,7 +101,7 @@ def decode_merged(merged: MergedViews, options: DecodeOptions, rule: Rule, *, gr
 
 
 def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions, rule: Rule) -> Gaussians:
-    """``count`` Gaussians, dealt out to where they lower distortion most; None: K of each Feature Gaussian."""
+    """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
     if count is None and options.count == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
     features, members = merged.features, merged.members
@@ -175,8 +175,8 @@ def halve(
         )
         return np.diff(child_starts), child_ids, rows[parents]
 
-    found = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
-    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
+    parts = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
+    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*parts, strict=True))
     return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.moments import Members
-from gsmerge.networks import Learned, merge_features, refine_features
+from gsmerge.networks import NetworkContext, merge_features, refine_features
 from gsmerge.types import FeatureGaussians, Gaussians, Matches, Segmentation
 
 
@@ -31,12 +31,12 @@ class MergedViews:
     features: FeatureGaussians
     members: Members
     segmentation: Segmentation
-    networks: Learned | None = None
+    networks: NetworkContext | None = None
     choices: Mapping[str, Any] = field(default_factory=dict)
     k1_gaussians: Gaussians | None = None
 
 
-def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None = None) -> FeatureGaussians:
+def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:
     """One Feature Gaussian per cluster; those that are alone pass unchanged.
 
     Members are weighted with their opacities times what the photos say of them (gains); masses and integrated
@@ -46,7 +46,7 @@ def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None 
     Args:
         features: g Feature Gaussians.
         matches: A cluster for each.
-        learned: Networks whose merger corrects what is pooled; None: none does.
+        networks: Networks whose merger corrects what is pooled; None: none does.
 
     Returns:
         ``matches.count`` Feature Gaussians: first those that are alone in their old order, then the merged ones.
@@ -55,19 +55,19 @@ def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None 
     if len(order) == 0:
         return features
     pooled = pool_runs(features, order, cuts)
-    if learned is not None:
-        pooled = merge_features(pooled, features, order.numpy(), cuts, learned)
+    if networks is not None:
+        pooled = merge_features(pooled, features, order.numpy(), cuts, networks)
     return FeatureGaussians.concat([take(features, alone), pooled])
 
 
-def refine(features: FeatureGaussians, learned: Learned | None) -> FeatureGaussians:
+def refine(features: FeatureGaussians, networks: NetworkContext | None) -> FeatureGaussians:
     """Feature Gaussians with the refiner's corrections (paper section 4.5); as they are without networks.
 
     Args:
         features: Merged Feature Gaussians of all views.
-        learned: Networks and the scene, or None.
+        networks: Networks and the scene, or None.
     """
-    return features if learned is None else refine_features(features, learned)
+    return features if networks is None else refine_features(features, networks)
 
 
 def cluster_runs(matches: Matches) -> tuple[Tensor, Tensor, np.ndarray]:

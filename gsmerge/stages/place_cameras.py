@@ -15,7 +15,7 @@ from gsmerge.types import Cameras, Gaussians, UnalignedScene
 NUM_VIEWS = 24
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
-AROUND = 40  # directions from which the scene is looked at
+AROUND = 40  # candidate cameras around the scene
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
 LOOKS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length

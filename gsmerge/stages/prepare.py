@@ -18,7 +18,7 @@ from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
 from gsmerge.geometry import project
 from gsmerge.moments import Members, scene_members
-from gsmerge.networks import Checkpoint, Learned, find_checkpoint
+from gsmerge.networks import Checkpoint, NetworkContext, find_checkpoint
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
@@ -157,13 +157,13 @@ class PreparedScene:
     tree: RegionTree | None
     hidden: Gaussians | None
 
-    def candidates(self, members: Members) -> list[Learned | None]:
+    def candidates(self, members: Members) -> list[NetworkContext | None]:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
         if self.checkpoint is None:
             return [None]
         options = self.options
-        learned = Learned(self.checkpoint.networks, members, self.scene.cameras, options.seed, options.precision)
-        return [learned, None] if options.checkpoint == "auto" else [learned]
+        networks = NetworkContext(self.checkpoint.networks, members, self.scene.cameras, options.seed)
+        return [networks, None] if options.checkpoint == "auto" else [networks]
 
     def keeps_all(self, count: int | None) -> bool:
         """Whether so many Gaussians are asked for that an unaligned scene need not be grouped."""

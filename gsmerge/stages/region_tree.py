@@ -19,7 +19,7 @@ from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Groups, PixelScene
 
-DEPTH_RANGE = 1e3  # depths are held within this factor of the view's median
+DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
 
 
@@ -64,7 +64,7 @@ class RegionTree:
         order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
         first: ``[v+1]`` int64, merges in the views before.
         distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
-        least: Fewest regions before any is larger than ``max_extent``.
+        min_regions: Fewest regions before any is larger than ``max_extent``.
     """
 
     groups: Groups
@@ -72,7 +72,7 @@ class RegionTree:
     order: np.ndarray
     first: np.ndarray
     distortions: np.ndarray
-    least: int
+    min_regions: int
 
     def __len__(self) -> int:
         """Superpixels at the start."""
@@ -103,7 +103,7 @@ def region_tree(
 
     Args:
         images: ``[v,h,w,3]`` float, sRGB in [0, 1].
-        depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 are taken as very near.
+        depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 count as very near.
         groups: The superpixels to start from, 4-connected, none empty.
         valid: ``[v,h,w]`` bool; pixels that do not count. Superpixels without a valid pixel merge first.
         options: Weights.
@@ -131,8 +131,8 @@ def region_tree(
     order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
-    least = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
-    return RegionTree(groups, parents, order, first, distortions, least)
+    min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
+    return RegionTree(groups, parents, order, first, distortions, min_regions)
 
 
 def _check_pictures(images: Tensor, depths: Tensor, groups: Groups, valid: Tensor) -> None:
@@ -150,8 +150,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Depths in units of their median, float32; 0 for pixels that do not count."""
     usable = valid & np.isfinite(depths)
     middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
-    held = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
-    return np.where(usable, held, 0).astype(np.float32)
+    clipped = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    return np.where(usable, clipped, 0).astype(np.float32)
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
@@ -180,7 +180,7 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 
 def auto_count(tree: RegionTree, options: AllocateOptions | None = None) -> int:
     """The :func:`knee` of a scene, among the counts that need no region larger than ``max_extent``."""
-    usable = tree.counts >= tree.least
+    usable = tree.counts >= tree.min_regions
     return knee(tree.counts[usable], tree.distortions[usable], options)
 
 

@@ -217,11 +217,11 @@ def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -
         for settings in ({"fit": "none"}, {"fit_steps": 12}):
             found = scenes.compacted(one, **settings)
             scores = found.report.choices["start_scores"]
-            learned = scores["learned"] > scores["analytic"]
-            assert ("networks" in found.report.choices) == learned
-            alone = scenes.compacted(one, **settings, checkpoint="shipped" if learned else "none")
+            networks = scores["learned"] > scores["analytic"]
+            assert ("networks" in found.report.choices) == networks
+            alone = scenes.compacted(one, **settings, checkpoint="shipped" if networks else "none")
             assert scenes.identical(found.gaussians, alone.gaussians)
-            starts.add(learned)
+            starts.add(networks)
     assert starts == {False, True}
 
 

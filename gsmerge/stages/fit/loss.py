@@ -35,14 +35,14 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
     return above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
 
 
-def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dssim: float) -> np.ndarray:
+def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float) -> np.ndarray:
     """Gradient of the loss (1 - dssim) |image - photo| + dssim (1 - SSIM), per pixel of the image.
 
     Args:
         image: ``[h,w,3]`` float32.
         photo: ``[h,w,3]`` float32.
         weight: ``[h,w]`` float32 weights of the pixels.
-        dssim: Share of structural similarity, see :func:`loss_ssim`.
+        ssim_lambda: Share of structural similarity, see :func:`loss_ssim`.
 
     Returns:
         ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size.
@@ -55,7 +55,7 @@ def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dss
     from_square *= image
     from_cross *= photo
     similarity = from_mean + 2 * from_square + from_cross
-    gradient = np.float32(1 - dssim) * channels * np.sign(image - photo) - np.float32(dssim) * similarity
+    gradient = np.float32(1 - ssim_lambda) * channels * np.sign(image - photo) - np.float32(ssim_lambda) * similarity
     gradient /= np.float32(image.shape[0] * image.shape[1])
     return gradient
 

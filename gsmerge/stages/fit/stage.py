@@ -20,7 +20,7 @@ from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import gaussians_of, start_state
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
-CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
+CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
@@ -51,7 +51,7 @@ def fit_scene(
     if scene.images is None or not options.needs_photos:
         return gaussians
     if exact and not options.grows:  # nothing grows to the number asked for, so nothing may fall below it either
-        options = replace(options, prune=0.0)
+        options = replace(options, min_contribution=0.0)
     log.choices["begun_with"] = len(gaussians)
     with log.stage("fit"):
         photos = scene_photos(scene), scene_photos(scene, 2)
@@ -70,7 +70,7 @@ def fit(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
-    rival: Gaussians | None = None,
+    baseline_start: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
@@ -83,19 +83,22 @@ def fit(
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
         progress: Told after every step of the full fit.
-        rival: Another start that the full fit has to beat instead, see :func:`gsmerge.stages.fit.full.score_to_beat`.
+        baseline_start: Another start that the full fit may beat instead, see
+            :func:`gsmerge.stages.fit.full.score_to_beat`.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
-    keep = shown(gaussians, photos[1], options.prune)
+    keep = visible_mask(gaussians, photos[1], options.min_contribution)
     if options.fit == "none":
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device), None, rival)
+        fitted, report = fit_full(
+            kept, photos, options, count, seed, progress, engine_for(options.device), None, baseline_start
+        )
         fitted, report = _better_of(kept, fitted, report, photos[0])
         if report.accepted:
             return fitted, report
@@ -108,13 +111,13 @@ def fit(
     return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
 
 
-def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> torch.Tensor:
     """``[n]`` mask of the Gaussians worth keeping.
 
     Args:
         gaussians: n Gaussians.
         photos: The views that they may show in.
-        least: Largest blending weight at a pixel that is too little. What lies in no photo's frustum stays.
+        min_weight: Least blending weight at some pixel. What lies in no photo's frustum stays.
     """
     splats = prepare(gaussians)
 
@@ -126,16 +129,16 @@ def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
-    return torch.from_numpy(~inside | (peak >= least))
+    return torch.from_numpy(~inside | (peak >= min_weight))
 
 
 def _better_of(
     before: Gaussians, after: Gaussians, report: FitReport, photos: Photos, close: float = CLOSE
 ) -> tuple[Gaussians, FitReport]:
-    """The fitted Gaussians, but where they began if the held-out blocks hardly gained and the photos as a whole lost.
+    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
 
-    Gaussians that were fitted already are where steps of the usual size only stir. A gain of ``close`` dB or more is
-    not looked at twice.
+    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
+    more the photos are not compared.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report

@@ -79,7 +79,9 @@ def test_a_run_repeats_on_any_number_of_threads(scene: PixelScene, method: str) 
 @pytest.mark.parametrize("method", OWN)
 def test_scenes_without_an_order(scene: PixelScene, method: str) -> None:
     if method == "blocks":
-        with pytest.raises(UsageError, match="method blocks: expected one Gaussian per pixel, found an unaligned"):
+        with pytest.raises(
+            UsageError, match="method blocks: expected one Gaussian per pixel, found an unaligned scene"
+        ):
             compact(loose.shuffled(scene), method=method)
         return
     result = compact(loose.shuffled(scene), method=method, budget=COUNT, fit_steps=4)

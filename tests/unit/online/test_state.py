@@ -93,15 +93,15 @@ def test_baked_is_what_the_stages_decode(most: int, some: Made, uneven: FeatureG
 
 
 def test_heads_are_in_what_is_baked(some: Made) -> None:
-    learned = some.learned(noisy())
-    features = encode_features(some.features, learned)
+    networks = some.networks(noisy())
+    features = encode_features(some.features, networks)
     assert features.latents.shape[1] == SMALL.latent
-    found = bake(features, some.members, learned, 4)
+    found = bake(features, some.members, networks, 4)
     assert found.features.latents.shape == (len(features), 0)
     ones, children = ones_and_most(found, 4)
     # lengths are floored beside the largest, so that the thinnest may be told anew
-    assert_close(ones, decode(features, some.members, ALL, learned=learned), rtol=1e-3)
-    wanted = decode(features, some.members, replace(ALL, k=4), learned=learned)
+    assert_close(ones, decode(features, some.members, ALL, networks=networks), rtol=1e-3)
+    wanted = decode(features, some.members, replace(ALL, k=4), networks=networks)
     assert_same_children(children, wanted)
     plain = bake(features, some.members, None, 4)
     assert not torch.equal(plain.children.sh0, found.children.sh0)

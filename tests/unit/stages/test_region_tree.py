@@ -97,8 +97,8 @@ def test_regions_keep_below_the_largest_extent_until_there_is_no_other_way(portr
         boxes = [np.nonzero(labels == i) for i in range(count)]
         return np.array([max(np.ptp(y), np.ptp(x)) for y, x in boxes])
 
-    assert tree.least < 60
-    assert side / 2 < extents(tree.least).max() < side
+    assert tree.min_regions < 60
+    assert side / 2 < extents(tree.min_regions).max() < side
     assert extents(3).max() >= side
 
 

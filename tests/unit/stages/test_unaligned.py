@@ -49,7 +49,7 @@ def test_sizes_must_fit(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("unseen", "hide"), ("min_contribution", -1.0), ("min_contribution", np.nan)]
+    ("name", "value"), [("unseen", "hide"), ("min_owner_weight", -1.0), ("min_owner_weight", np.nan)]
 )
 def test_options_are_checked(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected"):
