@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from gsmerge.measure.compare import break_even
+from gsmerge.measure.comparison import break_even
 from gsmerge.report import human_bytes
 from gsmerge.research.charts.figures import make_verdicts
 from gsmerge.research.charts.record import INPUT, RunRecord

@@ -166,11 +166,12 @@ def print_plan(
     """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
-    from gsmerge.report import plan_document, plan_lines, to_json
+    from gsmerge.report import document_head, to_json
+    from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
 
-    given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+    given = read_input(files, opacity=opacity, hints=hints)
     scene, cameras = given.scene, given.scene.cameras
     with told_as_usage():
         wanted = budget_count(scene, settings)
@@ -184,13 +185,13 @@ def print_plan(
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
-        usual=default_count(scene, settings),
-        wanted=wanted,
+        default_count=default_count(scene, settings),
+        budget=wanted,
         notes=[*given.notes, *unused],
         count=scene.num_gaussians,
         num_rest=3 * scene.gaussians.shN.shape[1],
     )
     if as_json:
-        sys.stdout.write(to_json(document))
+        sys.stdout.write(to_json({**document_head(), **document}))
     else:
         print("\n".join(map(one_line, plan_lines(document))))

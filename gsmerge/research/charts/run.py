@@ -33,16 +33,16 @@ from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_
 from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experiment_key, read_runs
 from gsmerge.research.charts.scenes import SceneSource
 from gsmerge.runtime.estimate import (
+    COST_BASELINES,
     COST_COLOR_FIT,
-    COST_FIT_LOOKS,
+    COST_FIT_RENDERS,
     COST_FULL_FIT,
     COST_MERGE,
+    COST_OTHER_BASELINE,
     COST_READ,
-    COST_RIVAL,
-    COST_RIVAL_STEP,
-    COST_RIVALS,
     COST_ROBUST,
     COST_SEGMENT,
+    COST_UNMERGED_STEP,
     score_cost,
 )
 from gsmerge.runtime.threads import available_threads, use_threads
@@ -329,7 +329,7 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     fit = settings.get("fit", "full")
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
-        work += pixels * COST_FIT_LOOKS
+        work += pixels * COST_FIT_RENDERS
     else:
         work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
     return work / threads
@@ -337,10 +337,14 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
 
 def _baseline_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
     """The same of a baseline."""
-    work = COST_RIVALS.get(method, COST_RIVAL) + score_cost(views) + COST_COLOR_FIT * (method == "unmerged-color")
+    work = (
+        COST_BASELINES.get(method, COST_OTHER_BASELINE)
+        + score_cost(views)
+        + COST_COLOR_FIT * (method == "unmerged-color")
+    )
     work *= pixels
     if method == "unmerged-fit":
-        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_RIVAL_STEP)
+        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_UNMERGED_STEP)
     return work / threads
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.measure.before_after import comparison_document, comparison_html, comparison_markdown
-from gsmerge.measure.compare import Comparison, Side, Storage, break_even, compare
+from gsmerge.measure.comparison import Comparison, SceneCosts, Storage, break_even, compare
+from gsmerge.measure.comparison_page import comparison_document, comparison_html, comparison_markdown
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.measure.speed import Speed, measure_speeds, overdraw, resized
 from gsmerge.render import plan_view, prepare
@@ -112,7 +112,7 @@ def test_html_loads_nothing_and_escapes_names(found: Comparison) -> None:
 
 
 def test_without_merge_seconds_nothing_is_earned_back(scene: PixelScene) -> None:
-    side = Side("input", storage("input", 10), (Speed("cpu", 4, 3, 1, 0.2),), 1.0, None)
+    side = SceneCosts("input", storage("input", 10), (Speed("cpu", 4, 3, 1, 0.2),), 1.0, None)
     after = replace(side, name="b", speeds=(Speed("cpu", 4, 3, 1, 0.1),))
     quality = compare(scene, {}, {"input": storage("input", 1)}, None, PLAIN, long_sides=(8,)).quality
     document = comparison_document(Comparison(side, (after,), quality))

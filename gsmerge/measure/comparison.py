@@ -1,4 +1,4 @@
-"""Before and after: bytes, render time, overdraw, quality, and when the time that merging took is earned back."""
+"""A scene and its compact versions: bytes, render time, overdraw, quality, and break-even frames."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Storage:
 
 
 @dataclass(frozen=True)
-class Side:
-    """One of the scenes.
+class SceneCosts:
+    """What one of the scenes costs.
 
     Args:
         name: As given.
         storage: Of its file.
         speeds: Render time at every size and on every device.
         overdraw: Gaussians blended per pixel.
-        merge_seconds: What making it took; None where it is not known.
+        merge_seconds: Time that making it took; None where it is not known.
     """
 
     name: str
@@ -54,16 +54,16 @@ class Side:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A scene and what was made of it.
+    """A scene and its compact versions.
 
     Args:
         before: The scene.
-        after: What was made of it.
+        after: Its compact versions.
         quality: Of all of them.
     """
 
-    before: Side
-    after: tuple[Side, ...]
+    before: SceneCosts
+    after: tuple[SceneCosts, ...]
     quality: Evaluation
 
 
@@ -71,12 +71,12 @@ def break_even(merge_seconds: float, before: float, after: float) -> float | Non
     """Frames after which merging has paid for itself in render time (paper, supplement: timing).
 
     Args:
-        merge_seconds: What merging took.
+        merge_seconds: Time that merging took.
         before: Seconds per frame of the input.
-        after: The same of the result.
+        after: Seconds per frame of the result.
 
     Returns:
-        None where the result is not drawn faster.
+        None where the result does not render faster.
     """
     return merge_seconds / (before - after) if after < before else None
 
@@ -98,9 +98,9 @@ def compare(
         results: Compact Gaussians by name, in the scene's world.
         storage: What their files hold, by name; the scene's under "input".
         targets: Held-out views; None: the input views alone.
-        options: What of the quality is measured.
-        long_sides: Sizes to draw at; None: the views' own, and twice that.
-        merge_seconds: What making the results took, by name, where it is known.
+        options: Which measures of quality.
+        long_sides: Pixels along the longer side to render at; None: the views' own, and twice that.
+        merge_seconds: Time that making the results took, by name, where it is known.
 
     Raises:
         UsageError: If a size is not positive, or as :func:`gsmerge.evaluate`.
@@ -111,12 +111,12 @@ def compare(
         raise UsageError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
     quality = evaluate(scene, results, targets, options)
     near = near_plane(scene)
-    every = {INPUT: scene.file_gaussians, **results}
+    gaussians_of = {INPUT: scene.file_gaussians, **results}
     threads = None if options is None else options.threads
-    speeds = measure_speeds(every, scene.cameras, sides, near, threads=threads)
+    speeds = measure_speeds(gaussians_of, scene.cameras, sides, near, threads=threads)
     known = merge_seconds or {}
-    found = [
-        Side(name, storage[name], speeds[name], overdraw(gaussians, scene.cameras, near), known.get(name))
-        for name, gaussians in every.items()
-    ]
-    return Comparison(found[0], tuple(found[1:]), quality)
+    before, *after = (
+        SceneCosts(name, storage[name], speeds[name], overdraw(gaussians, scene.cameras, near), known.get(name))
+        for name, gaussians in gaussians_of.items()
+    )
+    return Comparison(before, tuple(after), quality)

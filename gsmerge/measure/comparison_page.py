@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from gsmerge.measure.compare import Comparison, Side, break_even
+from gsmerge.measure.comparison import Comparison, SceneCosts, break_even
 from gsmerge.measure.scores import MASKED, evaluation_document
 from gsmerge.report import document_head, human_bytes
 
@@ -41,69 +41,56 @@ def comparison_document(comparison: Comparison, notes: Sequence[str] = ()) -> di
     }
 
 
-def _side(side: Side, before: Side) -> dict[str, Any]:
-    found: dict[str, Any] = {
+def _side(side: SceneCosts, before: SceneCosts) -> dict[str, Any]:
+    facts: dict[str, Any] = {
         "name": side.name,
         **asdict(side.storage),
         "bytes_per_gaussian": round(side.storage.bytes_each, 3),
         "overdraw": round(side.overdraw, 3),
-        "speeds": [_speed(side, before, i) for i in range(len(side.speeds))],
+        "speeds": [{**asdict(speed), "seconds": round(speed.seconds, 6)} for speed in side.speeds],
     }
-    if side is not before:
-        found["factors"] = {
-            "bytes": before.storage.bytes / max(side.storage.bytes, 1),
-            "count": before.storage.num_gaussians / max(side.storage.num_gaussians, 1),
-            "bytes_per_gaussian": before.storage.bytes_each / max(side.storage.bytes_each, 1e-9),
-        }
-        found["merge_seconds"] = side.merge_seconds
-    return found
-
-
-def _speed(side: Side, before: Side, index: int) -> dict[str, Any]:
-    own, usual = side.speeds[index], before.speeds[index]
-    found = {**asdict(own), "seconds": round(own.seconds, 6)}
-    if side is not before:
-        found["speedup"] = usual.seconds / own.seconds
-        frames = None if side.merge_seconds is None else break_even(side.merge_seconds, usual.seconds, own.seconds)
-        found["break_even_frames"] = frames
-    return found
+    if side is before:
+        return facts
+    facts["factors"] = {
+        "bytes": before.storage.bytes / max(side.storage.bytes, 1),
+        "count": before.storage.num_gaussians / max(side.storage.num_gaussians, 1),
+        "bytes_per_gaussian": before.storage.bytes_each / max(side.storage.bytes_each, 1e-9),
+    }
+    facts["merge_seconds"] = merge = side.merge_seconds
+    for speed, own, base in zip(facts["speeds"], side.speeds, before.speeds, strict=True):
+        speed["speedup"] = base.seconds / own.seconds
+        speed["break_even_frames"] = None if merge is None else break_even(merge, base.seconds, own.seconds)
+    return facts
 
 
 def _tables(document: Mapping[str, Any]) -> Iterator[tuple[str, Row, list[Row]]]:
     """Heading, columns and rows of each table."""
-    before, after = document["before"], document["after"]
-    every = [before, *after]
+    sides = [document["before"], *document["after"]]
     rows: list[Row] = []
-    for side in every:
+    for side in sides:
         factors = side.get("factors")
-        cells = ["", "", ""]
-        if factors is not None:
-            cells = [f"{factors[name]:.1f} x" for name in ("bytes", "count", "bytes_per_gaussian")]
-        rows.append(
-            (
-                side["name"], f"{side['num_gaussians']:,}", f"{side['bytes_per_gaussian']:.1f}",
-                human_bytes(side["bytes"]), *cells,
-            )
-        )  # fmt: skip
+        cells = [f"{factors[name]:.1f} x" if factors else "" for name in ("bytes", "count", "bytes_per_gaussian")]
+        count, each = f"{side['num_gaussians']:,}", f"{side['bytes_per_gaussian']:.1f}"
+        rows.append((side["name"], count, each, human_bytes(side["bytes"]), *cells))
     head = ("", "Gaussians", "bytes each", "file", "smaller by", "of it by count", "by bytes each")
     yield "Storage", head, rows
-    names = list(dict.fromkeys(name for side in every for name in side["by_attribute"]))
+    names = list(dict.fromkeys(name for side in sides for name in side["by_attribute"]))
     yield (
         "Bytes by attribute",
         ("", *names),
-        [(s["name"], *(human_bytes(s["by_attribute"].get(name, 0)) for name in names)) for s in every],
+        [(s["name"], *(human_bytes(s["by_attribute"].get(name, 0)) for name in names)) for s in sides],
     )
-    yield "Rendering", ("", "device", "size", "ms a frame", "faster by", "earned back after"), list(_speed_rows(every))
+    yield "Rendering", ("", "device", "size", "ms a frame", "faster by", "earned back after"), list(_speed_rows(sides))
     yield (
         "Overdraw",
         ("", "Gaussians blended into a pixel"),
-        [(side["name"], f"{side['overdraw']:.1f}") for side in every],
+        [(side["name"], f"{side['overdraw']:.1f}") for side in sides],
     )
     yield _quality_table(document["quality"])
 
 
-def _speed_rows(every: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
-    for side in every:
+def _speed_rows(sides: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
+    for side in sides:
         for speed in side["speeds"]:
             threads = f", {speed['threads']} threads" if speed["threads"] else ""
             faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
