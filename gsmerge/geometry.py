@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.types import Cameras
+from gsmerge.types import SH_C0, Cameras
+
+_Array = TypeVar("_Array", np.ndarray, Tensor)
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 
@@ -71,10 +75,33 @@ def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
         ``[c,n,2]`` positions in pixels (pixel centres at +0.5; meaningless where the depth is not positive)
         and ``[c,n]`` depths along z, both in float64.
     """
-    means, viewmats, Ks = means.double(), cameras.viewmats.double(), cameras.Ks.double()
-    camera = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
-    image = camera @ Ks.transpose(1, 2)
+    return project_points(means.double(), cameras.viewmats.double(), cameras.Ks.double())
+
+
+def project_points(points: _Array, viewmats: _Array, Ks: _Array) -> tuple[_Array, _Array]:
+    """:func:`project` for NumPy arrays and tensors of any leading shape, in their own precision.
+
+    Args:
+        points: ``[...,n,3]`` world positions.
+        viewmats: ``[...,4,4]`` world to camera.
+        Ks: ``[...,3,3]`` intrinsics, pixels.
+
+    Returns:
+        ``[...,n,2]`` positions in pixels and ``[...,n]`` depths along z.
+    """
+    camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
+    image = camera @ Ks.swapaxes(-1, -2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def sh0_to_rgb(sh0: _Array) -> _Array:
+    """Base colours, 0 to 1 where they are in range, of harmonics of degree 0."""
+    return 0.5 + SH_C0 * sh0
+
+
+def rgb_to_sh0(rgb: _Array) -> _Array:
+    """Harmonics of degree 0 of base colours in [0, 1]."""
+    return (rgb - 0.5) / SH_C0
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:

@@ -162,7 +162,7 @@ def evaluate(
     Args:
         scene: The input. Without photos its own renders are what results are compared with.
         results: Gaussians by name, in the scene's world.
-        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_targets`; None: input views alone.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_held_out`; None: input views alone.
         options: What is measured.
         progress: Called with ("evaluate", done, total) after each result.
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from gsmerge.budget import file_bytes
 from gsmerge.errors import SceneError
 from gsmerge.io import (
     Alignment,
@@ -24,10 +23,11 @@ from gsmerge.io import (
     read_cameras,
     read_ply_with_hints,
 )
-from gsmerge.io.alignment.unaligned import Sight, sight
+from gsmerge.io.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.io.exporters import exporter_names
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_layout import LOGIT_COMMENT
+from gsmerge.io.formats.ply_file import LOGIT_COMMENT
+from gsmerge.io.formats.ply_writer import file_bytes
 from gsmerge.io.hints import make_hints
 from gsmerge.measure.extents import Coverage, Extents, coverage, extents
 from gsmerge.options import CompactOptions
@@ -79,7 +79,7 @@ class Inspection:
         rows: Which hints of the rows won, and by how much; None while there is none.
         alignment_score: Share of the Gaussians at most one pixel from their pixels' centres; None without pixels.
         alignment_margin: How many times nearer they are than under the next reading; None without pixels.
-        sight: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
+        check_cameras: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
             cameras that fit.
         coverage: What every view shows.
         estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
@@ -121,7 +121,7 @@ class Inspection:
     rows: str | None
     alignment_score: float | None
     alignment_margin: float | None
-    sight: Sight | None
+    check_cameras: CameraCheck | None
     coverage: tuple[Coverage, ...]
     estimate: dict[str, float] | None
     notes: tuple[str, ...]
@@ -235,16 +235,16 @@ def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, A
     found |= {"alignment_score": load.alignment.share_within_1px, "alignment_margin": load.recovery.margin}
     size = {"width": load.scene.cameras.width, "height": load.scene.cameras.height}
     size |= {"per_pixel": load.recovery.best.layout.per_pixel, "num_missing": load.pixel_scene().num_missing}
-    return found | size | {"alignment": load.alignment, "rows": load.recovery.words}
+    return found | size | {"alignment": load.alignment, "rows": load.recovery.description}
 
 
-def _sight(load: SceneLoad) -> Sight | None:
+def _sight(load: SceneLoad) -> CameraCheck | None:
     scene = load.scene
     if len(scene) == 0:
         return None
     everything = torch.ones(len(scene.gaussians), dtype=torch.bool)
     valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else everything
-    return sight(scene.gaussians, valid, scene.cameras, scene.images)
+    return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 
 def estimate(scene: PixelScene | UnalignedScene) -> dict[str, float]:

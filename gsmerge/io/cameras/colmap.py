@@ -12,8 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.cameras.lens import Lens, fisheye, perspective
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, Lens, fisheye, make_camera_file, perspective
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (

@@ -14,7 +14,7 @@ import torch
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.photos import decode_photos
+from gsmerge.io.photos import decode_embedded
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
@@ -114,4 +114,4 @@ def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
         plain = isinstance(image, torch.Tensor) and image.ndim == 1 and image.dtype == torch.uint8
         if not plain or not _has_values(image) or image.numel() > limit or not image.is_contiguous():
             raise SceneError(path, "expected images as tensors [bytes] of uint8, found others")
-    return decode_photos(path, names, [image.numpy() for image in images], _MAX_PHOTOS)
+    return decode_embedded(path, names, [image.numpy() for image in images], _MAX_PHOTOS)

@@ -10,8 +10,15 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, CameraFile, make_camera_file
-from gsmerge.io.cameras.lens import Lens, fisheye, perspective
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENCV,
+    C2W_OPENGL,
+    CameraFile,
+    Lens,
+    fisheye,
+    make_camera_file,
+    perspective,
+)
 from gsmerge.io.photos import find_image, image_size
 
 _PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"

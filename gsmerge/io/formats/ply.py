@@ -12,9 +12,9 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats.compressed import is_compressed, unpack
-from gsmerge.io.formats.ply_file import let_go, open_ply
-from gsmerge.io.formats.ply_layout import (
+from gsmerge.io.formats.ply_file import (
     BLOCK_BYTES,
     LOGIT_COMMENT,
     MAX_HARMONIC,
@@ -29,11 +29,13 @@ from gsmerge.io.formats.ply_layout import (
     bytes_by_attribute,
     color_columns,
     layout_name,
+    open_ply,
+    release_block,
     sh_degree,
     spread_low_degree,
 )
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import Gaussians
 
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
 
@@ -42,24 +44,24 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """What was found in a PLY file.
+    """What a PLY file holds.
 
     Args:
         path: The file.
         layout: Name of the column layout, as "17-column export" or "INRIA, SH degree 3".
         format: "ascii", "binary little-endian" or "binary big-endian".
-        count: Gaussians, the set-aside ones included.
+        count: Gaussians, the unusable ones included.
         file_bytes: Size of the file.
         bytes_by_attribute: Bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats,
             extra); of the values' binary types for an ascii file.
         columns: All columns of the vertex element, in the file's order.
-        extra_columns: Those that mean nothing here.
-        extra_elements: Elements beside ``vertex``.
+        extra_columns: Those that are ignored.
+        extra_elements: Elements besides ``vertex``.
         byte_columns: Columns stored as bytes.
         comments: Of the header.
         sh_degree: 0 to 4.
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
-        opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
+        opacity_guessed: Whether the encoding was guessed from the values, not given by the caller or the file.
         num_nonfinite: Rows with NaN or inf, set aside.
         num_clipped_scales: Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped.
         num_zero_quats: Gaussians without a rotation, taken as the identity.
@@ -92,7 +94,7 @@ class PlyScene:
         gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
             fully transparent and grey, and has the position and scales of the finite row before it.
         valid: ``[n]`` bool, False for the rows that were not finite.
-        info: What was found.
+        info: What the file holds.
     """
 
     gaussians: Gaussians
@@ -136,7 +138,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
     data = open_ply(path)
-    compressed = is_compressed(data)
+    compressed = "chunk" in data and is_compressed(data)
     stored = unpack(path, data) if compressed else _vertex(path, data).data
     rows = np.asarray(stored)
     names = tuple(rows.dtype.names or ())
@@ -146,9 +148,9 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
 
     def convert(block: slice) -> _Converted:
-        found = _convert(rows[block], {name: column[block] for name, column in out.items()})
-        let_go(stored, block)
-        return found
+        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        release_block(stored, block)
+        return converted
 
     done = parallel_map(convert, blocks)
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
@@ -186,8 +188,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
 
 def _vertex(path: Path, data: PlyData) -> PlyElement:
     if "vertex" not in data:
-        found = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
-        raise SceneError(path, f"expected an element 'vertex', found {found}")
+        names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
+        raise SceneError(path, f"expected an element 'vertex', found {names}")
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties}
     missing = [name for name in REQUIRED if name not in columns]
@@ -262,7 +264,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
         for j, name in enumerate(color_columns(rows.dtype.names)):
             column = take_harmonic(name)
             if name in RGB:
-                column = (column / (255 if rows.dtype[name].kind == "u" else 1) - 0.5) / SH_C0
+                column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
             out["sh0"][:, 0, j] = column
         num_higher = out["shN"].shape[1]
         for channel in range(3):

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from gsmerge.io import SceneLoad, atomic_output, read_targets
+from gsmerge.io import SceneLoad, atomic_output, read_held_out
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plane
 from gsmerge.measure.preview import Picture, to_picture
 from gsmerge.render import render
@@ -33,7 +33,7 @@ def held_out(load: SceneLoad, cameras: Path | None, images: Path | None) -> tupl
     """The target views of a scene, and where they lie along the trajectory if that is known."""
     if cameras is None:
         return None, None
-    found = read_targets(load, cameras, images)
+    found = read_held_out(load, cameras, images)
     places = None if found.context_places is None else (found.context_places, found.places)
     return Views(found.cameras, found.images, found.names), places
 

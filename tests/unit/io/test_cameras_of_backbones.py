@@ -126,6 +126,6 @@ def broken(kind: str, folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Pat
         ("a frame too many", "expected frames 0 to 2, found 7"),
     ],
 )
-def test_what_is_wrong_is_told(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], kind: str, message: str) -> None:
+def test_what_is_wrong_is_named(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], kind: str, message: str) -> None:
     with pytest.raises(SceneError, match=message):
         read_cameras(broken(kind, tmp_path, *truth))
