@@ -15,7 +15,7 @@ from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.trajectory import INTRINSICS
 from gsmerge.io.scene_files import IMAGE_PLACES
 
-BESIDE = (
+EXTRA_FILES = (
     DATAPARSER,
     *INTRINSICS,
     FRAMES_FILE,
@@ -52,7 +52,7 @@ def read_files(files: SceneFiles) -> list[Path]:
     paths = [path for path in (files.ply, files.cameras, files.images) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
-        paths += [root / name for name in BESIDE if (root / name).is_file()]
+        paths += [root / name for name in EXTRA_FILES if (root / name).is_file()]
         paths += photos_of(files.cameras)
     return list(dict.fromkeys(paths))
 

@@ -88,7 +88,7 @@ class Exporter:
 
 
 # The pixelSplat family shares code but differs in order, trimming and rotations. Its worlds are recentred on the
-# median, divided by a quantile and turned upright: a scale and a shift that are stored nowhere.
+# median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.
 _UPRIGHT: tuple[FrameKind, ...] = ("upright",)
 _ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
 _NORMALS = ("nx", "ny", "nz")

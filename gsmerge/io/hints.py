@@ -18,8 +18,8 @@ class ReadHints:
 
     Args:
         exporter: Which exporter wrote it, a name of :data:`gsmerge.io.exporters.EXPORTERS`; "auto": recognised.
-        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are taken,
-            where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
+        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are
+            used, where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
             "auto": as the exporter says, and checked against the surface where the pixels are known.
         order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
             pixels.

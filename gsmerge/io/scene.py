@@ -336,5 +336,5 @@ def place_cameras_in_scene(
     size = None if images is None else (images.shape[2], images.shape[1])
     cameras = to_cameras(camera_file, size)
     views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
-    note = "the cameras do not fit the Gaussians and stand as their file has them"
+    note = "the cameras do not fit the Gaussians and stay as their file has them"
     return CamerasInScene(ply.gaussians, views, (*ply_notes(ply.info), note))

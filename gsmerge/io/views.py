@@ -54,7 +54,7 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
         raise SceneError(
             files.ply,
-            f"no cameras found beside it (looked for {places}, one .torch chunk)",
+            f"no cameras found next to it (looked for {places}, one .torch chunk)",
             "name them with --cameras, or have views placed with --order none",
         )
     return cameras

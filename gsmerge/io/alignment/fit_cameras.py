@@ -1,4 +1,4 @@
-"""Cameras, photos and rows brought together: as they are, at another size, or with the poses read in another way."""
+"""Fitting cameras and photos to the rows: as they are, at another size, or with the poses read in another way."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photos import Photos, as_tensor, natural_key, photo_size
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
-_ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid that only the photos' colours can tell apart
+_ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
 _MAX_TRIED = 6  # fits that only the number of rows speaks for and that are tried with all frames
 
 

@@ -21,7 +21,7 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 
 @dataclass(frozen=True)
 class GridFit:
-    """One way in which cameras and photos may be brought to the grid.
+    """One way to bring cameras and photos to the grid.
 
     Args:
         cameras: At the grid's size.

@@ -49,7 +49,7 @@ class Layout:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the rows are the grid as they stand: nothing to move, nothing missing."""
+        """Whether the rows are the grid as they are: nothing to move, nothing missing."""
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
 
@@ -139,7 +139,7 @@ def _orders(
 
 
 def depth_layout(count: int, depths: np.ndarray) -> Layout | None:
-    """The layout of Depth Anything 3 from the depth maps beside it: border, nearest 90 % of each view, every n-th view.
+    """The layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
     Args:
         count: Rows of the file.

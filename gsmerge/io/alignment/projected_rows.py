@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.geometry import project_points
 from gsmerge.io.alignment.layouts import Layout
 
-MIN_BLOCK = 500  # rows of a view; fewer cannot be told from noise
+MIN_BLOCK = 500  # rows of a view; fewer cannot be distinguished from noise
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ _MAX_UNEVENNESS = 10.0  # of one block, so that no single one decides
 
 
 def pruned_layout(rows: ProjectedRows) -> Layout | None:
-    """Which pixel of which view every row is, found block by block."""
+    """Which pixel of which view every row is, block by block."""
     blocks = _blocks(rows)
     if blocks is None:
         return None
@@ -112,7 +112,7 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     """Strictly increasing pixels for the rows of one view.
 
     The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With
-    the row known, ``pixel - rank`` never decreases, and is found by isotonic regression, which averages the
+    the row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the
     jitter over stretches without gaps.
 
     Args:

@@ -170,8 +170,8 @@ def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: in
     pairs, colors = find_correspondences(inputs, sample_layout(layout, samples))
     frames = candidate_similarities(pairs, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=effort)
     scores = [score_layout(inputs, layout, frame, (pairs, colors)) for frame in frames]
-    least = min(score.worst_px for score in scores)
-    best = next(score for score in scores if score.worst_px <= max(_SIMPLER * least, least + _SIMPLER_PX))
+    lowest = min(score.worst_px for score in scores)
+    best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
     if best.ok and best.frame is not IDENTITY and inputs.scale is None:
         return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.viewmats, inputs.Ks))
     return best

@@ -15,7 +15,7 @@ from gsmerge.types import Cameras, Gaussians
 
 _SAMPLES = 20_000  # Gaussians that are projected
 _MIN_SEEN = 0.5  # share of them that some camera sees
-_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from pixels taken at random
+_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
 _SAME_COLORS = 0.01  # mean distance of the colours from random pixels below which photos say nothing
 
 
@@ -36,7 +36,7 @@ class CameraCheck:
 
     @property
     def score(self) -> float:
-        """0 to 1, to compare cameras by: the share that is seen, less where the colours are no better than others."""
+        """0 to 1, to rank cameras by: the share that is seen, reduced where colours fit little better than random."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property

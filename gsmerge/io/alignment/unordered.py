@@ -99,7 +99,7 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | 
         sure = np.flatnonzero(near & (second >= tolerance))
         own = centre[sure].argmin(1)
         ids = [sure[own == view] for view in range(rows.num_views)]
-        colors = [color_of(some[mine], view, pixels[mine, view]) for view, mine in enumerate(ids)]
+        colors = [color_of(some[part], view, pixels[part, view]) for view, part in enumerate(ids)]
         color = float(np.median(np.concatenate(colors)))
     px = float(np.median(ranked[near, 0]))
     return _Spread(tolerance, max(px, _SMALLEST_PX), max(color, _SMALLEST_COLOR))

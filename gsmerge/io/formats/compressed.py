@@ -103,10 +103,10 @@ def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
     missing = np.sqrt(np.clip(1 - sum(part**2 for part in parts), 0, None))
     quats = np.empty((len(words), 4))
     for which in range(4):
-        mine = largest == which
+        own = largest == which
         others = iter(parts)
         for i in range(4):
-            quats[mine, i] = missing[mine] if i == which else next(others)[mine]
+            quats[own, i] = missing[own] if i == which else next(others)[own]
     for i, name in enumerate(QUATS):
         rows[name] = quats[:, i]
 

@@ -64,7 +64,7 @@ class PlyInfo:
         opacity_guessed: Whether the encoding was guessed from the values, not given by the caller or the file.
         num_nonfinite: Rows with NaN or inf, set aside.
         num_clipped_scales: Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped.
-        num_zero_quats: Gaussians without a rotation, taken as the identity.
+        num_zero_quats: Gaussians without a rotation, read as the identity.
     """
 
     path: str
@@ -128,7 +128,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
             as logits. Infinite logits are opacities of 0 and 1.
 
-    Colours may stand as red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
@@ -144,25 +144,16 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
-    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
-    blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
-
-    def convert(block: slice) -> _Converted:
-        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
-        release_block(stored, block)
-        return converted
-
-    done = parallel_map(convert, blocks)
+    blocks = _convert_all(stored, out)
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    named = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
-    encoding = named or _likely_encoding(done)
+    known = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
+    encoding = known or _likely_encoding(blocks)
     _activate(out["opacities"], out["valid"], encoding)
-    num_bad = _set_aside(path, out)
+    num_bad = _clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
     if byte_columns == NORMALS:
         spread_low_degree(out["shN"])
-    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
-    extra = tuple(name for name in names if name not in used)
+    extra = _extra_columns(names, num_rest)
     info = PlyInfo(
         path=str(path),
         layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
@@ -177,10 +168,10 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         comments=comments,
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
-        opacity_guessed=named is None,
+        opacity_guessed=known is None,
         num_nonfinite=num_bad,
-        num_clipped_scales=sum(d.num_clipped for d in done),
-        num_zero_quats=sum(d.num_zero_quats for d in done),
+        num_clipped_scales=sum(b.num_clipped for b in blocks),
+        num_zero_quats=sum(b.num_zero_quats for b in blocks),
     )
     tensors = {k: torch.from_numpy(v) for k, v in out.items()}
     return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
@@ -209,6 +200,25 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     return vertex
 
 
+def _convert_all(stored: np.ndarray, out: dict[str, np.ndarray]) -> list[_Converted]:
+    """Fill the arrays block by block, in parallel."""
+    rows = np.asarray(stored)
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+
+    def convert(start: int) -> _Converted:
+        block = slice(start, min(start + size, len(rows)))
+        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        release_block(stored, block)
+        return converted
+
+    return parallel_map(convert, range(0, len(rows), size))
+
+
+def _extra_columns(names: tuple[str, ...], num_rest: int) -> tuple[str, ...]:
+    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    return tuple(name for name in names if name not in used)
+
+
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
     names = [name for name in columns if name.startswith("f_rest_")]
     if len(names) not in (0, 9, 24, 45, 72) or set(names) != {f"f_rest_{i}" for i in range(len(names))}:
@@ -230,7 +240,7 @@ def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Converted:
-    """What one block of rows had."""
+    """What one block of rows contained."""
 
     num_clipped: int
     num_zero_quats: int
@@ -239,7 +249,7 @@ class _Converted:
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
-    """Fill the arrays of one block of rows, column by column; opacities are copied as they are."""
+    """Fill the arrays of one block of rows, column by column; opacities are only copied."""
     with np.errstate(all="ignore"):
         total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
 
@@ -321,9 +331,9 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
-def _likely_encoding(done: list[_Converted]) -> str:
-    finite = any(d.any_finite_opacity for d in done)
-    return "raw" if finite and all(d.unit_opacities for d in done) else "logit"
+def _likely_encoding(blocks: list[_Converted]) -> str:
+    finite = any(block.any_finite_opacity for block in blocks)
+    return "raw" if finite and all(block.unit_opacities for block in blocks) else "logit"
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
@@ -338,7 +348,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
         np.reciprocal(opacities, out=opacities)
 
 
-def _set_aside(path: Path, out: dict[str, np.ndarray]) -> int:
+def _clear_invalid(path: Path, out: dict[str, np.ndarray]) -> int:
     """Make the invalid rows transparent, in place; returns their number."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)

@@ -83,8 +83,6 @@ def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
         assert np.abs(scene.images.numpy() * 255 - SMOOTH.images).mean() < 8, name
         note = f"photos of 110 x 72 are {mapping.description}, the cameras' and the Gaussian grid's size"
         assert note in loaded.notes
-            f"photos of 110 x 72 are {mapping.description}, the cameras' and the Gaussian grid's size" in loaded.notes
-        )
 
 
 def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
