@@ -13,7 +13,7 @@ from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_text
 from gsmerge.io.content_hash import stem_of
-from gsmerge.io.formats.ply_file import promised
+from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
 from gsmerge.runtime.estimate import memory_bytes
 
@@ -66,7 +66,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
         if real in inputs or real in own:
             continue
         inputs.add(real)
-        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *promised(ply))
+        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
         for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
             if name in owners:
                 raise UsageError(
