@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
+from gsmerge.baselines.baseline import Baseline, most_important, own_gaussians
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.group import Canvas
-from gsmerge.stages.region_tree import trim
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Cameras, Gaussians
 
 AT_ONCE = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
@@ -33,11 +30,11 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     return total
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Those that show most, unchanged and in their order; of equal ones the first of the file."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        return gaussians[trim(summed_weights(gaussians, source.scene.cameras), count)]
+        return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
 
 
 CONTRIBUTION = Baseline("contribution", "keep those with the largest summed blending weight", run)

@@ -16,13 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, principal_axes
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
@@ -199,9 +197,9 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Exactly ``count``; the input itself where it has no more."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians
     with log.stage("reduce"):

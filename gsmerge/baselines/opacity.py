@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
+from gsmerge.baselines.baseline import Baseline, most_important, own_gaussians
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
-from gsmerge.stages.region_tree import trim
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The most opaque, unchanged and in their order; of equal ones the first of the file."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        return gaussians[trim(gaussians.opacities, count)]
+        return gaussians[most_important(gaussians.opacities, count)]
 
 
 OPACITY = Baseline("opacity", "keep the most opaque", run)

@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Any of them, unchanged and in their order; the seed says which."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        rng = np.random.default_rng(options.seed)
+        rng = np.random.default_rng(prepared.options.seed)
         return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
 
 

@@ -39,6 +39,19 @@ def find_baseline(name: str) -> Baseline | None:
     return BASELINES[name]
 
 
+def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene) -> tuple[Baseline | None, list[str]]:
+    """The baseline that is asked for, fit for the scene, and a note on settings that it does not use.
+
+    Raises:
+        UsageError: If the scene does not have what it needs, or a program is missing.
+    """
+    baseline = find_baseline(options.method)
+    if baseline is None:
+        return None, []
+    check_scene(baseline, scene)
+    return baseline, unused_notes(baseline, options)
+
+
 def check_scene(baseline: Baseline, scene: PixelScene | UnalignedScene) -> None:
     """Whether a scene has what a method needs.
 

@@ -13,12 +13,10 @@ import tempfile
 from pathlib import Path
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.io import read_ply, write_ply
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
@@ -42,14 +40,14 @@ def find_program() -> str:
     return found
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that.
 
     Raises:
         UsageError: If the program is not installed.
         GsmergeError: If it fails.
     """
-    gaussians, program = own_gaussians(source), find_program()
+    gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:
         return gaussians
     with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:

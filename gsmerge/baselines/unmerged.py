@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """All Gaussians, whatever the count."""
-    return own_gaussians(source)
+    return own_gaussians(prepared.scene)
 
 
 UNMERGED = Baseline("unmerged", "the input as it is", run, uses=())

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gsmerge.baselines.baseline import Baseline
-from gsmerge.baselines.unmerged_fit import fitted_input
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
+from gsmerge.baselines.unmerged_fit import fit_input
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """The colour fit on all Gaussians, none left out; whatever the count."""
-    return fitted_input(source, replace(options.fit, fit="color", prune=0.0), options.seed, log)
+    return fit_input(prepared, replace(prepared.options.fit, fit="color", min_contribution=0.0), log)
 
 
 UNMERGED_COLOR = Baseline(
@@ -23,5 +21,5 @@ UNMERGED_COLOR = Baseline(
     "the input with colours solved on the photos",
     run,
     needs=("photos",),
-    uses=("iterations", "pull", "huber", "min_gain", "max_gain", "holdout"),
+    uses=("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout"),
 )

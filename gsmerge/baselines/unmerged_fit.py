@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
-from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.fit import FitOptions, fit
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.fit import FitOptions, fit_scene
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 
-def fitted_input(source: Source, settings: FitOptions, seed: int, log: RunLog) -> Gaussians:
+def fit_input(prepared: PreparedScene, options: FitOptions, log: RunLog) -> Gaussians:
     """All Gaussians, fitted to the photos; those that no photo shows make way for others, so the number stays."""
-    gaussians = own_gaussians(source)
-    with log.stage("fit"):
-        photos = scene_photos(source.scene), scene_photos(source.scene, 2)
-        gaussians, report = fit(gaussians, photos, settings, len(gaussians), seed, log.fit_progress)
-    if report:
-        log.choices["fit"] = asdict(report)
-        if not report.accepted:
-            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
-    return gaussians
+    gaussians = own_gaussians(prepared.scene)
+    return fit_scene(gaussians, prepared.scene, options, len(gaussians), seed=prepared.options.seed, log=log)
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """As many steps as ours by default, as much time with a time budget; whatever the count."""
-    return fitted_input(source, replace(options.fit, fit="full"), options.seed, log)
+    return fit_input(prepared, replace(prepared.options.fit, fit="full"), log)
 
 
 UNMERGED_FIT = Baseline(

@@ -13,10 +13,8 @@ import numpy as np
 import torch
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
@@ -79,9 +77,9 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)).float() for array in arrays))
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """At most ``count`` voxels, and hardly fewer."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
         means = gaussians.means.double().numpy()
         size = voxel_size(means, count)

@@ -129,7 +129,6 @@ def batch(
     method: opt.MethodOption = None,
     checkpoint: net.CheckpointOption = None,
     require_checkpoint: net.RequireCheckpointOption = False,
-    precision: net.PrecisionOption = None,
     seed: opt.SeedOption = None,
     threads: Annotated[
         int | None, _option("Threads of each scene.", min=1, show_default="processors by jobs", panel=opt.OUTPUT)

@@ -65,7 +65,6 @@ def encode(
     unseen: opt.UnseenOption = None,
     checkpoint: net.CheckpointOption = None,
     require_checkpoint: net.RequireCheckpointOption = False,
-    precision: net.PrecisionOption = None,
     output: EncodedOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,

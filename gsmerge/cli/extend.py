@@ -99,7 +99,6 @@ def extend(
     unseen: opt.UnseenOption = None,
     checkpoint: net.CheckpointOption = None,
     require_checkpoint: net.RequireCheckpointOption = False,
-    precision: net.PrecisionOption = None,
     replay: ReplayOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,

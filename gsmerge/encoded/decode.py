@@ -12,11 +12,11 @@ from gsmerge.encoded.divide import pick_children
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_described, described_by
+from gsmerge.networks import NetworkContext, decode_with_group_features, make_group_features
 from gsmerge.render.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.fit import shown
+from gsmerge.stages.fit import visible_mask
 from gsmerge.types import Gaussians
 
 
@@ -113,7 +113,7 @@ def decode_scene(
         gaussians, _ = children_of(encoded, plan.counts)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
         if plan.prune > 0:
-            gaussians = gaussians[shown(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]
+            gaussians = gaussians[visible_mask(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]
         if encoded.kept is not None:
             gaussians = Gaussians.concat([gaussians, encoded.kept])
         return encoded.frame.leave(gaussians)
@@ -126,8 +126,8 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
     every = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])
     gaussians = every[torch.from_numpy(rows)]
     if heads is not None:
-        described = described_by(features, heads.views, heads.group, encoded.cameras)
+        group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-        learned = Learned(heads.networks, nothing, encoded.cameras, precision=heads.precision)
-        gaussians = decode_described(gaussians, parents, features, described, learned)
+        networks = NetworkContext(heads.networks, nothing, encoded.cameras)
+        gaussians = decode_with_group_features(gaussians, parents, features, group_features, networks)
     return gaussians, parents

@@ -8,8 +8,7 @@ import torch
 from gsmerge.encoded.encoded import Division
 from gsmerge.kernels.gaussians.bisect import gather_groups
 from gsmerge.moments import Members, Rule
-from gsmerge.stages.decode import halve, pool_children
-from gsmerge.stages.region_tree import deal_order
+from gsmerge.stages.decode import deal_order, halve, pool_children
 from gsmerge.types import FeatureGaussians, Gaussians
 
 

@@ -9,19 +9,21 @@ from typing import Any
 import torch
 
 from gsmerge import __version__
-from gsmerge.build import Merged, merged_groups, wanted_count
 from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
+from gsmerge.pipeline import build, merge_views
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.group import Grouping, knee_count, scene_tree
+from gsmerge.search import choose_count
+from gsmerge.stages.decode import MAX_CHILDREN, merged_count
+from gsmerge.stages.group import knee_count
+from gsmerge.stages.merge import MergedViews
+from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.types import PixelScene, UnalignedScene
 
-USUAL_MOST = 4  # children that are kept of a group, unless a number of Gaussians is to be dealt out
+DEFAULT_MAX_K = 4  # children that are kept of a group, unless a number of Gaussians is to be dealt out
 
 
 def encode_scene(
@@ -56,14 +58,13 @@ def encode_scene(
         raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {max_k}")
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, log)
-        count = decide(work, log)
-        if keeps_all(work, count):
+        prepared = prepare(scene, options, log)
+        count = choose_count(prepared, build, log)
+        if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
-        grouping = choose_groups(work, count, log)
-        merged = merged_groups(work.source, grouping, work.options, log)
+        merged = merge_views(prepared, count, log)
         with log.stage("decode"):
-            return _kept(work, grouping, merged, max_k, log)
+            return _encoded(prepared, merged, max_k, log)
 
 
 def _unfitted(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
@@ -78,38 +79,37 @@ def _unfitted(options: CompactOptions, settings: dict[str, Any]) -> CompactOptio
     return replace(options, fit=replace(options.fit, fit="none"))
 
 
-def _kept(work: Work, grouping: Grouping, merged: Merged, max_k: int | None, log: RunLog) -> Encoded:
+def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, log: RunLog) -> Encoded:
     """Everything that decoding needs of the merged Feature Gaussians."""
-    features, learned = merged.features, merged.learned
-    options, scene = work.options, work.source.scene
-    wanted = wanted_count(merged, grouping, options)
-    dealt = wanted is not None or options.decode.count > USUAL_MOST
-    most = max_k or (MAX_CHILDREN if dealt else USUAL_MOST)
-    tree = work.tree or scene_tree(scene, work.canvas, options, work.canvas.usual)
+    features, networks, segmentation = merged.features, merged.networks, merged.segmentation
+    options, scene = prepared.options, prepared.scene
+    count = merged_count(merged, options.decode, grows=options.fit.grows)
+    dealt = count is not None or options.decode.count > DEFAULT_MAX_K
+    most = max_k or (MAX_CHILDREN if dealt else DEFAULT_MAX_K)
     prunes = scene.images is not None and options.fit.effort != "draft"
     settings = StoredSettings(
-        num_input=work.scene.num_gaussians,
+        num_input=prepared.given.num_gaussians,
         k=options.decode.k,
         most=most,
         min_opacity=options.decode.min_opacity,
-        prune=options.fit.prune if prunes else 0.0,
-        wanted=wanted if grouping.exact else None,
-        places=None if grouping.exact or wanted is None else wanted // options.decode.count,
-        knee=knee_count(tree, work.canvas, options),
+        prune=options.fit.min_contribution if prunes else 0.0,
+        wanted=count if segmentation.exact else None,
+        places=None if segmentation.exact or count is None else count // options.decode.count,
+        knee=knee_count(prepared),
     )
     heads = None
-    if learned is not None:
-        described = learned.describe(features)
-        heads = StoredHeads(learned.networks, learned.precision, described.views, described.group)
+    if networks is not None:
+        group_features = networks.describe(features)
+        heads = StoredHeads(networks.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, most, options.encode.rule),
-        kept=work.kept,
-        frame=work.frame,
+        kept=prepared.hidden,
+        frame=prepared.frame,
         cameras=scene.cameras,
         settings=settings,
         heads=heads,
-        about=_about(work.settings, log),
+        about=_about(prepared.settings, log),
     )
 
 

@@ -42,13 +42,11 @@ class StoredHeads:
 
     Args:
         networks: All of a checkpoint's networks.
-        precision: Of their arithmetic, ``"float32"`` or ``"bfloat16"``.
         views: ``[g]`` int64, the view that each group's frame belongs to.
         group: ``[g,n]`` the numbers that describe each group.
     """
 
     networks: Networks
-    precision: str
     views: Tensor
     group: Tensor
 

@@ -33,7 +33,6 @@ from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.tokens import GROUP
-from gsmerge.options import PRECISIONS
 from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import FeatureGaussians
@@ -48,7 +47,6 @@ KINDS = {
     "height": int,
     "about": dict,
     "networks": dict | None,
-    "precision": str,
 }
 
 
@@ -79,7 +77,6 @@ def save_encoded(
         "height": encoded.cameras.height,
         "networks": None if heads is None else asdict(heads.networks.options),
         "about": {**encoded.about, **({} if source is None else {"source": dict(source)})},
-        "precision": "float32" if heads is None else heads.precision,
     }
     data = to_bytes(FORMAT, header, _tensors(encoded))
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
@@ -166,9 +163,6 @@ def _heads(
     """The networks, if there are any, and what they know of the groups."""
     if header["networks"] is None:
         return None
-    if header["precision"] not in PRECISIONS:
-        problem = f"precision: expected {' or '.join(PRECISIONS)}, found {header['precision']!r:.40}"
-        raise SceneError(path, problem, REMEDY)
     own = {name.removeprefix("networks."): t for name, t in tensors.items() if name.startswith("networks.")}
     networks = build_networks(path, header["networks"], own, REMEDY)
     views = take("heads.views", torch.int32, len(features)).long()
@@ -179,4 +173,4 @@ def _heads(
         problem = f"features.latents: expected {networks.options.latent} numbers, as of its networks, found {wide}"
         raise SceneError(path, problem, REMEDY)
     group = take("heads.group", torch.float32, len(features), GROUP)
-    return StoredHeads(networks, header["precision"], views, group)
+    return StoredHeads(networks, views, group)

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from gsmerge import __version__
-from gsmerge.build import Merged, merged_groups
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
@@ -21,12 +20,14 @@ from gsmerge.online.options import OnlineOptions
 from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
 from gsmerge.online.state import OnlineState, Parts, baked, joined, no_photos, pick, with_solved
 from gsmerge.options import CompactOptions
-from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
+from gsmerge.pipeline import build, merge_views
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.fit import shown
-from gsmerge.stages.merge import take
+from gsmerge.search import choose_count
+from gsmerge.stages.fit import visible_mask
+from gsmerge.stages.merge import MergedViews, take
+from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 
@@ -89,32 +90,31 @@ def extend(
     _check(state, scene, options, online.max_k if state is None else state.settings.most)
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, log, None if state is None else state.frame)
-        work = replace(work, canvas=replace(work.canvas, share=1.0))  # nothing grows here
-        count = decide(work, log)
-        if keeps_all(work, count):
+        prepared = prepare(scene, options, log, None if state is None else state.frame)
+        prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
+        count = choose_count(prepared, build, log)
+        if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        grouping = choose_groups(work, count, log)
-        merged = merged_groups(work.source, grouping, work.options, log)
-        shots = _shots(state, work)
+        merged = merge_views(prepared, count, log)
+        shots = _shots(state, prepared)
         counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
         rows = torch.zeros(0, dtype=torch.int64)
         if state is not None:
             with log.stage("cover"):
                 rows = rows_in_view(state.parts.features, shots.cameras)
-                fresh = _uncovered(pick(state.parts, rows), merged, shots, work.source.scene, online)
+                fresh = _uncovered(pick(state.parts, rows), merged, shots, prepared.scene, online)
                 counts["num_covered"] = len(merged.features) - len(fresh)
                 merged = replace(merged, features=take(merged.features, fresh))
         most = online.max_k if state is None else state.settings.most
         places = np.arange(len(shots)) if state is None else view_places(state.cameras, shots.cameras)
         with log.stage("decode"):
-            new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
+            new = baked(merged.features, merged.members, merged.networks, most, options.encode.rule)
         with log.stage("join"):
-            state, found = _entered(state, new, work, (shots, places, rows), online)
+            state, found = _entered(state, new, prepared, (shots, places, rows), online)
             counts |= found
-        if work.scene.images is not None:
-            state = _with_photos(state, (shots, places), work.options, online, log)
-    numbers = {"num_views": len(work.source.scene), "num_input": scene.num_gaussians, **counts}
+        if prepared.given.images is not None:
+            state = _with_photos(state, (shots, places), prepared.options, online, log)
+    numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts}
     told = options.to_dict() | asdict(online)
     done = BatchReport(
         **numbers, num_groups=len(state), seconds=log.seconds, choices=log.choices,
@@ -163,15 +163,15 @@ def _lasting(options: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in options.items() if name != "threads"}
 
 
-def _shots(state: OnlineState | None, work: Work) -> Shots:
+def _shots(state: OnlineState | None, prepared: PreparedScene) -> Shots:
     """Photos of the batch, or what stands in for them, at the size of the state's views."""
-    scene = work.source.scene
+    scene = prepared.scene
     size = scene.cameras if state is None else state.cameras
     return shots_at(scene_pictures(scene), scene.cameras, size.width, size.height)
 
 
 def _uncovered(
-    parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | UnalignedScene, online: OnlineOptions
+    parts: Parts, batch: MergedViews, shots: Shots, scene: PixelScene | UnalignedScene, online: OnlineOptions
 ) -> torch.Tensor:
     """Rows of the batch's groups that show something which the groups in view do not show as well."""
     features, members = batch.features, batch.members
@@ -187,7 +187,7 @@ def _uncovered(
 def _entered(
     state: OnlineState | None,
     new: Parts,
-    work: Work,
+    prepared: PreparedScene,
     seen: tuple[Shots, np.ndarray, torch.Tensor],
     online: OnlineOptions,
 ) -> tuple[OnlineState, dict[str, int]]:
@@ -195,22 +195,22 @@ def _entered(
 
     ``seen`` are the batch's photos, which of all views they show, and the rows of the state's groups in their view.
     """
-    options, scene, (shots, places, rows) = work.options, work.source.scene, seen
+    options, scene, (shots, places, rows) = prepared.options, prepared.scene, seen
     if state is None:
-        return _begun(new, work, online), {}
+        return _begun(new, prepared, online), {}
     found = partners(take(state.parts.features, rows), new.features, options.match)
     joins = found >= 0
     parts = absorb(state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most)
     alone = pick(new, torch.nonzero(~joins)[:, 0])
     counts = {"num_joined": int(joins.sum())}
-    if options.fit.prune > 0 and scene.images is not None:
+    if options.fit.min_contribution > 0 and scene.images is not None:
         beside = take(parts.features, rows)
         every = Gaussians.concat([feature_to_gaussians(beside), feature_to_gaussians(alone.features)])
-        shows = shown(every, shots.photos(2), options.fit.prune)[len(beside) :]
+        shows = visible_mask(every, shots.photos(2), options.fit.min_contribution)[len(beside) :]
         counts["num_hidden"] = int((~shows).sum())
         alone = pick(alone, torch.nonzero(shows)[:, 0])
-    kept = [one for one in (state.kept, work.kept) if one is not None]
-    total = state.settings.num_input + work.scene.num_gaussians
+    kept = [one for one in (state.kept, prepared.hidden) if one is not None]
+    total = state.settings.num_input + prepared.given.num_gaussians
     settings = replace(state.settings, num_input=total, k=options.decode.k)
     further = shots.cameras[torch.from_numpy(places >= len(state.cameras))]
     return replace(
@@ -222,18 +222,18 @@ def _entered(
     ), counts
 
 
-def _begun(new: Parts, work: Work, online: OnlineOptions) -> OnlineState:
+def _begun(new: Parts, prepared: PreparedScene, online: OnlineOptions) -> OnlineState:
     """The state that a first batch makes."""
-    options, cameras = work.options, work.source.scene.cameras
+    options, cameras = prepared.options, prepared.scene.cameras
     settings = StoredSettings(
-        num_input=work.scene.num_gaussians,
+        num_input=prepared.given.num_gaussians,
         k=options.decode.k,
         most=online.max_k,
         min_opacity=options.decode.min_opacity,
-        prune=options.fit.prune if work.scene.images is not None else 0.0,
+        prune=options.fit.min_contribution if prepared.given.images is not None else 0.0,
         wanted=None,
         places=None,
         knee=0,
     )
     same = resized(cameras, cameras.width, cameras.height)
-    return OnlineState(new, work.kept, work.frame, same, no_photos(cameras), settings, {})
+    return OnlineState(new, prepared.hidden, prepared.frame, same, no_photos(cameras), settings, {})

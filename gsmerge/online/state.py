@@ -16,7 +16,7 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredSettings, without_members
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.stages.prepare import Frame
@@ -102,14 +102,14 @@ class OnlineState:
 
 
 def baked(
-    features: FeatureGaussians, members: Members, learned: Learned | None, most: int, rule: Rule = "depth"
+    features: FeatureGaussians, members: Members, networks: NetworkContext | None, most: int, rule: Rule = "depth"
 ) -> Parts:
     """Groups as what they decode to: gains, spreads, latents and heads are in the result and needed no more.
 
     Args:
         features: g Feature Gaussians with their members.
         members: The Gaussians that they point to.
-        learned: Networks whose heads correct what is decoded; None: none do.
+        networks: Networks whose heads correct what is decoded; None: none do.
         most: Most children that are kept of a group.
         rule: How children are pooled.
     """
@@ -117,9 +117,9 @@ def baked(
     children, parents = ones, np.arange(len(features))
     if most > 1:
         children, parents = divide(features, members, np.full(len(features), most), rule)
-    if learned is not None:
-        ones = decode_gaussians(ones, np.arange(len(features)), features, learned)
-        children = decode_gaussians(children, parents, features, learned)
+    if networks is not None:
+        ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
+        children = decode_gaussians(children, parents, features, networks)
     return _parts(features, ones, children, parents)
 
 

@@ -14,9 +14,8 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.cli.network_options import Precision
 from gsmerge.io import ReadHints
-from gsmerge.options import METHODS, PRECISIONS
+from gsmerge.options import METHODS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -32,10 +31,6 @@ def readme_commands(root: Path) -> list[str]:
     blocks = re.findall(r"```bash\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
     calls = (part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&"))
     return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
-
-
-def test_precisions_are_the_library_s() -> None:
-    assert tuple(choice.value for choice in Precision) == PRECISIONS
 
 
 def test_commands_are_the_documented_ones() -> None:
@@ -107,7 +102,7 @@ def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device", "checkpoint", "precision", "geometry"}
+    known |= {"levels", "device", "checkpoint", "geometry"}
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None

@@ -54,5 +54,8 @@ def test_missing_file_is_told_without_torch_loading_twice() -> None:
 def test_submodule_imports_do_not_hide_functions() -> None:
     """The modules render and inspect share their names with the functions that they hold."""
     print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"
-    assert run_python(f"import gsmerge.render, gsmerge.measure.inspect\n{print_kinds}").split() == ["function", "function"]
+    assert run_python(f"import gsmerge.render, gsmerge.measure.inspect\n{print_kinds}").split() == [
+        "function",
+        "function",
+    ]
     assert run_python(f"import gsmerge.pipeline\n{print_kinds}").split() == ["function", "function"]

@@ -16,10 +16,10 @@ from gsmerge.networks import Networks
 from gsmerge.render.autograd import render_differentiable
 from gsmerge.render.metrics import C1, C2
 from gsmerge.render.metrics import WINDOW as SIDE
+from gsmerge.render.photos import NEAR
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import foreseen
 from gsmerge.research.training.windows import Window
-from gsmerge.stages.prepare import NEAR
 from gsmerge.types import Gaussians
 
 BEST = 100.0  # dB: PSNR of windows without an error

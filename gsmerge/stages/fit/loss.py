@@ -16,14 +16,14 @@ def _box(array: np.ndarray) -> np.ndarray:
     return cv2.blur(array, WINDOW, borderType=cv2.BORDER_CONSTANT)
 
 
-def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dssim: float) -> np.ndarray:
+def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float) -> np.ndarray:
     """Gradient of the loss (1 - dssim) |image - photo| + dssim (1 - SSIM), per pixel of the image.
 
     Args:
         image: ``[h,w,3]`` float32.
         photo: ``[h,w,3]`` float32.
         weight: ``[h,w]`` float32 weights of the pixels.
-        dssim: Share of structural similarity (windows of 7 x 7).
+        ssim_lambda: Share of structural similarity (windows of 7 x 7).
 
     Returns:
         ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size.
@@ -36,7 +36,7 @@ def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dss
     from_square *= image
     from_cross *= photo
     similarity = from_mean + 2 * from_square + from_cross
-    gradient = np.float32(1 - dssim) * channels * np.sign(image - photo) - np.float32(dssim) * similarity
+    gradient = np.float32(1 - ssim_lambda) * channels * np.sign(image - photo) - np.float32(ssim_lambda) * similarity
     gradient /= np.float32(image.shape[0] * image.shape[1])
     return gradient
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from learned import Made, made
+from networks import Made, made
 
 from gsmerge.encoded.divide import divide_all, pick_children
 from gsmerge.encoded.encoded import Division
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.stages.decode import divide
-from gsmerge.stages.region_tree import split_counts
+from gsmerge.stages.decode import divide, split_counts
 from gsmerge.types import FeatureGaussians, Gaussians
 
 MOST = 8

@@ -11,8 +11,8 @@ import pytest
 import scenes
 import torch
 from arriving import FAST, counts, fed, parts_of, room, same_parts, same_state, state_of
-from learned import noisy, written
 from loose import NO_CAMERAS, far_behind, loosened, shuffled
+from networks import noisy, written
 
 from gsmerge import Compactor, Gaussians, PixelScene, UnalignedScene, decode_scene, encode_scene
 from gsmerge.errors import UsageError

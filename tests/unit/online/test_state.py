@@ -10,8 +10,8 @@ import pytest
 import scenes
 import torch
 from arriving import group, random_gaussians, same_group, same_parts
-from learned import SMALL, Made, made, noisy, written
 from loose import far_behind, shuffled, voxels
+from networks import SMALL, Made, made, noisy, written
 
 from gsmerge import Gaussians, PixelScene, decode_scene, encode_scene
 from gsmerge.geometry import covariances
@@ -93,15 +93,15 @@ def test_baked_is_what_the_stages_decode(most: int, some: Made, uneven: FeatureG
 
 
 def test_heads_are_in_what_is_baked(some: Made) -> None:
-    learned = some.learned(noisy())
-    features = encode_features(some.features, learned)
+    networks = some.networks(noisy())
+    features = encode_features(some.features, networks)
     assert features.latents.shape[1] == SMALL.latent
-    found = baked(features, some.members, learned, 4)
+    found = baked(features, some.members, networks, 4)
     assert found.features.latents.shape == (len(features), 0)
     ones, children = ones_and_most(found, 4)
     # lengths are floored beside the largest, so that the thinnest may be told anew
-    assert_close(ones, decode(features, some.members, ALL, learned=learned), rtol=1e-3)
-    wanted = decode(features, some.members, replace(ALL, k=4), learned=learned)
+    assert_close(ones, decode(features, some.members, ALL, networks=networks), rtol=1e-3)
+    wanted = decode(features, some.members, replace(ALL, k=4), networks=networks)
     assert_same_children(children, wanted)
     plain = baked(features, some.members, None, 4)
     assert not torch.equal(plain.children.sh0, found.children.sh0)

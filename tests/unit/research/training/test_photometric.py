@@ -16,7 +16,7 @@ from training_runs import OPTIONS, TINY
 from gsmerge.errors import GsmergeError
 from gsmerge.measure.evaluate import Views
 from gsmerge.measure.lpips import lpips, lpips_available, lpips_loss
-from gsmerge.networks import Learned, Networks
+from gsmerge.networks import NetworkContext, Networks
 from gsmerge.networks.apply import encode_features, refine_features
 from gsmerge.render import render
 from gsmerge.render.metrics import ssim
@@ -248,7 +248,7 @@ def test_untrained_networks_render_what_the_analytic_stages_do(example: Example)
 @pytest.mark.parametrize("outputs", ["residual", "absolute"])
 def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example, outputs: str) -> None:
     networks = noisy(replace(TINY, outputs=outputs))
-    learned = Learned(networks, example.members, example.cameras, 0)
+    learned = NetworkContext(networks, example.members, example.cameras, 0)
     merged = merge(encode_features(example.features, learned), example.matches, learned)
     wanted = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), learned=learned)
     every = torch.arange(len(example.centres))
