@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-from pathlib import Path
 from typing import Any
 
 from numba.core.compiler_lock import global_compiler_lock
@@ -13,14 +12,22 @@ from gsmerge.kernels.jit import cache_folder
 
 
 def compile_once() -> None:
-    """Lock every kernel while it is loaded or compiled; kernels that it calls are locked in turn."""
-    folder, compile_alone = Path(cache_folder()), Dispatcher.compile
+    """Lock every kernel that Python calls while it is loaded or compiled, with all kernels that it calls."""
+    folder, compile_alone = cache_folder(), Dispatcher.compile
     folder.mkdir(parents=True, exist_ok=True)
+    under_way: list[Any] = []
 
     def compile_locked(self: Any, signature: Any) -> Any:
-        # numba's own lock goes first: two threads of a process would take the two in different orders
-        with global_compiler_lock, (folder / f"{self.py_func.__name__}.lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            return compile_alone(self, signature)
+        with global_compiler_lock:  # first, or two threads of a process would take the two locks in different orders
+            if under_way:
+                return compile_alone(self, signature)
+            name = f"{self.py_func.__module__}.{self.py_func.__name__}.lock"
+            with (folder / name).open("w") as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                under_way.append(self)
+                try:
+                    return compile_alone(self, signature)
+                finally:
+                    under_way.pop()
 
     Dispatcher.compile = compile_locked
