@@ -1,4 +1,4 @@
-"""What a rival method is: a name, what it needs, which settings it looks at, and a function."""
+"""What a baseline (another method) is: a name, what it needs, which settings it uses, and a function."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import torch
 from torch import Tensor
 
 from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.assign import assign_members
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.prepare import PreparedScene
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
 
 Need = Literal["photos", "pixels", "node"]
 Run = Callable[[PreparedScene, int, RunLog], Gaussians]
@@ -22,7 +25,7 @@ COUNTS = ("budget", "max_bytes", "preset", "superpixels", "density", "k")  # set
 
 @dataclass(frozen=True)
 class Baseline:
-    """One rival method.
+    """One other method.
 
     Args:
         name: As on the command line.
@@ -30,7 +33,7 @@ class Baseline:
         run: Prepared scene, number of Gaussians, log -> canonical Gaussians, at most that many unless the method keeps
             the input's. It times itself, by stages of the log.
         needs: ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js.
-        uses: Settings that it looks at, by flat name; seed and threads are everybody's.
+        uses: Settings that it uses, by flat name, besides those that all methods use.
     """
 
     name: str
@@ -51,9 +54,9 @@ def own_gaussians(scene: PixelScene | UnalignedScene) -> Gaussians:
     return scene.gaussians
 
 
-def view_shares(count: int, num_views: int, most: int) -> list[int]:
-    """A number dealt out evenly over the views, at most ``most`` each; the first views get the rest."""
-    return [min(most, count // num_views + (view < count % num_views)) for view in range(num_views)]
+def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
+    """A number divided evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
+    return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
 
 
 def most_important(importance: Tensor | np.ndarray, count: int) -> Tensor:
@@ -70,3 +73,14 @@ def most_important(importance: Tensor | np.ndarray, count: int) -> Tensor:
         raise ValueError(f"count: expected at least 0, got {count}")
     values = torch.as_tensor(importance).double().nan_to_num(nan=-torch.inf, neginf=-torch.inf)
     return torch.sort(torch.argsort(values, descending=True, stable=True)[:count]).values
+
+
+def merge_groups(
+    prepared: PreparedScene, groups: Groups, log: RunLog, rule: Literal["depth", "paper"] = "depth"
+) -> Gaussians:
+    """One Gaussian for each group, without matching across views; groups that hold nothing are left out."""
+    with log.stage("encode"):
+        members = prepared.members or assign_members(prepared.scene, groups, prepared.options.contribution)
+        features = encode(prepared.scene, members, groups, EncodeOptions(rule=rule))
+    with log.stage("decode"):
+        return decode(features, members, DecodeOptions(min_opacity=0.0), rule=rule)

@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import torch
 
-from gsmerge.baselines.baseline import Baseline, view_shares
+from gsmerge.baselines.baseline import Baseline, merge_groups, view_shares
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.assign import assign_members
-from gsmerge.stages.decode import DecodeOptions, decode
-from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import superpixels
 from gsmerge.types import Gaussians, Groups
@@ -30,11 +27,7 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         views = range(len(scene))
         labels = parallel_map(lambda view: superpixels(prepared.pictures[view], counts[view], SEGMENTATION), views)
         groups = Groups(torch.stack(labels), tuple(counts))
-    with log.stage("encode"):
-        members = prepared.members or assign_members(scene, groups, prepared.options.contribution)
-        features = encode(scene, members, groups, EncodeOptions(rule="paper"))
-    with log.stage("decode"):
-        return decode(features, members, DecodeOptions(min_opacity=0.0), rule="paper")
+    return merge_groups(prepared, groups, log, rule="paper")
 
 
 PAPER = Baseline("paper", "the superpixel merging paper's moment matching", run)

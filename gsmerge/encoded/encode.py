@@ -1,4 +1,4 @@
-"""scene -> merged feature gaussians and all their children: everything up to decoding, to be kept."""
+"""scene -> merged feature gaussians and all their children: everything up to decoding, to be stored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.types import PixelScene, UnalignedScene
 
-DEFAULT_MAX_K = 4  # children that are kept of a group, unless a number of Gaussians is to be dealt out
+DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
 
 
 def encode_scene(
@@ -34,7 +34,7 @@ def encode_scene(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Encoded:
-    """All of :func:`gsmerge.compact` up to decoding, kept: superpixels, merging, matching, networks; never a fit.
+    """All of :func:`gsmerge.compact` up to decoding, stored: superpixels, merging, matching, networks; never a fit.
 
     ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", **settings)``, bit for bit; so is
     any other ``k`` at decoding, unless a budget, a preset, ``k="auto"`` or the size of the input limits the number of
@@ -44,14 +44,14 @@ def encode_scene(
         scene: As of :func:`gsmerge.compact`.
         options: Settings of all stages; those of the fit do not matter. None: the defaults.
         max_k: Most Gaussians of a group that can be decoded, 1 to 8: more take more space. None: 4, or 8 where ``k``
-            is larger or a number of Gaussians is dealt out (budgets, presets, ``k="auto"``, scenes in no order).
+            is larger or a number of Gaussians is asked for (budgets, presets, ``k="auto"``, unaligned scenes).
         progress: As of :func:`gsmerge.compact`.
         **settings: Single settings by name, on top of ``options``.
 
     Raises:
         ValueError: If a setting is unknown or out of range, or goes with a fit or another method.
     """
-    options = _unfitted((options or CompactOptions()).with_settings(settings), settings)
+    options = _without_fit((options or CompactOptions()).with_settings(settings), settings)
     if max_k is not None and not 1 <= max_k <= MAX_CHILDREN:
         raise UsageError(f"max k: expected 1 to {MAX_CHILDREN}, got {max_k}")
     if max_k is not None and max_k < options.decode.count:
@@ -64,38 +64,37 @@ def encode_scene(
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
         merged = merge_views(prepared, count, log)
         with log.stage("decode"):
-            return _encoded(prepared, merged, max_k, log)
+            return _to_encoded(prepared, merged, max_k, log)
 
 
-def _unfitted(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
+def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
     """The options without a fit.
 
     Raises:
         UsageError: If a fit, another method, a quality or levels are asked for.
     """
-    fitted = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
-    for name in (*fitted, *options.whole_only):
+    fit = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
+    for name in (*fit, *options.whole_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")
     return replace(options, fit=replace(options.fit, fit="none"))
 
 
-def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, log: RunLog) -> Encoded:
+def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, log: RunLog) -> Encoded:
     """Everything that decoding needs of the merged Feature Gaussians."""
-    features, networks, segmentation = merged.features, merged.networks, merged.segmentation
+    features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
     options, scene = prepared.options, prepared.scene
     count = merged_count(merged, options.decode, grows=options.fit.grows)
-    dealt = count is not None or options.decode.count > DEFAULT_MAX_K
-    most = max_k or (MAX_CHILDREN if dealt else DEFAULT_MAX_K)
+    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.count <= DEFAULT_MAX_K else MAX_CHILDREN)
     prunes = scene.images is not None and options.fit.effort != "draft"
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
         k=options.decode.k,
-        most=most,
+        max_k=max_k,
         min_opacity=options.decode.min_opacity,
-        prune=options.fit.min_contribution if prunes else 0.0,
-        wanted=count if segmentation.exact else None,
-        places=None if segmentation.exact or count is None else count // options.decode.count,
-        knee=knee_count(prepared),
+        min_contribution=options.fit.min_contribution if prunes else 0.0,
+        target_count=count if exact else None,
+        num_slots=None if exact or count is None else count // options.decode.count,
+        knee_count=knee_count(prepared),
     )
     heads = None
     if networks is not None:
@@ -103,7 +102,7 @@ def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, lo
         heads = StoredHeads(networks.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, merged.members, most, options.encode.rule),
+        division=divide_all(features, merged.members, max_k, options.encode.rule),
         kept=prepared.hidden,
         frame=prepared.frame,
         cameras=scene.cameras,
@@ -115,8 +114,7 @@ def _encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, lo
 
 def _about(options: CompactOptions, log: RunLog) -> dict[str, Any]:
     """Version, options, choices and notes; nothing that depends on the machine."""
-    told = options.to_dict()
-    del told["threads"]
-    checkpoint = {"checkpoint": Path(options.checkpoint).name}
+    settings = options.to_dict() | {"checkpoint": Path(options.checkpoint).name}
+    del settings["threads"]
     choices = {name: value for name, value in log.choices.items() if name != "networks"}
-    return {"gsmerge": __version__, "options": told | checkpoint, "choices": choices, "notes": list(log.notes)}
+    return {"gsmerge": __version__, "options": settings, "choices": choices, "notes": list(log.notes)}

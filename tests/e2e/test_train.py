@@ -9,7 +9,7 @@ from pathlib import Path
 from shutil import copytree, rmtree
 
 import numpy as np
-from networks import SMALL, noisy, written
+from learned import SMALL, noisy, written
 
 from gsmerge.cli.train import find_training_scenes
 from gsmerge.networks import load_checkpoint

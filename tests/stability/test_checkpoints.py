@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from learned import noisy, scaled, written
 from loose import shuffled
-from networks import noisy, scaled, written
 from safetensors.torch import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
 

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from gsmerge.kernels.gaussians.optimise import C1, C2, COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
+from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
 from gsmerge.render.colored import draw_colored, seen_colors
 from gsmerge.stages.fit.full import KERNELS, Engine, Plan, step_sizes
-from gsmerge.stages.fit.loss import WINDOW
+from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.stages.fit.options import FitOptions, LearningRates
 from gsmerge.stages.fit.state import State, state_of
 from gsmerge.types import SH_C0
@@ -156,14 +155,9 @@ def image_loss(image: Tensor, photo: Tensor, weight: Tensor, ssim_lambda: float)
         image: ``[h,w,3]``.
         photo: ``[h,w,3]``.
         weight: ``[h,w]`` weights of the pixels.
-        ssim_lambda: Share of structural similarity, over windows of 7 x 7, zero beyond the border.
+        ssim_lambda: Share of structural similarity, see :func:`gsmerge.stages.fit.loss.loss_ssim`.
     """
-    stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
-    mx, my, xx, yy, xy = avg_pool2d(stacked, WINDOW, 1, WINDOW[0] // 2).permute(0, 2, 3, 1)
-    c1, c2 = float(C1), float(C2)
-    above = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
-    similarity = above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
-    each = (1 - ssim_lambda) * (image - photo).abs() + ssim_lambda * (1 - similarity)
+    each = (1 - ssim_lambda) * (image - photo).abs() + ssim_lambda * (1 - loss_ssim(image, photo))
     return (weight[..., None] * each).sum() / weight.numel()
 
 
