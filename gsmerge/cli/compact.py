@@ -166,6 +166,7 @@ def print_plan(
     """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
+    from gsmerge.options import to_schema
     from gsmerge.report import document_head, to_json
     from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
@@ -192,6 +193,7 @@ def print_plan(
         num_rest=3 * scene.gaussians.shN.shape[1],
     )
     if as_json:
-        sys.stdout.write(to_json({**document_head(), **document}))
+        options = {"options": to_schema(document["options"])}
+        sys.stdout.write(to_json({**document_head(), **document, **options}))
     else:
         print("\n".join(map(one_line, plan_lines(document))))
