@@ -49,7 +49,7 @@ class Made:
     members: Members
     features: FeatureGaussians
 
-    def learned(self, networks: Networks, seed: int = 0) -> NetworkContext:
+    def networks(self, networks: Networks, seed: int = 0) -> NetworkContext:
         """The networks for this scene."""
         return NetworkContext(networks, self.members, self.scene.cameras, seed)
 

@@ -114,7 +114,7 @@ def _run(
     """Read, encode and write; returns the report."""
     from gsmerge.compact_file import read_input
     from gsmerge.encoded.encode import encode_scene
-    from gsmerge.encoded.file import save_encoded
+    from gsmerge.encoded.gsm_file import save_encoded
     from gsmerge.io import atomic_output
     from gsmerge.report import file_sha256
 
@@ -146,7 +146,7 @@ def _document(
 
     settings, size = encoded.settings, out.stat().st_size
     told = {name: value for name, value in found.items() if name not in ("name", "comments", "notes")}
-    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.num_most, "max_k": settings.most}
+    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": settings.max_k}
     return {
         **document_head(),
         "input": {"path": str(ply), "num_gaussians": settings.num_input, **told},

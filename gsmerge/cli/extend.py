@@ -112,7 +112,7 @@ def extend(
     if len(scenes) > 1 and (cameras is not None or images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.io import find_scene_files
-    from gsmerge.online.files import extend_file
+    from gsmerge.online.file import extend_file
 
     batches = [find_scene_files(scene, cameras=cameras, images=images) for scene in scenes]
     for files in batches:

@@ -84,7 +84,9 @@ def report(
     from gsmerge.measure.before_after import comparison_document
     from gsmerge.measure.compare import compare
     from gsmerge.measure.evaluate import INPUT, EvaluateOptions
-    from gsmerge.stages.unaligned import with_views
+    from gsmerge.runtime.run_log import RunLog
+    from gsmerge.stages.place_cameras import add_views
+    from gsmerge.types import UnalignedScene
 
     files = find_scene_files(before, cameras=cameras, images=images)
     for path in output or []:
@@ -96,9 +98,11 @@ def report(
     nets, missing = networks(lpips)
     load = load_files(files, opacity=opacity.value, hints=hints)
     scene, held_out, adapted = held_out_views(load, targets, target_images, None)
-    scene, placed = with_views(scene)
+    log = RunLog()
+    if isinstance(scene, UnalignedScene):
+        scene = add_views(scene, log)
     plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
-    notes = [*load.notes, *adapted, *placed, *missing]
+    notes = [*load.notes, *adapted, *log.notes, *missing]
     say_notes(notes, quiet=quiet or json)
     storage = {INPUT: _storage(load.ply), **{name: _storage(ply.info) for name, ply in plys.items()}}
     gaussians = {name: ply.gaussians for name, ply in plys.items()}

@@ -39,7 +39,7 @@ def encode(
     members: Members,
     groups: Groups,
     options: EncodeOptions,
-    learned: NetworkContext | None = None,
+    networks: NetworkContext | None = None,
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, view by view.
 
@@ -48,14 +48,14 @@ def encode(
         members: Its Gaussians as arrays.
         groups: The superpixels of every view.
         options: The rule.
-        learned: Networks whose encoder looks at the members too; None: none does.
+        networks: Networks whose encoder corrects what is pooled; None: none does.
 
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
     """
     starts, ids, views = member_rows(scene, members, groups)
     features = from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
-    return features if learned is None else encode_features(features, learned)
+    return features if networks is None else encode_features(features, networks)
 
 
 def member_rows(

@@ -48,7 +48,7 @@ def _confine(x, x0, unit, share, limits):
 
 @kernel
 def adam(
-    x, x0, m, v, units, shares, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
+    x, x0, m, v, units, box_shares, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
     first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
     """Adam on the rows ``first`` to ``last`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
@@ -57,7 +57,7 @@ def adam(
     scene. Dense: Gaussians without a gradient (``ids`` rising holds those that have one) coast on their momentum.
 
     Args:
-        shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
+        box_shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
         limits: Of the mean (in sizes), log scale, logit.
         betas: Decay of the first and second moment.
@@ -88,7 +88,7 @@ def adam(
             v[i, c] = b2 * v[i, c] + (f4(1.0) - b2) * energy[c]
             move = rates[c] * m[i, c] * c1 / (np.sqrt(v[i, c] * c2) + f4(1e-15))
             x[i, c] -= move * unit if c < SIZE else move
-        _confine(x[i], x0[i], unit, shares[i], limits)
+        _confine(x[i], x0[i], unit, box_shares[i], limits)
         for c in range(3):
             means[i, c], colors[i, c] = x[i, c], x[i, COLOR + c]
             scales[i, c] = np.exp(x[i, SIZE + c])

@@ -30,7 +30,7 @@ from gsmerge.moments import Members
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import Photos, scene_pictures
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.scenes import (
     TrainingScene,
@@ -43,10 +43,10 @@ from gsmerge.stages.decode import divide
 from gsmerge.stages.encode import encode
 from gsmerge.stages.fit.full import Masks, fit_full
 from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.stage import shown
-from gsmerge.stages.group import group_scene, scene_canvas
+from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
+from gsmerge.stages.segment import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
 
 Progress = Callable[[int, int], None]
@@ -227,7 +227,7 @@ def _fit_columns(
     changes = {"density": density, "match": options.match, "fit": "none", "robust": False, "seed": options.seed}
     settings = CompactOptions().with_settings(changes)
     scene, members = training.scene, training.members
-    groups = group_scene(scene_canvas(scene, settings), settings).groups
+    groups = segment(scene_pictures(scene), settings.segment)
     features = encode(scene, members, groups, settings.encode)
     matches = match(features, settings.match)
     merged = merge(features, matches)
@@ -269,7 +269,7 @@ def _fit_level(
     """Gaussians after a full fit without growth, and a mask ``[n]`` of those that were fitted, which a photo shows."""
     fit, photos = FitOptions(fit_steps=options.fit_steps), teacher.photos
     mask = start.opacities >= min_opacity
-    mask[mask.clone()] = shown(start[mask], photos[1], fit.prune)
+    mask[mask.clone()] = visible_mask(start[mask], photos[1], fit.min_contribution)
     fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress, masks=teacher.masks)
     if not report.accepted:
         problem = f"expected a scene that the fit makes better ({report.stopped})"

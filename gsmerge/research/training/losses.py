@@ -12,20 +12,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.measure.lpips import lpips_loss
 from gsmerge.networks import Networks
 from gsmerge.networks.residuals import RESIDUAL, ROTATION, residual_limits
 from gsmerge.render.autograd import render_differentiable
-from gsmerge.render.metrics import C1, C2
-from gsmerge.render.metrics import WINDOW as SIDE
+from gsmerge.render.photos import NEAR
 from gsmerge.research.training.examples import Example
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import Crop, predict, predict_corrections
 from gsmerge.research.training.windows import Window
-from gsmerge.stages.prepare import NEAR
+from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.types import Gaussians
 
 MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
@@ -116,17 +114,10 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """:func:`gsmerge.render.metrics.ssim` of images ``[h,w,3]``, differentiable; 1 where no window fits."""
-    border, unbiased = SIDE // 2, SIDE**2 / (SIDE**2 - 1)
-    weights = mask[border:-border, border:-border].to(image)
-    if min(image.shape[:2]) < SIDE or not bool(weights.any()):
+    """Mean :func:`gsmerge.stages.fit.loss.loss_ssim` of images ``[h,w,3]`` within ``mask [h,w]``; 1 if it is empty."""
+    if not bool(mask.any()):
         return torch.ones(())
-    x, y = image.permute(2, 0, 1), photo.permute(2, 0, 1)
-    means = avg_pool2d(torch.cat([x, y, x * x, y * y, x * y])[None], SIDE, 1)[0]
-    ux, uy, xx, yy, xy = means.chunk(5)
-    vx, vy, vxy = (unbiased * v for v in (xx - ux * ux, yy - uy * uy, xy - ux * uy))
-    scores = (2 * ux * uy + C1) * (2 * vxy + C2) / ((ux * ux + uy * uy + C1) * (vx + vy + C2))
-    return (scores.mean(0) * weights).sum() / weights.sum()
+    return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
 
 
 def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Tensor:

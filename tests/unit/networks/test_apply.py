@@ -22,8 +22,7 @@ from gsmerge.networks.apply import find_neighbors, run_encoder, run_heads
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.match import MatchOptions, match
-from gsmerge.stages.merge import merge, take
-from gsmerge.stages.refine import refine
+from gsmerge.stages.merge import merge, refine, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
 
 from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
-from gsmerge.encoded.file import FORMAT
+from gsmerge.encoded.gsm_file import ENCODED
 from gsmerge.errors import SceneError
 
 
@@ -132,7 +132,7 @@ def test_what_is_not_known_is_not_looked_at(path: Path, encoded: Encoded) -> Non
     tensors["features.moods"], tensors["state.views"] = torch.full((7,), float("nan")), torch.zeros(3)
     told |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # older versions wrote a precision
     told["settings"]["mood"] = "better"
-    save_file(tensors, path, {FORMAT: json.dumps(told), "mood": "best"})
+    save_file(tensors, path, {ENCODED: json.dumps(told), "mood": "best"})
     assert scenes.identical(decode_scene(load_encoded(path)), decode_scene(encoded))
 
 
