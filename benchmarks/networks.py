@@ -36,7 +36,7 @@ STAGES = ("encode", "match", "refine", "decode")  # that networks take part in
 
 @dataclass(frozen=True)
 class Condition:
-    """A way to run; both with and without networks unless ``learned`` alone is wanted."""
+    """A way to run; both with and without networks unless ``learned`` says otherwise."""
 
     name: str
     settings: dict[str, Any]
@@ -169,9 +169,9 @@ def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse
         gain = paired_difference(pick(after, "psnr"), pick(before, "psnr"))
         worst = min(after[s]["psnr"] - before[s]["psnr"] for s in after)
         lpips = [run["lpips_vgg"] - before[s]["lpips_vgg"] for s, run in after.items() if "lpips_vgg" in run]
-        told = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
+        lpips_gain = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
         first = summary(before) if False in condition.learned else "(whole, no fit) " + summary(before)
-        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {told} |")
+        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {lpips_gain} |")
     return "\n".join(rows)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.measure.compare import break_even
 from gsmerge.report import human_bytes
-from gsmerge.research.charts.figures import make_verdicts
+from gsmerge.research.charts.figures import make_verdict_tables
 from gsmerge.research.charts.record import INPUT, RunRecord
 from gsmerge.research.charts.statistics import mean_interval
 
@@ -52,8 +52,8 @@ def _table(head: Row, rows: Sequence[Row]) -> str:
 
 def _section(title: str, parts: str, words: str, table: str, *figures: str) -> str:
     """A section with the command that makes it, its table and its charts."""
-    shown = [f"![{name}](results/{name}.png)" for name in figures]
-    return "\n\n".join(filter(None, [f"## {title}", f"Made by `{COMMAND} --only {parts}`. {words}", table, *shown]))
+    pictures = [f"![{name}](results/{name}.png)" for name in figures]
+    return "\n\n".join(filter(None, [f"## {title}", f"Made by `{COMMAND} --only {parts}`. {words}", table, *pictures]))
 
 
 def _mean(records: Sequence[RunRecord], name: str, digits: int = 2) -> str:
@@ -65,8 +65,8 @@ def _interval(records: Sequence[RunRecord], name: str) -> str:
     values = [v for r in records if (v := getattr(r, name)) is not None]
     if len(values) < 2:
         return "-"
-    found = mean_interval(values)
-    return f"{found.mean:.2f} ± {found.high - found.mean:.2f}"
+    interval = mean_interval(values)
+    return f"{interval.mean:.2f} ± {interval.high - interval.mean:.2f}"
 
 
 def _share(records: Sequence[RunRecord]) -> str:
@@ -82,25 +82,25 @@ QUALITY = ("PSNR", "SSIM", "LPIPS")
 
 
 def _words(record: RunRecord) -> str:
-    """A run's method and settings, for people."""
-    told = [f"{name} {value}" for name, value in record.settings.items() if name != "budget"]
+    """A run's method and settings in words."""
+    settings = [f"{name} {value}" for name, value in record.settings.items() if name != "budget"]
     name = "the input" if record.method == INPUT else record.method
-    return ", ".join([name, *told])
+    return ", ".join([name, *settings])
 
 
 def _grouped(
     records: Sequence[RunRecord], key: Callable[[RunRecord], tuple[object, ...]]
 ) -> dict[tuple[object, ...], list[RunRecord]]:
-    """Records by key, those that lack a scene that others have left out; in the order they came."""
-    found: dict[tuple[object, ...], list[RunRecord]] = {}
+    """Records by key in their order, without keys that lack a scene that others have."""
+    groups: dict[tuple[object, ...], list[RunRecord]] = {}
     for record in records:
-        found.setdefault(key(record), []).append(record)
-    most = max((len({r.scene for r in some}) for some in found.values()), default=0)
-    return {k: some for k, some in found.items() if len({r.scene for r in some}) == most}
+        groups.setdefault(key(record), []).append(record)
+    most = max((len({r.scene for r in some}) for some in groups.values()), default=0)
+    return {k: some for k, some in groups.items() if len({r.scene for r in some}) == most}
 
 
 def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
-    """Ours and rivals at several sizes."""
+    """Ours and baselines at several sizes."""
     records = parts.get("sizes", ())
     groups = _grouped(records, lambda r: (r.method != INPUT, r.settings.get("budget", ""), r.method, _words(r)))
     if not groups:
@@ -117,12 +117,12 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     head = ("method", "kept", "PSNR (dB)", *QUALITY[1:], "seconds", "ms a frame")
     figures = ("quality-seconds", "quality-ratio", "stages", "break-even")
     words = "`unmerged-fit` is the input after the same fit with fast effort, `paper` the paper's moment matching."
-    return [_section("Ours and rivals", "sizes", words, _table(head, rows), *figures)]
+    return [_section("Ours and baselines", "sizes", words, _table(head, rows), *figures)]
 
 
 def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
-    """Whether a rival's point lies above ours at equal cost."""
-    tables = make_verdicts(list(parts.get("sizes", ())))
+    """Whether a baseline's point lies above ours at equal cost."""
+    tables = make_verdict_tables(list(parts.get("sizes", ())))
     out = []
     for table in tables:
         rows = []
@@ -130,16 +130,18 @@ def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
             d = table.decimals
             ours = "-" if verdict.ours is None else f"{verdict.ours:.{d}f}"
             ahead = "-" if verdict.ahead is None else f"{verdict.ahead.mean:+.{d}f}"
-            rows.append((f"{verdict.rival}, {label}", f"{verdict.quality:.{d}f}", ours, ahead, verdict.words))
+            rows.append((f"{verdict.baseline}, {label}", f"{verdict.quality:.{d}f}", ours, ahead, verdict.words))
         above = [row[0] for row in rows if row[3] != "-" and float(row[3]) < 0]
         cheaper = sum(row[2] == "-" for row in rows)
-        told = f"Of {len(rows) - cheaper} points none lies above ours on the mean."
+        summary = f"Of {len(rows) - cheaper} points none lies above ours on the mean."
         if above:
-            told = f"Above ours on the mean: {'; '.join(above)}."
+            summary = f"Above ours on the mean: {'; '.join(above)}."
         if cheaper:
-            told += f" {cheaper} points are cheaper than anything of ours, so not compared."
-        out.append(f"### {table.title}\n\n{told}\n\n" + _table(("rival", "rival", "ours", "ahead", "verdict"), rows))
-    return ["## Is any rival above ours at equal cost?", *out] if out else []
+            summary += f" {cheaper} points are cheaper than anything of ours, so not compared."
+        out.append(
+            f"### {table.title}\n\n{summary}\n\n" + _table(("baseline", "its metric", "ours", "ahead", "verdict"), rows)
+        )
+    return ["## Is any baseline above ours at equal cost?", *out] if out else []
 
 
 def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -311,9 +313,9 @@ def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
     gains = sorted(_gains(parts), key=lambda row: float(row[-1]))
     lost = [row for row in gains if float(row[-1]) < 0]
     head = ("scene", "part", "views", "settings", "input (dB)", "ours")
-    shown = lost or gains[:5]
+    listed = lost or gains[:5]
     words = "are below their input" if lost else "gain least (none is below its input)"
-    text = f"## When not to use it\n\nRuns of ours that {words} on held-out views:\n\n{_table(head, shown)}"
+    text = f"## When not to use it\n\nRuns of ours that {words} on held-out views:\n\n{_table(head, listed)}"
     return "\n\n".join(filter(None, [text, _too_many(parts.get("sizes", ())), _without(parts.get("ablation", ()))]))
 
 
@@ -329,9 +331,9 @@ def _gains(parts: Mapping[str, Sequence[RunRecord]]) -> list[Row]:
             assert r.psnr_target_visible is not None
             assert before.psnr_target_visible is not None
             views = "all" if r.views_asked is None else str(r.views_asked)
-            told = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
+            settings = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
             gain = r.psnr_target_visible - before.psnr_target_visible
-            rows.append((r.scene, name, views, told, f"{before.psnr_target_visible:.2f}", f"{gain:+.2f}"))
+            rows.append((r.scene, name, views, settings, f"{before.psnr_target_visible:.2f}", f"{gain:+.2f}"))
     return rows
 
 
@@ -343,16 +345,18 @@ def _too_many(records: Sequence[RunRecord]) -> str:
     budgets = sorted({str(r.settings["budget"]) for r in runs}, key=lambda text: float(text.rstrip("%")))
     if len(budgets) < 2:
         return ""
-    found = {(r.scene, str(r.settings["budget"])): r for r in runs}
+    by_scene = {(r.scene, str(r.settings["budget"])): r for r in runs}
     rows = []
     for scene in sorted({r.scene for r in runs}):
         values = [
-            (found[scene, b].psnr_target_visible, found[scene, b].psnr_context) for b in budgets if (scene, b) in found
+            (by_scene[scene, b].psnr_target_visible, by_scene[scene, b].psnr_context)
+            for b in budgets
+            if (scene, b) in by_scene
         ]
         rows.append((scene, *(f"{target:.2f} / {context:.2f}" for target, context in values)))
     words = (
         "More Gaussians are not always better. Held-out and input views (dB) by budget: where the input views go on"
-        " rising and the held-out ones fall, the photos are learned by heart, because depth or poses do not fit them;"
+        " rising and the held-out ones fall, the fit memorises the photos, because depth or poses do not fit them;"
         " ask for fewer, or for `--k auto`."
     )
     return f"### More Gaussians than a scene bears\n\n{words}\n\n{_table(('scene', *budgets), rows)}"
