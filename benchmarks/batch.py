@@ -1,4 +1,4 @@
-"""What a batch costs beside single runs, and what it loses when it is killed again and again.
+"""Cost of a batch compared with single runs, and what it loses when it is killed again and again.
 
     python benchmarks/batch.py                                 # 200 scenes of 50 k Gaussians, 20 kills
     python benchmarks/batch.py --scenes 20 --kills 4 -- --effort fast
@@ -110,12 +110,12 @@ def killed(scenes: list[Path], out: Path, options: list[str], cost: Cost, kills:
         process.wait()
         done.append(sum(records(folder).values()))
     timed("batch", scenes[0].parent, "--out", folder, "-q", *options)
-    found, wanted, counts = hashes(folder), hashes(out / "undisturbed"), records(folder)
+    results, expected, counts = hashes(folder), hashes(out / "undisturbed"), records(folder)
     twice = [name for (name, _), count in counts.items() if count > 1]
-    lost, other = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
-    differ = sorted(name for name in found.keys() & wanted.keys() if found[name] != wanted[name])
+    lost, other = sorted(expected.keys() - results.keys()), sorted(results.keys() - expected.keys())
+    differ = sorted(name for name in results.keys() & expected.keys() if results[name] != expected[name])
     print(f"killed {kills} times, with {', '.join(map(str, done))} scenes recorded")
-    print(f"                {len(found)} of {len(wanted)} results; lost {lost}, differ {differ}")
+    print(f"                {len(results)} of {len(expected)} results; lost {lost}, differ {differ}")
     print(f"                recorded twice {twice}, left over {other}")
     return not (lost or differ or twice or other)
 

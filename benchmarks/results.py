@@ -1,4 +1,4 @@
-"""Measures what docs/results.md says, on the real scenes kept beside the repository, and writes it.
+"""Measures the figures of docs/results.md on the real scenes next to the repository, and writes it.
 
 python benchmarks/results.py                       # everything, resumable: what is done is not repeated
 python benchmarks/results.py --only sizes views    # some of the parts

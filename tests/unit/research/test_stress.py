@@ -106,13 +106,13 @@ def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: 
         load,
         CompactOptions().with_settings({"fit_steps": 30, "density": 0.1}),
         targets=Views(read.cameras, read.images, read.names),
-        progress=lambda *step: told.append(step),
+        progress=lambda *step: steps.append(step),
     )
     assert [outcome.case for outcome in found] == list(CASES)
     failed = {o.case: o.measured for o in found if o.passed is False}
     assert failed == {}
     assert [o.case for o in found if o.passed is None] == ["c2w-opengl"]
-    assert told[-1] == ("done", len(CASES), len(CASES))
+    assert steps[-1] == ("done", len(CASES), len(CASES))
 
 
 def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:

@@ -62,7 +62,7 @@ def test_what_changes_nothing_is_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "message"),
+    ("lists", "message"),
     [
         ({"k": "1,1"}, "k: expected every value once"),
         ({"k": " , "}, "k: expected at least one value"),
@@ -71,17 +71,17 @@ def test_what_changes_nothing_is_left_out() -> None:
         ({"views": "some"}, "views: expected numbers from 1"),
     ],
 )
-def test_lists_that_cannot_be(told: dict[str, str], message: str) -> None:
+def test_lists_that_cannot_be(lists: dict[str, str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        parse_grid(told)
+        parse_grid(lists)
 
 
 @pytest.mark.parametrize(
-    ("told", "message"), [({"k": "9"}, "expected"), ({"fit": "some"}, "fit: expected"), ({"budgets": "x"}, "expected")]
+    ("lists", "message"), [({"k": "9"}, "expected"), ({"fit": "some"}, "fit: expected"), ({"budgets": "x"}, "expected")]
 )
-def test_settings_that_the_library_refuses(told: dict[str, str], message: str) -> None:
+def test_settings_that_the_library_refuses(lists: dict[str, str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        make_experiments([Path("a")], parse_grid(told))
+        make_experiments([Path("a")], parse_grid(lists))
 
 
 def test_files(tmp_path: Path) -> None:
