@@ -105,7 +105,7 @@ def run(part: Part, split: str, cache: Path, out: Path) -> None:
     scenes = [str(path) for path in exports(part.style, split, cache)]
     targets = f"{shared_folder()}/scenes/{split}/{{stem}}/transforms.json"
     for call in part.calls:
-        words = ["chart", *scenes, "--targets", targets, "--out", str(out / part.name), *call, *LPIPS]
+        words = ["chart", *scenes, "--targets", targets, "--output", str(out / part.name), *call, *LPIPS]
         start = time.perf_counter()
         code = gsmerge(words)
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {part.name} {shlex.join(call)}", flush=True)
@@ -130,7 +130,7 @@ def main() -> None:
         folder = args.runs / part.name
         if not folder.is_dir():
             continue
-        gsmerge(["chart", "--draw-only", "--out", str(folder)])
+        gsmerge(["chart", "--draw-only", "--output", str(folder)])
         records[part.name] = list(read_runs(folder)[0].values())
         for figure in part.figures:
             for suffix in ("png", "svg"):

@@ -14,9 +14,8 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.cli.network_options import Precision
 from gsmerge.io import ReadHints
-from gsmerge.options import METHODS, PRECISIONS
+from gsmerge.options import METHODS
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -24,7 +23,7 @@ COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[
 def options(command: Any) -> set[str]:
     """Long names of a command's options."""
     names = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
-    return {name for name in names if name.startswith("--")} - {"--help"}
+    return {name for name in names if name.startswith("--")} - {"--help", "--help-all"}
 
 
 def readme_commands(root: Path) -> list[str]:
@@ -32,10 +31,6 @@ def readme_commands(root: Path) -> list[str]:
     blocks = re.findall(r"```bash\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
     calls = (part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&"))
     return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
-
-
-def test_precisions_are_the_library_s() -> None:
-    assert tuple(choice.value for choice in Precision) == PRECISIONS
 
 
 def test_commands_are_the_documented_ones() -> None:

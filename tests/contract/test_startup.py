@@ -8,6 +8,10 @@ import sys
 import pytest
 
 HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage", "matplotlib")
+COMMANDS = (
+    "compact", "batch", "encode", "decode", "extend", "evaluate", "inspect", "segment", "render", "preview", "report",
+    "stress", "chart", "generate", "train",
+)  # fmt: skip
 
 
 def run_python(code: str) -> str:
@@ -22,19 +26,17 @@ def loaded_after(code: str) -> set[str]:
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ["--help"],
-        ["--version"],
-        [],
-        *(
-            [name, "--help"]
-            for name in ("compact", "batch", "inspect", "segment", "render", "preview", "chart", "generate", "train")
-        ),
-    ],
+    [["--help"], ["--version"], [], ["compact", "--help-all"], *([name, "--help"] for name in COMMANDS)],
     ids=" ".join,
 )
 def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     assert loaded_after(f"from gsmerge.cli import main\nassert main({arguments!r}) == 0") == set()
+
+
+def test_a_command_loads_no_other() -> None:
+    code = "from gsmerge.cli import main\nassert main(['compact', '--help']) == 0\nimport sys\n"
+    modules = run_python(f"{code}print(*(m for m in sys.modules if m.startswith('gsmerge.cli.')))").splitlines()[-1]
+    assert set(modules.split()) == {f"gsmerge.cli.{name}" for name in ("app", "compact", "console", "options", "paths")}
 
 
 def test_import_loads_nothing_heavy() -> None:
@@ -54,5 +56,8 @@ def test_missing_file_is_told_without_torch_loading_twice() -> None:
 def test_submodule_imports_do_not_hide_functions() -> None:
     """The modules render and inspect share their names with the functions that they hold."""
     print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"
-    assert run_python(f"import gsmerge.render, gsmerge.measure.inspect\n{print_kinds}").split() == ["function", "function"]
+    assert run_python(f"import gsmerge.render, gsmerge.measure.inspect\n{print_kinds}").split() == [
+        "function",
+        "function",
+    ]
     assert run_python(f"import gsmerge.pipeline\n{print_kinds}").split() == ["function", "function"]

@@ -29,7 +29,7 @@ def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
-    return run("batch", rooms, "--out", out, *FAST, *options)
+    return run("batch", rooms, "--output", out, *FAST, *options)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def first(rooms: Path) -> tuple[int, Path]:
     from gsmerge.cli import main
 
     out = rooms.parent / "out"
-    return main(["batch", str(rooms), "--out", str(out), *FAST, "-q", "--jobs", "2"]), out
+    return main(["batch", str(rooms), "--output", str(out), *FAST, "-q", "--jobs", "2"]), out
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
     for name, path in cameras.items():
         shutil.copytree(rooms / name, tmp_path / "in" / name)
         (tmp_path / "in" / name / "transforms.json").rename(path)
-    told = ("--cameras", f"{tmp_path}/{{stem}}.json", "--output", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
+    told = ("--cameras", f"{tmp_path}/{{stem}}.json", "--name", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
     outcome = batch(run, tmp_path / "in", tmp_path / "out", *told)
     assert outcome.code == 0, outcome.err
     assert sorted(results(tmp_path / "out")) == ["in/0-room0.k1.ply", "in/1-room1.k1.ply"]
@@ -124,7 +124,7 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
 
 def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
     told = ("--effort", "draft", "--target-psnr", 90, "--density", 0.01, "--jobs", 1)
-    outcome = run("batch", rooms / "room0", "--out", tmp_path, *told)
+    outcome = run("batch", rooms / "room0", "--output", tmp_path, *told)
     assert outcome.code == 4
     assert "1 of 1 results miss the target" in outcome.err
     assert (tmp_path / "room0.ply").exists()
@@ -140,10 +140,10 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
         (("--jobs", 0), 2, "auto"),
         (("--max-memory", "lots"), 2, "--max-memory: expected a size such as 8GB"),
         (("--retries", -1), 2, "retries"),
-        (("--output", "{name}.ply"), 2, "{stem}"),
-        (("--output", "{stem}.txt"), 2, "ends in .compressed.ply, .ply, .spz, .splat"),
-        (("--output", "{stem}.spz", "--max-bytes", "1MB"), 2, "max bytes: expected an output as .ply"),
-        (("--output", "same.ply"), 2, "a file of its own for each scene"),
+        (("--name", "{name}.ply"), 2, "{stem}"),
+        (("--name", "{stem}.txt"), 2, "ends in .compressed.ply, .ply, .spz, .splat"),
+        (("--name", "{stem}.spz", "--max-bytes", "1MB"), 2, "max bytes: expected an output as .ply"),
+        (("--name", "same.ply"), 2, "a file of its own for each scene"),
         (("--address", "auto"), 2, "address: expected engine ray"),
         (("--exporter", "nobody"), 2, "nobody"),
     ],
@@ -151,7 +151,7 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
 def test_wrong_usage_is_told_at_once(
     told: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
 ) -> None:
-    outcome = run("batch", rooms, "--out", tmp_path / "out", *told)
+    outcome = run("batch", rooms, "--output", tmp_path / "out", *told)
     assert outcome.code == code
     assert said in outcome.err
     assert outcome.err.count("\n") == 1
@@ -159,11 +159,11 @@ def test_wrong_usage_is_told_at_once(
 
 
 def test_places_that_make_no_sense_are_told_at_once(rooms: Path, tmp_path: Path, run: Run) -> None:
-    assert run("batch", tmp_path / "gone", "--out", tmp_path / "out").code == 3
-    assert run("batch", rooms, "--out", rooms).code == 2
+    assert run("batch", tmp_path / "gone", "--output", tmp_path / "out").code == 3
+    assert run("batch", rooms, "--output", rooms).code == 2
     (tmp_path / "file").touch()
-    assert run("batch", rooms, "--out", tmp_path / "file").code == 2
-    outcome = run("batch", rooms, "--out", tmp_path / "file" / "out")
+    assert run("batch", rooms, "--output", tmp_path / "file").code == 2
+    outcome = run("batch", rooms, "--output", tmp_path / "file" / "out")
     assert outcome.code == 3
     assert "cannot be written" in outcome.err
     assert outcome.err.count("gsmerge: error") == 1

@@ -18,7 +18,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.networks import Networks
 
 FORMAT = "gsmerge-training"
-REMEDY = "choose another --out, or remove it to begin anew"
+REMEDY = "choose another --output, or remove it to begin anew"
 Row = dict[str, float]
 
 

@@ -1,0 +1,47 @@
+"""What ``--dry-run`` of compact and encode prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsmerge.cli.console import print_document
+from gsmerge.cli.options import Args, usage_errors
+
+if TYPE_CHECKING:
+    from gsmerge.io import ReadHints, SceneFiles
+    from gsmerge.options import CompactOptions
+
+
+def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
+    """Print what would be done, as lines or JSON."""
+    from gsmerge.baselines import check_scene, find_baseline, unused_notes
+    from gsmerge.compact_file import read_input
+    from gsmerge.report import plan_document, plan_lines
+    from gsmerge.runtime.threads import available_threads
+    from gsmerge.stages.group import asked_per_view, limit_of, usual_count
+
+    given = read_input(files, settings.segment, opacity=args.opacity, hints=hints)
+    scene, cameras = given.scene, given.scene.cameras
+    baseline, unused = find_baseline(settings.method), []
+    with usage_errors():
+        wanted = limit_of(scene, settings)
+    if baseline is not None:
+        check_scene(baseline, scene)
+        unused = unused_notes(baseline, settings)
+    document = plan_document(
+        {name: path and str(path) for name, path in vars(files).items()},
+        (len(cameras), cameras.height, cameras.width),
+        settings.resolved(photos=scene.images is not None),
+        output_path=out,
+        per_view=asked_per_view(scene, settings) if len(scene) else 0,
+        photos=scene.images is not None,
+        threads=settings.threads or available_threads(),
+        fit_steps=settings.fit.steps,
+        usual=usual_count(scene, settings),
+        wanted=wanted,
+        notes=[*given.notes, *unused],
+        count=scene.num_gaussians,
+        num_rest=3 * scene.gaussians.shN.shape[1],
+    )
+    print_document(document, plan_lines(document), as_json=args.json)
