@@ -44,7 +44,7 @@ def choices(parameter: Parameter) -> tuple[str, ...]:
 
 def expected(make: Callable[..., Any], *arguments: Any, **settings: Any) -> set[str]:
     """The values that the library's error names as possible."""
-    with pytest.raises(ValueError, match="expected .*, got") as error:
+    with pytest.raises(ValueError, match=r"expected .*, got") as error:
         make(*arguments, **settings)
     listed = re.search(r"expected (?:one of )?(.*?), (?:or \w+, )?got", str(error.value))
     assert listed is not None
