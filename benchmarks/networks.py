@@ -64,7 +64,6 @@ ABLATION = (
     Condition("matching by the K = 1 head", {**ONE, **PLAIN, "geometry": "decoded"}, learned=(True,)),
     Condition("larger superpixels", {"budget": "2%", **PLAIN}),
     Condition("smaller superpixels", {"budget": "8.7%", **PLAIN}),
-    Condition("bfloat16", {**ONE, **PLAIN, "precision": "bfloat16"}, learned=(True,)),
     Condition("the photos choose the merge", {**ONE, "fit": "none", "robust": True}),
 )
 PARTS = {"gain": GAIN, "children": MANY, "ablation": ABLATION}

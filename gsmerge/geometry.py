@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.types import Cameras
+from gsmerge.types import SH_C0, Cameras
+
+Colors = TypeVar("Colors", np.ndarray, Tensor)
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 
@@ -88,3 +92,13 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
         for bit in range(MORTON_BITS):
             codes |= (column >> bit & 1) << (3 * bit + axis)
     return codes
+
+
+def sh0_to_rgb(sh0: Colors) -> Colors:
+    """Base colours (sRGB, 0 to 1 where they can be shown) of spherical harmonics of degree 0, same shape and type."""
+    return 0.5 + SH_C0 * sh0
+
+
+def rgb_to_sh0(rgb: Colors) -> Colors:
+    """The inverse of :func:`sh0_to_rgb`."""
+    return (rgb - 0.5) / SH_C0

@@ -6,15 +6,60 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
 from gsmerge.runtime.estimate import COST_FIXED, fit_of, is_robust, memory_bytes, memory_problem, work_seconds
 from gsmerge.runtime.memory import machine_memory
+from gsmerge.types import Gaussians
 
 SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class CompactReport:
+    """What a run did.
+
+    Args:
+        num_input: Gaussians in the scene.
+        num_output: Gaussians in the result.
+        seconds: Wall time of each stage.
+        psnr_before: Mean PSNR (dB) of the input views, of many some, rendered from the input; None without photos.
+        psnr_after: The same from the result.
+        choices: What the stages decided (count, curve, merge, scores, clusters, fit).
+        notes: Warnings about the input and what was adapted, one sentence each.
+        options: All settings by flat name.
+        peak_memory_bytes: Largest resident memory of the process so far.
+        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
+    """
+
+    num_input: int
+    num_output: int
+    seconds: dict[str, float]
+    psnr_before: float | None
+    psnr_after: float | None
+    choices: dict[str, Any]
+    notes: list[str]
+    options: dict[str, Any]
+    peak_memory_bytes: int
+    unmet: str | None = None
+
+
+@dataclass(frozen=True)
+class CompactResult:
+    """The compact Gaussians, in the scene's own world frame, and the report.
+
+    Args:
+        gaussians: The Gaussians.
+        report: What was done.
+        coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+    """
+
+    gaussians: Gaussians
+    report: CompactReport
+    coarser: tuple[CompactResult, ...] = ()
 
 
 def file_sha256(path: Path) -> str:

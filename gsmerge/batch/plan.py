@@ -79,8 +79,7 @@ def free_memory() -> int | None:
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, shape: Shape) -> float:
     """Wall time of scenes, within a factor of about two."""
-    settings, steps = options.settings.to_dict(), options.settings.fit.steps
-    settings["checkpoint"] = options.settings.networks(photos=True)
+    settings, steps = options.settings.resolved(photos=True), options.settings.fit.steps
     total = 0.0
     for job in jobs:
         views = max(1, _num_views(job))

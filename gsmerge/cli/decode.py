@@ -47,8 +47,8 @@ def _run(args: opt.Args, out: Path, settings: CompactOptions, start: float) -> d
     """Read, decode and write; returns the report."""
     from gsmerge.encoded.decode import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
+    from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
-    from gsmerge.online.fitted import as_decoded, check_fit, decode_stored, num_photos, usual_fit
     from gsmerge.report import document_head, seconds_document
 
     imported, path, count = perf_counter(), args.encoded, {"k": args.k, "budget": args.budget}
@@ -63,10 +63,10 @@ def _run(args: opt.Args, out: Path, settings: CompactOptions, start: float) -> d
         **count,
     }  # fmt: skip
     notes = [lost] if lost else []
-    fit = settings.fit if args.fit is not None or num_photos(stored) else usual_fit(stored)
+    fit = settings.fit if args.fit is not None or num_photos(stored) else default_fit(stored)
     check_fit(stored, fit)
     if args.dry_run:
-        encoded = as_decoded(stored)
+        encoded = decodable(stored)
         plan = plan_decode(encoded, **count)
         most = int(plan.counts.sum()) + encoded.num_kept
         output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}

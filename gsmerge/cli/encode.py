@@ -44,7 +44,7 @@ def _run(
     """Read, encode and write; returns the report."""
     from gsmerge.compact_file import read_input
     from gsmerge.encoded.encode import encode_scene
-    from gsmerge.encoded.file import save_encoded
+    from gsmerge.encoded.gsm_file import save_encoded
     from gsmerge.io import atomic_output
     from gsmerge.report import document_head, file_sha256, seconds_document
 
@@ -61,7 +61,7 @@ def _run(
     seconds = {"import": imported - start, "read": read - imported, "encode": done - read}
     seconds["write"] = perf_counter() - done
     own, size, used = encoded.settings, out.stat().st_size, encoded.about["options"]
-    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.num_most, "max_k": own.most}
+    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": own.max_k}
     return {
         **document_head(),
         "input": {"path": str(files.ply), "num_gaussians": own.num_input, **hashed, **given.recognised},

@@ -41,7 +41,7 @@ def extend(args: opt.Args) -> None:
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
-    from gsmerge.online.files import extend_file
+    from gsmerge.online.file import extend_file
     from gsmerge.online.options import OnlineOptions
     from gsmerge.options import CompactOptions
 

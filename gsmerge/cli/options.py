@@ -216,7 +216,7 @@ BUDGETS = "budget max_bytes preset"
 SEARCHES = "max_drop target_psnr levels"
 MERGE = "segmentation robust match geometry unseen"
 FIT = "fit effort device fit_steps time_budget"
-NETWORKS = "checkpoint require_checkpoint precision"
+NETWORKS = "checkpoint require_checkpoint"
 RUN = "seed threads"
 
 _TABLE = (
@@ -279,7 +279,6 @@ _TABLE = (
                "the shipped ones where they improve the result.", shown="auto", rare=True, metavar="FILE|NAME"),
         option("require_checkpoint", bool, "A checkpoint that cannot be used is an error instead of a note.",
                "--require-checkpoint", rare=True),
-        option("precision", ("float32", "bfloat16"), "Arithmetic of the networks.", shown="float32", rare=True),
     ),
     panel(
         FITTING,

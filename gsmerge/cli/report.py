@@ -55,7 +55,9 @@ def report(args: opt.Args) -> None:
     from gsmerge.measure.before_after import comparison_document, comparison_markdown
     from gsmerge.measure.compare import compare
     from gsmerge.measure.evaluate import INPUT, EvaluateOptions
-    from gsmerge.stages.unaligned import with_views
+    from gsmerge.runtime.run_log import RunLog
+    from gsmerge.stages.place_cameras import add_views
+    from gsmerge.types import UnalignedScene
 
     files, after, outputs = args.files(args.before), args.after, args.output or []
     for path in outputs:
@@ -67,9 +69,11 @@ def report(args: opt.Args) -> None:
     nets, missing = lpips_networks(args.lpips)
     load = args.load(files)
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
-    scene, placed = with_views(scene)
+    log = RunLog()
+    if isinstance(scene, UnalignedScene):
+        scene = add_views(scene, log)
     plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
-    notes = [*load.notes, *adapted, *placed, *missing]
+    notes = [*load.notes, *adapted, *log.notes, *missing]
     say_notes(notes, quiet=args.silent)
     storage = {INPUT: _storage(load.ply), **{name: _storage(ply.info) for name, ply in plys.items()}}
     gaussians = {name: ply.gaussians for name, ply in plys.items()}

@@ -16,8 +16,9 @@ from gsmerge.measure.lpips import lpips, min_size
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.render import render
 from gsmerge.render.metrics import psnr, ssim
+from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.prepare import NEAR, scene_frame
+from gsmerge.stages.prepare import scene_frame
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import pick_views
 

@@ -33,7 +33,7 @@ from gsmerge.measure.extents import Coverage, Extents, coverage, extents
 from gsmerge.options import CompactOptions
 from gsmerge.report import plan_document
 from gsmerge.runtime.threads import available_threads, use_threads
-from gsmerge.stages.group import usual_count
+from gsmerge.stages.group import default_count
 from gsmerge.types import PixelScene, UnalignedScene
 
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # below one step of an 8-bit image; where optical depth is capped
@@ -262,7 +262,7 @@ def estimate(scene: PixelScene | UnalignedScene) -> dict[str, float]:
         photos=scene.images is not None,
         threads=available_threads(),
         fit_steps=options.fit.steps,
-        usual=usual_count(scene, options),
+        usual=default_count(scene, options),
         count=scene.num_gaussians,
         num_rest=3 * scene.gaussians.shN.shape[1],
     )

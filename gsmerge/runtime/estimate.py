@@ -8,7 +8,7 @@ from typing import Any
 # Processor seconds per million pixels of all views together (or Gaussians, which is the same number), kernels compiled.
 # Measured on 12 and on 84 views of 480 pixels; they only have to be right within a factor of two.
 COST_FIXED = 1.5  # imports
-MOST_JUDGED = 24  # views that whole scenes are scored by
+MAX_SCORED_VIEWS = 24  # views that whole scenes are scored by
 COST_READ = 0.7
 COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
 COST_MERGE = 0.5
@@ -52,7 +52,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
 
 def score_cost(views: float) -> float:
     """Processor seconds per million pixels that scoring input and result takes: every Gaussian in every scored view."""
-    return COST_SCORE * min(views, MOST_JUDGED)
+    return COST_SCORE * min(views, MAX_SCORED_VIEWS)
 
 
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
@@ -87,12 +87,6 @@ def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
     return own.get(options["method"], "none") if photos else "none"
 
 
-def photos_choose(robust: bool | None, fit: str, effort: str) -> bool:
-    """Whether photos choose the merge where there are any: as asked, or unless a full fit follows or it is a draft."""
-    return fit != "full" and effort != "draft" if robust is None else robust
-
-
 def is_robust(options: Mapping[str, Any], *, photos: bool) -> bool:
     """Whether merges are chosen among by the photos."""
-    used = photos and options["method"] == "gsmerge"
-    return used and photos_choose(options["robust"], options["fit"], options["effort"])
+    return photos and options["method"] == "gsmerge" and bool(options["robust"])

@@ -102,7 +102,7 @@ def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device", "checkpoint", "precision", "geometry"}
+    known |= {"levels", "device", "checkpoint", "geometry"}
     assert set(told) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None

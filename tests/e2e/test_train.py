@@ -43,9 +43,9 @@ def test_train_then_compact(scene_copy: Path, run: Run) -> None:
     document = json.loads(run(*call, "--validation", scene_copy, "--json").out)
     assert (document["step"], document["resumed"], document["notes"]) == (4, 4, [])
     small = scene_copy / "small.ply"
-    learned = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json")
-    assert learned.code == 0, learned.err
-    report = json.loads(learned.out)
+    networks = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json")
+    assert networks.code == 0, networks.err
+    report = json.loads(networks.out)
     assert report["choices"]["networks"]["training"]["step"] in (2, 4)
     assert report["options"]["checkpoint"] == str(out / "best.safetensors")
     assert "refine" in report["seconds"]

@@ -33,7 +33,7 @@ def compacted(scene: UnalignedScene, **settings: Any) -> CompactResult:
 SETTINGS = [
     {}, {"k": 2}, {"fit": "none"}, {"fit": "full", "fit_steps": 10}, {"budget": 150}, {"budget": 150, "fit": "full"},
     {"k": "auto"}, {"robust": False}, {"match": "none"}, {"match": "aabb"}, {"segmentation": "slic"},
-    {"max_bytes": "12KB"}, {"unseen": "keep"}, {"rule": "paper", "robust": False}, {"min_contribution": 0.1},
+    {"max_bytes": "12KB"}, {"unseen": "keep"}, {"rule": "paper", "robust": False}, {"min_owner_weight": 0.1},
 ]  # fmt: skip
 
 

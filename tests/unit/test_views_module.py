@@ -10,7 +10,7 @@ import scenes
 import torch
 
 from gsmerge.types import PixelScene, UnalignedScene
-from gsmerge.views import MOST_JUDGED, distinct_views, even_views, judged_views, midpoint_views, subset
+from gsmerge.views import MAX_SCORED_VIEWS, distinct_views, even_views, midpoint_views, scored_views, subset
 
 
 @pytest.mark.parametrize(
@@ -36,9 +36,9 @@ def test_even_views_are_distinct_and_keep_the_ends() -> None:
 
 
 def test_few_views_are_all_judged_by_and_many_by_some() -> None:
-    assert [judged_views(count) for count in (1, 2, 24)] == [[0], [0, 1], list(range(24))]
-    assert len(judged_views(84)) == MOST_JUDGED
-    assert (judged_views(84)[0], judged_views(84)[-1]) == (0, 83)
+    assert [scored_views(count) for count in (1, 2, 24)] == [[0], [0, 1], list(range(24))]
+    assert len(scored_views(84)) == MAX_SCORED_VIEWS
+    assert (scored_views(84)[0], scored_views(84)[-1]) == (0, 83)
 
 
 def test_targets_lie_midway() -> None:

@@ -218,7 +218,7 @@ def make_experiments(scenes: Sequence[Path], grid: Grid) -> tuple[list[Experimen
 
 
 def _check(method: str, settings: Mapping[str, Any]) -> None:
-    from gsmerge.baselines.registry import check_program, find_baseline
+    from gsmerge.baselines import check_program, find_baseline
     from gsmerge.options import CompactOptions
 
     try:

@@ -24,7 +24,6 @@ from gsmerge.research.generate.shapes import (
 )
 from gsmerge.research.generate.stage import Palette
 
-PAINTED = ("plain", "plaster", "wood", "cloth", "gradient", "marble")
 Things = list[Shape]
 
 

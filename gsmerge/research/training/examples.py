@@ -27,20 +27,20 @@ from gsmerge.io import SceneLoad, load_scene, read_targets
 from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.evaluate import Views
 from gsmerge.moments import Members
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, SIZE, TURN, sizes_of
-from gsmerge.networks.tokens import describe
+from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes
+from gsmerge.networks.tokens import compute_group_features
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import Photos, scene_pictures
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.subjects import Subject, covered, make_subject, reduced_masks, view_subsets
 from gsmerge.stages.decode import divide
 from gsmerge.stages.encode import encode
 from gsmerge.stages.fit.full import Masks, fit_full
 from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.stage import shown
-from gsmerge.stages.group import group_scene, scene_canvas
+from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
+from gsmerge.stages.segment import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
 
 Told = Callable[[int, int], None]
@@ -239,13 +239,13 @@ def _worked_out(
     settings = {"density": density, "match": options.match, "fit": "none", "robust": False}
     chosen = CompactOptions().with_settings({**settings, "seed": options.seed})
     scene, members = subject.scene, subject.members
-    groups = group_scene(scene_canvas(scene, chosen), chosen).groups
+    groups = segment(scene_pictures(scene), chosen.segment)
     features = encode(scene, members, groups, chosen.encode)
     matches = match(features, chosen.match)
     merged = merge(features, matches)
     columns: dict[str, Any] = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
     columns |= {"clusters": matches.clusters.numpy(), "centres": merged.means.numpy()}
-    frames = describe(merged, members, scene.cameras).frames
+    frames = compute_group_features(merged, members, scene.cameras).frames
     masks = covered(subject)
     columns["masks"] = reduced_masks(masks, subject.photos(options.photo_scale))
     teacher = _teacher(subject, masks, name)
@@ -281,7 +281,7 @@ def _fitted(
     """Gaussians after a full fit without growth, and which of those given they are ``[n]``: what is not seen is not."""
     fit, photos = FitOptions(fit_steps=options.fit_steps), teacher.photos
     mask = start.opacities >= least
-    mask[mask.clone()] = shown(start[mask], photos[1], fit.prune)
+    mask[mask.clone()] = visible_mask(start[mask], photos[1], fit.min_contribution)
     fitted, report = fit_full(
         start[mask], photos, fit, seed=options.seed, progress=progress, masks=teacher.masks
     )  # fmt: skip
@@ -293,12 +293,12 @@ def _fitted(
 
 def differences(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
     """``[n,13]`` corrections in frames ``[n,3,3]`` that make ``end`` of ``start``."""
-    back, sizes = frames.transpose(1, 2), sizes_of(start.scales).clamp_min(1e-12)
+    back, sizes = frames.transpose(1, 2), gaussian_sizes(start.scales).clamp_min(1e-12)
     found = torch.zeros(len(start), RESIDUAL)
     found[:, MEAN] = (back @ (end.means - start.means)[:, :, None])[:, :, 0] / sizes[:, None]
     found[:, SIZE] = torch.log(end.scales.clamp_min(1e-12) / start.scales.clamp_min(1e-12))
     turn = quat_to_rotmat(end.quats) @ quat_to_rotmat(start.quats).transpose(1, 2)
-    found[:, TURN] = (back @ _vectors(turn)[:, :, None])[:, :, 0]
+    found[:, ROTATION] = (back @ _vectors(turn)[:, :, None])[:, :, 0]
     ends = [torch.logit(g.opacities.clamp(0.004, 0.999)) for g in (start, end)]  # as the fit has them
     found[:, LOGIT] = ends[1] - ends[0]
     found[:, COLOR] = SH_C0 * (end.sh0 - start.sh0)[:, 0]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.networks import Networks
-from gsmerge.networks.residuals import RESIDUAL, TURN, limits
+from gsmerge.networks.residuals import RESIDUAL, ROTATION, residual_limits
 from gsmerge.research.training.examples import Example
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.photometric import draw_window, photometric_loss
@@ -45,7 +45,7 @@ def _scaled(
 ) -> tuple[Tensor, Tensor]:
     """:func:`compared` of corrections ``[n,13]`` that are known."""
     targets = crop.example.levels[crop.k].targets[crop.children[crop.judged]]
-    most = 2 * limits(options.network.bounds)  # of all stages together
+    most = 2 * residual_limits(options.network.bounds)  # of all stages together
     found = corrections[crop.judged]
     return found / scales[crop.k], (targets.clamp(-most, most) / scales[crop.k]).clamp(-MANY, MANY)
 
@@ -53,7 +53,7 @@ def _scaled(
 def correction_loss(found: Tensor, wanted: Tensor, options: TrainOptions) -> Tensor:
     """Mean smooth L1 of corrections ``[j,13]``; 0 of none."""
     weights = torch.ones(RESIDUAL)
-    weights[TURN] = options.turn_weight
+    weights[ROTATION] = options.turn_weight
     losses = torch.nn.functional.smooth_l1_loss(found, wanted, reduction="none") * weights
     return losses.sum() / (weights.sum() * max(1, len(wanted)))
 

@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.tables import read_table
 from gsmerge.networks import NetworkOptions
 from gsmerge.networks.modules import SLOTS
-from gsmerge.render.metrics import WINDOW
+from gsmerge.stages.fit.loss import LOSS_WINDOW
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class TrainOptions:
         for name in ("warmup", "seed"):
             self._expect(name, getattr(self, name), 0, 10**9, whole=True)
         self._expect("inner", self.inner, 1e-6, 1)
-        self._expect("window", self.window, WINDOW, 10**9, whole=True)
+        self._expect("window", self.window, LOSS_WINDOW, 10**9, whole=True)
         for name in ("average", "photo_start", "novel"):
             self._expect(name, getattr(self, name), 0, 1)
         for name in ("rate", "least_rate", "clip"):

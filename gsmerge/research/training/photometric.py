@@ -9,17 +9,15 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from gsmerge.measure.lpips import lpips_loss
 from gsmerge.networks import Networks
 from gsmerge.render.autograd import render_differentiable
-from gsmerge.render.metrics import C1, C2
-from gsmerge.render.metrics import WINDOW as SIDE
+from gsmerge.render.photos import NEAR
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import foreseen
 from gsmerge.research.training.windows import Window
-from gsmerge.stages.prepare import NEAR
+from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.types import Gaussians
 
 BEST = 100.0  # dB: PSNR of windows without an error
@@ -40,18 +38,11 @@ def color_difference(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> T
     return (difference * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)
 
 
-def structural_similarity(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """:func:`gsmerge.render.metrics.ssim` of images ``[h,w,3]``, differentiable; 1 where no window fits."""
-    border, unbiased = SIDE // 2, SIDE**2 / (SIDE**2 - 1)
-    weights = mask[border:-border, border:-border].to(image)
-    if min(image.shape[:2]) < SIDE or not bool(weights.any()):
+def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
+    """Mean :func:`gsmerge.stages.fit.loss.loss_ssim` of images ``[h,w,3]`` where ``mask [h,w]`` is; 1 where nowhere."""
+    if not bool(mask.any()):
         return torch.ones(())
-    x, y = image.permute(2, 0, 1), photo.permute(2, 0, 1)
-    means = avg_pool2d(torch.cat([x, y, x * x, y * y, x * y])[None], SIDE, 1)[0]
-    ux, uy, xx, yy, xy = means.chunk(5)
-    vx, vy, vxy = (unbiased * v for v in (xx - ux * ux, yy - uy * uy, xy - ux * uy))
-    scores = (2 * ux * uy + C1) * (2 * vxy + C2) / ((ux * ux + uy * uy + C1) * (vx + vy + C2))
-    return (scores.mean(0) * weights).sum() / weights.sum()
+    return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
 
 
 def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Tensor:
@@ -59,7 +50,7 @@ def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Te
     example = window.crop.example
     photo, mask = window.part(example.photos.images), window.part(example.masks)
     color = color_difference(image, photo, mask, options.photo_loss)
-    similar = structural_similarity(image, photo, mask) if options.ssim_weight else torch.ones(())
+    similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
     loss = options.photo_weight * color + options.ssim_weight * (1 - similar)
     return loss + options.lpips_weight * lpips_loss(image, photo, mask) if options.lpips_weight else loss
 

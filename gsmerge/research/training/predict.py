@@ -8,19 +8,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks import Learned, Networks
+from gsmerge.networks import NetworkContext, Networks
 from gsmerge.networks.apply import (
-    encoder_outputs,
-    head_residuals,
-    head_starts,
-    merger_outputs,
-    nearest,
-    refiner_outputs,
-    with_corrections,
-    with_encoding,
+    apply_corrections,
+    apply_encoding,
+    find_neighbors,
+    prepare_children,
+    run_encoder,
+    run_heads,
+    run_merger,
+    run_refiner,
 )
-from gsmerge.networks.residuals import MEAN, move_gaussians, rotated
-from gsmerge.networks.tokens import Described
+from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
+from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.examples import Example, differences
 from gsmerge.stages.merge import cluster_runs, pool_runs, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
@@ -92,23 +92,23 @@ def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
     The Gaussians of K = 1 are those that the stages make, one after the other; their gradient is that of the sum.
     """
     example = crop.example
-    learned = Learned(networks, example.members, example.cameras, seed)
+    context = NetworkContext(networks, example.members, example.cameras, seed)
     owner = owners(example.matches)
     parts = take(example.features, torch.nonzero(torch.isin(owner, crop.rows))[:, 0])
     local = torch.searchsorted(crop.rows, owner[torch.isin(owner, crop.rows)])
-    described = learned.describe(parts)
-    parts, shifts = with_encoding(parts, described, encoder_outputs(parts, described, learned), networks)
-    merged, corrections = _merged(parts, described, shifts, Matches(local, len(crop.rows)), learned)
-    described = learned.describe(merged)
-    raw = refiner_outputs(merged, described, nearest(merged, networks.options.neighbors), learned)
-    refined, residuals = with_corrections(merged, described, raw, networks)
-    described = learned.describe(refined)
+    group_features = context.describe(parts)
+    parts, shifts = apply_encoding(parts, group_features, run_encoder(parts, group_features, context), networks)
+    merged, corrections = _merged(parts, group_features, shifts, Matches(local, len(crop.rows)), context)
+    group_features = context.describe(merged)
+    raw = run_refiner(merged, group_features, find_neighbors(merged, networks.options.neighbors), context)
+    refined, residuals = apply_corrections(merged, group_features, raw, networks)
+    group_features = context.describe(refined)
     analytic = example.levels[crop.k].children[crop.children]
     parents = torch.searchsorted(crop.rows, example.levels[crop.k].parents[crop.children])
-    frames, single = described.frames[parents], crop.k == 1
-    children = described.base if single else analytic
-    children = head_starts(children, parents.numpy(), refined, described, networks)
-    heads = head_residuals(children, parents.numpy(), refined, described, learned)
+    frames, single = group_features.frames[parents], crop.k == 1
+    children = group_features.base if single else analytic
+    children = prepare_children(children, parents.numpy(), refined, group_features, networks)
+    heads = run_heads(children, parents.numpy(), refined, group_features, context)
     before = corrections + residuals if single else torch.zeros_like(heads)
     last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
     gaussians = move_gaussians(children, last, frames)
@@ -123,21 +123,21 @@ def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:
 
 
 def _merged(
-    parts: FeatureGaussians, described: Described, shifts: Tensor, matches: Matches, learned: Learned
+    parts: FeatureGaussians, group_features: GroupFeatures, shifts: Tensor, matches: Matches, context: NetworkContext
 ) -> tuple[FeatureGaussians, Tensor]:
     """Merged Feature Gaussians, and what encoder and merger did to each."""
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return parts, shifts
     pooled = pool_runs(parts, order, cuts)
-    of_pooled = learned.describe(pooled)
-    moved = rotated(described.frames, shifts[:, MEAN] * described.sizes[:, None])[order]
+    of_pooled = context.describe(pooled)
+    moved = rotate_vectors(group_features.frames, shifts[:, MEAN] * group_features.sizes[:, None])[order]
     run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
     share = parts.weights[order] / torch.zeros(len(cuts)).index_add(0, run, parts.weights[order])[run].clamp_min(1e-12)
     world = torch.zeros(len(cuts), 3).index_add(0, run, share[:, None] * moved)
-    local = rotated(of_pooled.frames.transpose(1, 2), world) / of_pooled.sizes[:, None]
-    raw = merger_outputs(pooled, of_pooled, parts, order.numpy(), cuts, learned)
-    pooled, residuals = with_corrections(pooled, of_pooled, raw, learned.networks)
+    local = rotate_vectors(of_pooled.frames.transpose(1, 2), world) / of_pooled.sizes[:, None]
+    raw = run_merger(pooled, of_pooled, parts, order.numpy(), cuts, context)
+    pooled, residuals = apply_corrections(pooled, of_pooled, raw, context.networks)
     from_encoder = torch.cat([local, torch.zeros(len(cuts), residuals.shape[1] - 3)], 1)
     merged = FeatureGaussians.concat([take(parts, alone), pooled])
     return merged, torch.cat([shifts[alone], residuals + from_encoder])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.networks.residuals import TURN
+from gsmerge.networks.residuals import ROTATION
 from gsmerge.types import Gaussians
 
 GOAL = 0.5  # overlap of boxes that children are drawn to
@@ -24,8 +24,8 @@ def teacher_loss(corrections: Tensor) -> Tensor:
     """
     if len(corrections) == 0:
         return corrections.new_zeros(())
-    rest = torch.cat([corrections[:, : TURN.start], corrections[:, TURN.stop :]], 1)
-    return corrections[:, TURN].norm(dim=1).mean() + rest.abs().mean()
+    rest = torch.cat([corrections[:, : ROTATION.start], corrections[:, ROTATION.stop :]], 1)
+    return corrections[:, ROTATION].norm(dim=1).mean() + rest.abs().mean()
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor) -> Tensor:

@@ -13,9 +13,9 @@ from gsmerge.measure.evaluate import Views
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.moments import Members, scene_members
 from gsmerge.render import composite, plan_view, prepare
-from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.render.photos import NEAR, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.prepare import NEAR, canonicalise
+from gsmerge.stages.prepare import canonicalise
 from gsmerge.types import Cameras, PixelScene, UnalignedScene
 from gsmerge.views import even_views, subset
 

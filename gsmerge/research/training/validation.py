@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks import Networks
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, SIZE, TURN
+from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.research.training.examples import Example
 from gsmerge.research.training.objective import compared, correction_loss
 from gsmerge.research.training.options import TrainOptions
@@ -23,7 +23,7 @@ from gsmerge.research.training.record import Row
 from gsmerge.research.training.windows import Window, random_window, whole_photo
 from gsmerge.runtime.threads import parallel_map
 
-PARTS = {"mean": MEAN, "size": SIZE, "turn": TURN, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
+PARTS = {"mean": MEAN, "size": SIZE, "turn": ROTATION, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
 VALIDATION = 2**32  # instead of the step, in what validation's random numbers hang on
 
 

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from gsmerge.render import plan_view, prepare
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import NEAR, Photos
 from gsmerge.research.training.examples import Example
 from gsmerge.research.training.predict import Crop
-from gsmerge.stages.prepare import NEAR
 from gsmerge.types import Cameras
 
 LEAST = 16  # pixels per side below which windows are not halved

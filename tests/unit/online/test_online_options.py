@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gsmerge import Compactor
-from gsmerge.online.compactor import settled
+from gsmerge.online.compactor import merge_settings
 from gsmerge.online.options import OnlineOptions
 
 
@@ -44,15 +44,15 @@ def test_other_settings_are_checked_too(values: dict[str, Any]) -> None:
 
 
 def test_colours_are_fitted_unless_told_otherwise() -> None:
-    options, online = settled({})
+    options, online = merge_settings({})
     assert options.fit.fit == "color"
     assert online == OnlineOptions()
-    assert settled({"fit": "none"})[0].fit.fit == "none"
+    assert merge_settings({"fit": "none"})[0].fit.fit == "none"
 
 
 def test_the_state_s_settings_come_before_the_defaults() -> None:
     told = {"density": 0.07, "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
     state: Any = SimpleNamespace(about={"options": told, "batches": []})
-    options, online = settled({"tolerance": 0.3, "seed": 4}, state)
+    options, online = merge_settings({"tolerance": 0.3, "seed": 4}, state)
     assert options.to_dict().items() >= {"density": 0.07, "fit": "none", "seed": 4}.items()
     assert online.tolerance == 0.3

@@ -9,7 +9,7 @@ import pytest
 
 from gsmerge.options import CompactOptions
 from gsmerge.runtime import memory
-from gsmerge.runtime.estimate import MOST_JUDGED, memory_bytes, memory_problem, score_cost, work_seconds
+from gsmerge.runtime.estimate import MAX_SCORED_VIEWS, memory_bytes, memory_problem, score_cost, work_seconds
 from gsmerge.runtime.memory import machine_memory, peak_memory
 
 VIEW = 480 * 320
@@ -17,14 +17,14 @@ VIEW = 480 * 320
 
 def seconds(views: int, **settings: Any) -> float:
     options = CompactOptions().with_settings(settings)
-    plain = options.to_dict() | {"checkpoint": "none"}
+    plain = options.resolved(photos=True) | {"checkpoint": "none"}
     return work_seconds(views * VIEW, VIEW, plain, photos=True, fit_steps=options.fit.steps)
 
 
 def test_many_views_cost_more_each_as_far_as_they_are_scored() -> None:
     """Every Gaussian of the input is rendered in every scored view."""
     assert score_cost(20) == 2 * score_cost(10)
-    assert score_cost(MOST_JUDGED) == score_cost(500)
+    assert score_cost(MAX_SCORED_VIEWS) == score_cost(500)
     assert seconds(24, effort="draft") > 2 * seconds(12, effort="draft")
     assert seconds(84, fit="none") > seconds(84, fit="none", robust=False)
 

@@ -14,9 +14,9 @@ from training_runs import OPTIONS, TINY
 
 import gsmerge
 from gsmerge.errors import SceneError
-from gsmerge.networks import Learned, NetworkOptions, Networks, load_checkpoint
-from gsmerge.networks.apply import encode_features, head_residuals, refine_features
-from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bounded, move_gaussians
+from gsmerge.networks import NetworkContext, NetworkOptions, Networks, load_checkpoint
+from gsmerge.networks.apply import encode_features, refine_features, run_heads
+from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bound_residuals, move_gaussians
 from gsmerge.research.training import (
     Example,
     TrainOptions,
@@ -71,7 +71,7 @@ def test_differences_undo_corrections(example: Example) -> None:
     raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
     frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
     frames = frames * torch.linalg.det(frames)[:, None, None]
-    wanted = bounded(raw, TINY.bounds, 0.5)
+    wanted = bound_residuals(raw, TINY.bounds, 0.5)
     found = differences(start, move_gaussians(start, wanted, frames), frames)
     torch.testing.assert_close(found, wanted, atol=2e-4, rtol=1e-3)
 
@@ -94,7 +94,7 @@ def test_owners_are_the_rows_after_merging(example: Example) -> None:
 def test_what_is_trained_is_what_runs(example: Example) -> None:
     """The corrections of a crop that holds everything are those that the stages make."""
     networks = noisy(TINY)
-    learned = Learned(networks, example.members, example.cameras, 5)
+    learned = NetworkContext(networks, example.members, example.cameras, 5)
     everything = torch.arange(len(example.centres))
     encoded = encode_features(example.features, learned)
     refined = refine_features(merge(encoded, example.matches, learned), learned)
@@ -102,8 +102,8 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     crop = Crop(example, 2, everything, torch.arange(len(level.children)), level.mask)
     with torch.no_grad():
         found = predicted(crop, networks, 5)
-    described = learned.describe(refined)
-    wanted = head_residuals(level.children, level.parents.numpy(), refined, described, learned)
+    group_features = learned.describe(refined)
+    wanted = run_heads(level.children, level.parents.numpy(), refined, group_features, learned)
     torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
     first = replace(crop, k=1, children=everything, judged=example.levels[1].mask)
     with torch.no_grad():

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.cover import MARGIN, REACH, group_errors, in_view, pixel_errors
+from gsmerge.online.novelty import MARGIN, REACH, group_errors, groups_in_view, pixel_errors
 from gsmerge.online.state import moments_of
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import photos_of
@@ -47,7 +47,7 @@ def test_in_view_of_a_ball_about_each(seed: int) -> None:
     """Balls against the pyramid of what a picture with some pixels about it shows, a plane after the other."""
     gaussians, cameras = random_gaussians(300, seed), scenes.arc(3, 32, 20)
     features = features_of(gaussians)
-    found = in_view(features, cameras)
+    found = groups_in_view(features, cameras)
     assert found.shape == (3, 300)
     assert 0.1 < found.mean() < 0.9
     radii = REACH * np.sqrt(np.trace(features.covars.double().numpy(), axis1=1, axis2=2))
@@ -60,12 +60,12 @@ def test_in_view_of_a_ball_about_each(seed: int) -> None:
 def test_in_view_of_one_group() -> None:
     cameras = scenes.arc(1, 32, 32, start=-0.5)  # a field of view of 53 degrees, from the zero along z
     places = [[0, 0, 3], [0, 0, -3], [0, 0, -0.01], [9, 0, 3], [0, -9, 3], [1.6, 0, 3], [0, 0, 300]]
-    found = in_view(scenes.make_features(np.array(places, float), sizes=0.05), cameras)
+    found = groups_in_view(scenes.make_features(np.array(places, float), sizes=0.05), cameras)
     assert found.tolist() == [[True, False, True, False, False, True, True]]
 
 
 def test_nothing_is_in_view_of_nothing() -> None:
-    assert in_view(scenes.make_features(np.zeros((0, 3))), scenes.arc(2)).shape == (2, 0)
+    assert groups_in_view(scenes.make_features(np.zeros((0, 3))), scenes.arc(2)).shape == (2, 0)
 
 
 @given(
@@ -78,7 +78,7 @@ def test_nothing_is_in_view_of_nothing() -> None:
 def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: tuple[int, int], level: int) -> None:
     """Every Gaussian that adds anything to any pixel, with the low-pass of the rasterizer, at either size."""
     gaussians, cameras = random_gaussians(200, seed, size=size), scenes.arc(2, *shape)
-    found = in_view(features_of(gaussians), cameras)
+    found = groups_in_view(features_of(gaussians), cameras)
     black = np.zeros((2, shape[1], shape[0], 3), np.float32)
     photos = photos_of(black, cameras, level)
     splats = prepare(gaussians)

@@ -1,4 +1,4 @@
-"""What the Gaussians of other views say of points: one per pixel, so that each view is asked at one place."""
+"""Agreement of points with the Gaussians of other views, one per pixel: each view is read at one pixel."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ COLUMNS = 6
 
 
 @kernel
-def look_around(
-    points, colors, own, viewmats, Ks, width, height, means, opacities, sh0, color_scale, near, far, least,
+def sum_cross_view(
+    points, colors, own, viewmats, Ks, width, height, means, opacities, sh0, color_scale, near, far, min_opacity,
     first, last, out,
 ):  # fmt: skip
     """Sums over the views that see each point.
@@ -21,7 +21,7 @@ def look_around(
     Args:
         points: ``[g,3]`` float64.
         colors: ``[g,3]`` float32 base colours less a half.
-        own: ``[g]`` int64 view of each, which is not asked.
+        own: ``[g]`` int64 view of each, which is left out.
         viewmats: ``[v,4,4]`` float64.
         Ks: ``[v,3,3]`` float64.
         width: Of all views, pixels.
@@ -29,16 +29,16 @@ def look_around(
         means: ``[v h w,3]`` float32 Gaussians, one per pixel.
         opacities: ``[v h w]`` float32.
         sh0: ``[v h w,1,3]`` float32.
-        color_scale: Of the first harmonic.
+        color_scale: Value of the first harmonic.
         near: Largest difference of the logarithms of two depths of one surface.
-        far: Differences count for no more.
-        least: Opacity that a Gaussian must have.
+        far: Larger differences are clipped to this.
+        min_opacity: More transparent Gaussians show no surface.
         first: First point.
         last: Last point, exclusive.
-        out: ``[g,6]`` float64, added to: views that see it, of these that have a surface there, behind it, before it;
-            absolute difference of colours where there is one, difference of the logarithms of depths.
+        out: ``[g,6]`` float64, added to: views that see the point; of these, those whose surface is at it, behind it,
+            in front of it; absolute difference of colours where it is at it, difference of the logarithms of depths.
     """
-    for v in range(viewmats.shape[0]):  # neighbouring points look at neighbouring pixels of one view
+    for v in range(viewmats.shape[0]):  # views outside: neighbouring points read neighbouring pixels
         m, K = viewmats[v], Ks[v]
         for i in range(first, last):
             if v == own[i]:
@@ -55,7 +55,7 @@ def look_around(
                 continue
             j = (v * height + int(row)) * width + int(column)
             there = m[2, 0] * means[j, 0] + m[2, 1] * means[j, 1] + m[2, 2] * means[j, 2] + m[2, 3]
-            if not (there > 0 and opacities[j] > least):
+            if not (there > 0 and opacities[j] > min_opacity):
                 continue
             ratio = math.log(depth / there)
             out[i, 0] += 1

@@ -9,17 +9,17 @@ from arriving import room
 
 from gsmerge import Cameras
 from gsmerge.geometry import project
-from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
+from gsmerge.online.photos import BatchPhotos, concat_cameras, resize_cameras, resize_photos, update_replay, view_ids
 from gsmerge.online.state import Replay
 
 NOTHING = Replay(np.zeros((0, 2, 3, 3), np.uint8), np.zeros(0, np.int64))
 
 
-def shots(first: int, count: int) -> Shots:
+def batch_photos(first: int, count: int) -> BatchPhotos:
     """Pictures of 3 x 2 pixels, each of its number."""
     images = np.broadcast_to(np.arange(first, first + count)[:, None, None, None] / np.float32(255), (count, 2, 3, 3))
     eyes, lenses = torch.eye(4, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
-    return Shots(
+    return BatchPhotos(
         np.ascontiguousarray(images, np.float32), Cameras(eyes.expand(count, 4, 4), lenses.expand(count, 3, 3), 3, 2)
     )
 
@@ -28,7 +28,7 @@ def kept(sizes: list[int], most: int, start: int = 0) -> Replay:
     """What is kept of batches of given sizes."""
     found, first = NOTHING, start
     for size in sizes:
-        found = kept_photos(found, shots(first, size), np.arange(first, first + size), first + size, most)
+        found = update_replay(found, batch_photos(first, size), np.arange(first, first + size), first + size, most)
         first += size
     return found
 
@@ -65,13 +65,13 @@ def test_views_without_photos_before(start: int, most: int) -> None:
 
 def test_views_that_come_again_are_kept_once() -> None:
     many = kept([4], 4)
-    again = kept_photos(many, shots(10, 3), np.array([1, 4, 1]), 5, 8)
+    again = update_replay(many, batch_photos(10, 3), np.array([1, 4, 1]), 5, 8)
     assert again.views.tolist() == [0, 1, 2, 3, 4]
     assert again.images[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 11]
 
 
 def test_photos_of_views_that_came_without() -> None:
-    found = kept_photos(kept([1, 1], 8, 4), shots(0, 3), np.array([0, 2, 1]), 6, 8)
+    found = update_replay(kept([1, 1], 8, 4), batch_photos(0, 3), np.array([0, 2, 1]), 6, 8)
     assert found.views.tolist() == [0, 1, 2, 4, 5]
     assert found.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
 
@@ -79,9 +79,9 @@ def test_photos_of_views_that_came_without() -> None:
 def test_known_cameras_are_found() -> None:
     cameras = room(6).cameras
     some, others = cameras[torch.tensor([4, 0, 4])], cameras[torch.tensor([5, 4, 3])]
-    assert view_places(some, others).tolist() == [3, 0, 4]
-    assert view_places(some[:0], others).tolist() == [0, 1, 2]
-    assert view_places(some, others[:0]).tolist() == []
+    assert view_ids(some, others).tolist() == [3, 0, 4]
+    assert view_ids(some[:0], others).tolist() == [0, 1, 2]
+    assert view_ids(some, others[:0]).tolist() == []
 
 
 def test_no_photos_are_kept_where_none_are_wanted() -> None:
@@ -92,14 +92,14 @@ def test_no_photos_are_kept_where_none_are_wanted() -> None:
 
 def test_fewer_may_be_wanted_later() -> None:
     many = kept([8], 8)
-    few = kept_photos(many, shots(8, 1), np.array([8]), 9, 3)
+    few = update_replay(many, batch_photos(8, 1), np.array([8]), 9, 3)
     assert few.views.tolist() == [0, 4, 8]
 
 
 def test_colours_are_rounded() -> None:
-    one = shots(0, 1)
+    one = batch_photos(0, 1)
     values = np.linspace(0, 1, 18, dtype=np.float32).reshape(1, 2, 3, 3)
-    found = kept_photos(NOTHING, Shots(values, one.cameras), np.array([0]), 1, 4)
+    found = update_replay(NOTHING, BatchPhotos(values, one.cameras), np.array([0]), 1, 4)
     assert found.images.dtype == np.uint8
     np.testing.assert_allclose(found.images / 255, values, atol=0.5 / 255 + 1e-6)
 
@@ -107,7 +107,7 @@ def test_colours_are_rounded() -> None:
 def test_pictures_of_the_states_size_are_left_as_they_are() -> None:
     scene = room(2)
     assert scene.images is not None
-    found = shots_at(scene.images, scene.cameras, 36, 24)
+    found = resize_photos(scene.images, scene.cameras, 36, 24)
     assert found.images is not None
     np.testing.assert_array_equal(found.images, scene.images.numpy())
     assert found.cameras is scene.cameras
@@ -117,7 +117,7 @@ def test_pictures_of_the_states_size_are_left_as_they_are() -> None:
 def test_pictures_of_another_size_are_averages(size: tuple[int, int]) -> None:
     scene = room(2)
     assert scene.images is not None
-    found = shots_at(scene.images, scene.cameras, *size)
+    found = resize_photos(scene.images, scene.cameras, *size)
     w, h = size
     means = scene.images.numpy().reshape(2, h, 24 // h, w, 36 // w, 3).mean((2, 4))
     np.testing.assert_allclose(found.images, means, atol=1e-5)
@@ -127,7 +127,7 @@ def test_pictures_of_another_size_are_averages(size: tuple[int, int]) -> None:
 def test_larger_pictures_keep_the_view() -> None:
     scene = room(1)
     assert scene.images is not None
-    found = shots_at(scene.images, scene.cameras, 72, 48)
+    found = resize_photos(scene.images, scene.cameras, 72, 48)
     assert found.images.shape == (1, 48, 72, 3)
     assert float(np.abs(found.images.mean((1, 2)) - scene.images.numpy().mean((1, 2))).max()) < 0.01
 
@@ -135,14 +135,14 @@ def test_larger_pictures_keep_the_view() -> None:
 def test_the_same_points_are_at_the_same_share_of_the_picture() -> None:
     cameras = room(3).cameras
     points = torch.tensor([[0.1, -0.2, 3.0], [0.5, 0.4, 2.0]], dtype=torch.float64)
-    large, small = (project(points, c)[0] for c in (cameras, resized(cameras, 9, 12)))
+    large, small = (project(points, c)[0] for c in (cameras, resize_cameras(cameras, 9, 12)))
     np.testing.assert_allclose(small, large * torch.tensor([9 / 36, 12 / 24]), atol=1e-9)
-    assert resized(cameras, 9, 12).viewmats.dtype == torch.float64
+    assert resize_cameras(cameras, 9, 12).viewmats.dtype == torch.float64
 
 
 def test_joined_cameras_come_one_after_the_other() -> None:
     first, second = room(2).cameras, room(3).cameras
-    found = joined_cameras(first, second)
+    found = concat_cameras(first, second)
     assert (len(found), found.width, found.height) == (5, 36, 24)
     assert torch.equal(found.viewmats[2:], second.viewmats.double())
     assert torch.equal(found.Ks[:2], first.Ks.double())
@@ -151,5 +151,5 @@ def test_joined_cameras_come_one_after_the_other() -> None:
 def test_photos_at_half_size() -> None:
     scene = room(2)
     assert scene.images is not None
-    found = shots_at(scene.images, scene.cameras, 36, 24).photos(2)
+    found = resize_photos(scene.images, scene.cameras, 36, 24).photos(2)
     assert (found.width, found.height, len(found)) == (18, 12, 2)

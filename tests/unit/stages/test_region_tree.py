@@ -9,8 +9,9 @@ import scenes
 import torch
 
 from gsmerge import PixelScene
+from gsmerge.baselines.baseline import most_important
 from gsmerge.moments import Members, scene_members
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.region_tree import (
     AllocateOptions,
@@ -20,8 +21,6 @@ from gsmerge.stages.region_tree import (
     knee,
     pixel_depths,
     region_tree,
-    split_counts,
-    trim,
 )
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import SH_C0, FeatureGaussians, Groups
@@ -98,8 +97,8 @@ def test_regions_keep_below_the_largest_extent_until_there_is_no_other_way(portr
         boxes = [np.nonzero(labels == i) for i in range(count)]
         return np.array([max(np.ptp(y), np.ptp(x)) for y, x in boxes])
 
-    assert tree.least < 60
-    assert side / 2 < extents(tree.least).max() < side
+    assert tree.min_regions < 60
+    assert side / 2 < extents(tree.min_regions).max() < side
     assert extents(3).max() >= side
 
 
@@ -262,7 +261,7 @@ def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Mem
 
 def test_a_first_step_that_only_pays_with_the_second() -> None:
     """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
-    from gsmerge.stages.region_tree import _hull_gains
+    from gsmerge.stages.decode import _hull_gains
 
     gains = _hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
     assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
@@ -307,20 +306,20 @@ def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Memb
 # ---------------------------------------------------------------- keeping the best
 
 
-def test_trim_keeps_the_most_important() -> None:
+def test_most_important_keeps_the_most_important() -> None:
     importance = torch.tensor([3.0, 1.0, 3.0, float("nan"), 0.0, 5.0])
-    assert trim(importance, 3).tolist() == [0, 2, 5]
-    assert trim(importance, 2).tolist() == [0, 5]
-    assert trim(importance, 5).tolist() == [0, 1, 2, 4, 5]
-    assert trim(importance.numpy(), 9).tolist() == [0, 1, 2, 3, 4, 5]
-    assert trim(importance, 0).tolist() == []
+    assert most_important(importance, 3).tolist() == [0, 2, 5]
+    assert most_important(importance, 2).tolist() == [0, 5]
+    assert most_important(importance, 5).tolist() == [0, 1, 2, 4, 5]
+    assert most_important(importance.numpy(), 9).tolist() == [0, 1, 2, 3, 4, 5]
+    assert most_important(importance, 0).tolist() == []
     with pytest.raises(ValueError, match="count: expected at least 0, got -1"):
-        trim(importance, -1)
+        most_important(importance, -1)
 
 
 def test_colours_of_sh_and_of_photos_weigh_the_same() -> None:
     """A group of two flat colours: its error is the squared distance from their mean, in sRGB."""
-    from gsmerge.stages.region_tree import _child_errors
+    from gsmerge.stages.decode import _child_errors
 
     same = Members(
         np.zeros((4, 3), np.float32), np.zeros((4, 4), np.float32), np.ones((4, 3), np.float32),

@@ -9,7 +9,7 @@ from scenes import arc, make_scene, room
 
 from gsmerge.geometry import project
 from gsmerge.moments import Members, scene_members
-from gsmerge.networks.evidence import FAR, LEAST, NEAR, evidence
+from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, PixelScene
 
@@ -29,7 +29,7 @@ def slowly(
                 continue
             j = (v * cameras.height + y) * cameras.width + x
             there = project(torch.from_numpy(members.means[j : j + 1]), cameras)[1][v, 0]
-            if not (there > 0 and members.opacities[j] > LEAST):
+            if not (there > 0 and members.opacities[j] > MIN_OPACITY):
                 continue
             ratio, seen = float(torch.log(depths[v, i] / there)), seen + 1
             kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
@@ -57,7 +57,7 @@ def test_every_point_and_view(scene: PixelScene) -> None:
     members = scene_members(scene)
     members.opacities[::7] = 0
     with use_threads(2):
-        found = evidence(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+        found = cross_view_stats(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
     wanted = slowly(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
     assert len(np.unique(found[:, 0])) > 3
     assert (wanted[:, 1:4].max(0) > 0).all()
