@@ -148,9 +148,7 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     for style, name in (("views", "plain"), ("da3", "da3"), ("depthsplat", "depthsplat"), ("anysplat", "anysplat")):
         records = parts.get(style, ())
         if style == "views":
-            records = [
-                r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"} and r.settings.get("k") != "auto"
-            ]
+            records = [r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"}]
             records = [
                 *records,
                 *(r for r in parts.get("sizes", ()) if r.method == "paper" and r.settings.get("budget") == "4.4%"),
@@ -236,11 +234,11 @@ ABLATION = {
     (("fit", "color"),): "without the full fit: colours alone, merge chosen by the photos",
     (("checkpoint", "none"), ("fit", "none")): "without any fit: merge chosen by the photos",
     (("checkpoint", "shipped"), ("fit", "none")): "without any fit: the trained encoder, merger, refiner and heads",
-    (("density", 0.02),): "larger superpixels",
-    (("density", 0.087),): "smaller superpixels",
+    (("superpixels", "2%"),): "larger superpixels",
+    (("superpixels", "8.7%"),): "smaller superpixels",
     (("segmentation", "bass-st"),): "the paper's superpixels (BASS with Shi-Tomasi)",
     (("segmentation", "slic"),): "SLIC superpixels",
-    (("k", "auto"),): "as many Gaussians as the scene needs (`--k auto`)",
+    (("budget", "auto"),): "as many Gaussians as the scene needs (`--budget auto`)",
 }
 
 
@@ -353,7 +351,7 @@ def _too_many(records: Sequence[RunRecord]) -> str:
     words = (
         "More Gaussians are not always better. Held-out and input views (dB) by budget: where the input views go on"
         " rising and the held-out ones fall, the photos are learned by heart, because depth or poses do not fit them;"
-        " ask for fewer, or for `--k auto`."
+        " ask for fewer, or for `--budget auto`."
     )
     return f"### More Gaussians than a scene bears\n\n{words}\n\n{_table(('scene', *budgets), rows)}"
 

@@ -258,8 +258,8 @@ def plan_document(
         photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
         fit_steps: Steps of the full fit.
-        usual: Gaussians that density and K ask for.
-        wanted: Gaussians that a budget, a file size or a preset asks for; None without any.
+        usual: Gaussians that superpixels and K ask for.
+        wanted: Gaussians that a budget asks for; None without one.
         notes: What the reader had to say.
         count: Gaussians of the file; None: one for each pixel of the grid.
         num_rest: Columns of higher harmonics.
@@ -282,7 +282,7 @@ def plan_document(
             "num_gaussians_at_most": min(count or pixels, at_most),
         },
         "method": method,
-        "superpixels_per_view": per_view if wanted is None and options["k"] != "auto" else None,
+        "superpixels_per_view": per_view if wanted is None and options["budget"] != "auto" else None,
         "robust": is_robust(options, photos=photos),
         "fit": fit_of(options, photos=photos),
         "estimate": {

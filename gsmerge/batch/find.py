@@ -67,7 +67,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
             continue
         inputs.add(real)
         job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *promised(ply))
-        for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
+        for name in (job.output, *further_outputs(job.output, options.settings.budget.levels)):
             if name in owners:
                 raise UsageError(
                     f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"

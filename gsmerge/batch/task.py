@@ -131,7 +131,7 @@ def _compacted(task: Task, work: Work, files: SceneFiles, key: str) -> dict[str,
 
 def _outputs(job: Job, options: BatchOptions) -> list[str]:
     """Names of the result and of its further levels."""
-    return [job.output, *further_outputs(job.output, options.settings.target.levels)]
+    return [job.output, *further_outputs(job.output, options.settings.budget.levels)]
 
 
 def _as_written(folder: Path, known: Known) -> list[dict[str, Any]]:

@@ -41,7 +41,7 @@ def parse_jobs(text: str) -> int:
         opt.option("images", str, "Folder of the photos, in the same way.", shown="beside each"),
     ),
     opt.HINTS,
-    f"k {opt.SUPERPIXELS} {opt.BUDGETS} {opt.SEARCHES} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
+    f"{opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", shown="auto", parser=parse_jobs,

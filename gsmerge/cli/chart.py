@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gsmerge.research.charts.run import Plan, RunOptions
 
 GRID = "Grid: comma-separated lists, whose product is run"
-LISTS = ("methods", "k", "budgets", "densities", "segmentations", "fit", "efforts", "matches", "views")
+LISTS = ("methods", "k", "budgets", "superpixels", "segmentations", "fit", "efforts", "matches", "views")
 HINTS = ("opacity", "exporter", "quats", "order", "scene_scale", "max_side")
 
 
@@ -34,9 +34,9 @@ def _list(name: str, help: str, shown: str) -> Parameter:
     *opt.panel(
         GRID,
         _list("methods", "Methods: gsmerge and baselines.", "gsmerge"),
-        _list("k", "Gaussians per superpixel: 1 to 8, auto.", "1"),
-        _list("budgets", 'Gaussians in the result, such as "0.5%,2%,40000".', "as density says"),
-        _list("densities", "Superpixels per pixel, next to the budgets.", "0.044"),
+        _list("k", "Gaussians per superpixel: 1 to 8.", "1"),
+        _list("budgets", "Gaussians in the result, such as 0.5%,2%,40000,auto.", "as superpixels and K say"),
+        _list("superpixels", "Superpixels per view, such as 3000,4.4%, next to the budgets.", "4.4%"),
         _list("segmentations", "Superpixel methods.", "rdseg"),
         _list("fit", "What is fitted: full, color, none.", "full"),
         _list("efforts", "Amount of work: fast, default, best.", "default"),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} k {opt.SUPERPIXELS} {opt.BUDGETS} {opt.SEARCHES} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
+    f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
     opt.output("The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.", "SCENE.compact.ply"),
     f"overwrite report dry_run {opt.RUN}",
 )
@@ -33,8 +33,8 @@ def compact(args: opt.Args) -> None:
     levels = [level_output(out, level) for level in range(1, args.levels or 1)]
     inputs = (*input_files(files), *checkpoint_files(args.checkpoint))
     check_outputs((out, *levels, args.report), inputs, overwrite=args.overwrite)
-    check_format(out, args.max_bytes)
     settings = args.settings()
+    check_format(out, settings.budget)
     if args.dry_run:
         from gsmerge.cli.plan import print_plan
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.argument("encoded", Path, "ENCODED", "A .gsm file of gsmerge encode or extend."),
-    opt.changed("k", help="Gaussians per group, up to what was encoded. auto: as many in all as compact takes without "
-                "photos.", show_default="as encoded"),
-    opt.changed("budget", help='Gaussians in the result, such as 40000 or "2%" of the input; at least one per group.'),
+    opt.changed("k", help="Gaussians per group, up to what was encoded.", show_default="as encoded"),
+    opt.changed("budget", help="Gaussians in the result: a number, a share of the input such as 2%, a size such as "
+                "5MB; at least one per group. auto: as many as compact takes without photos."),
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
     "effort device fit_steps time_budget",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @opt.command(
     opt.SCENE,
     opt.output("The encoded scene.", "SCENE.gsm"),
-    f"{opt.READING} k max_k {opt.SUPERPIXELS} {opt.BUDGETS} effort {opt.MERGE} {opt.NETWORKS}",
+    f"{opt.READING} k max_k superpixels budget effort {opt.MERGE} {opt.NETWORKS}",
     f"overwrite dry_run {opt.RUN}",
 )
 def encode(args: opt.Args) -> None:

@@ -36,6 +36,13 @@ REQUIRED = Parameter.empty
 RENAMED = {
     "--out": "-o/--output",
     "batch --output": "--name; -o/--output is the folder",
+    "--density": "--superpixels, such as --superpixels 4.4%",
+    "--densities": "--superpixels, such as --superpixels 2%,4.4%",
+    "--max-bytes": "--budget, such as --budget 5MB",
+    "--preset": "--budget, such as --budget quest3",
+    "--k auto": "--budget auto",
+    "--target-psnr": "--quality, such as --quality 30dB",
+    "--max-drop": "--quality, such as --quality -0.2dB",
 }
 
 
@@ -196,13 +203,18 @@ def _show_all(context: typer.Context, value: bool) -> None:
         raise typer.Exit
 
 
-def parse_k(text: str) -> int | str:
-    """``--k``: a number from 1 to 8, or auto."""
+def parse_k(text: str) -> int:
+    """``--k``: a number from 1 to 8."""
     if text == "auto":
-        return text
+        raise UsageError(str(renamed("--k auto")))
     if not text.isdigit() or not 1 <= int(text) <= 8:
-        raise typer.BadParameter(f'expected 1 to 8 or "auto", got {text!r}')
+        raise typer.BadParameter(f"expected 1 to 8, got {text!r}")
     return int(text)
+
+
+def parse_superpixels(text: str) -> int | str:
+    """``--superpixels``: a number, or a share."""
+    return int(text) if text.isdigit() else text
 
 
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
@@ -211,9 +223,7 @@ SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and
 HINTS = "opacity exporter quats order scene_scale max_side"
 READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
-SUPERPIXELS = "superpixels density"
-BUDGETS = "budget max_bytes preset"
-SEARCHES = "max_drop target_psnr levels"
+COUNTS = "k superpixels budget quality levels"
 MERGE = "segmentation robust match geometry unseen"
 FIT = "fit effort device fit_steps time_budget"
 NETWORKS = "checkpoint require_checkpoint"
@@ -243,17 +253,14 @@ _TABLE = (
     ),
     panel(
         COUNT,
-        option("superpixels", int, "Superpixels per view. Wins over --density.", min=1),
-        option("density", float, "Superpixels per pixel.", shown="0.044", rare=True, min=0.0, max=1.0),
-        option("k", str, "Gaussians per superpixel: finer with more. auto: as many as the scene needs.", shown="1",
-               parser=parse_k, metavar="[1-8|auto]"),
-        option("budget", str, 'Gaussians in the result, such as 40000 or "2%"; met exactly.'),
-        option("max_bytes", str, "Largest size of the result as a .ply, such as 5MB.", rare=True),
-        option("preset", ("quest3", "mobile", "desktop"), "At most as many Gaussians as this device draws fluidly.",
-               rare=True),
-        option("max_drop", float, "Fewest Gaussians within so many dB of the best that the scene reaches.", rare=True,
-               min=0.0),
-        option("target_psnr", float, "Fewest Gaussians that render the input photos at so many dB.", min=0.0),
+        option("k", str, "Gaussians per superpixel: finer with more.", shown="1", parser=parse_k, metavar="1-8"),
+        option("superpixels", str, "Superpixels per view: a number such as 3000, or a share of its pixels.",
+               shown="4.4%", parser=parse_superpixels, metavar="NUMBER|SHARE"),
+        option("budget", str, "Gaussians in the result: a number, a share such as 2% of the input, or a size such as "
+               "5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the scene "
+               "needs.", metavar="40000|2%|5MB|DEVICE|auto"),
+        option("quality", str, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that lose at "
+               "most so much against the best, such as -0.2dB.", metavar="30dB|-0.2dB"),
         option("levels", int, "Levels of detail, each in a file of its own, with a quarter of the Gaussians of the "
                "one before.", shown="1", rare=True, min=1, max=8),
         option("max_k", int, "Most Gaussians per superpixel that can be decoded later: more take more space.",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
+    from gsmerge.budget import BudgetOptions
     from gsmerge.io import SceneFiles
 
 
@@ -19,8 +20,8 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def check_format(output: Path, max_bytes: str | None = None) -> None:
-    """Refuse an output whose name says no known format, or ``--max-bytes`` for a format of unknown size.
+def check_format(output: Path, budget: BudgetOptions | None = None) -> None:
+    """Refuse an output whose name says no known format, or a budget in bytes for a format of unknown size.
 
     Raises:
         UsageError: In either case.
@@ -28,8 +29,8 @@ def check_format(output: Path, max_bytes: str | None = None) -> None:
     from gsmerge.io import output_format
 
     ending = output_format(output)
-    if max_bytes is not None and ending != ".ply":
-        raise UsageError(f"--max-bytes: expected an output as .ply, got {ending}; give a --budget")
+    if budget is not None and budget.in_bytes and ending != ".ply":
+        raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
 def check_picture(output: Path) -> None:

@@ -20,7 +20,7 @@ KINDS = ("borders", "means", "saliency")
 
 @opt.command(
     opt.SCENE,
-    f"cameras images opacity exporter quats order scene_scale {opt.SUPERPIXELS}",
+    "cameras images opacity exporter quats order scene_scale superpixels",
     opt.changed("segmentation", hidden=False),
     "effort",
     opt.output("Folder for the pictures.", default=opt.REQUIRED),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.TARGETS} k density budget fit effort fit_steps",
+    f"{opt.READING} {opt.TARGETS} k superpixels budget fit effort fit_steps",
     *opt.panel(opt.MEASURING, opt.option("cases", str, "Run only these cases.", shown="all", metavar="NAME,...")),
     f"report overwrite {opt.RUN}",
 )

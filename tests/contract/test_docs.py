@@ -101,7 +101,7 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
 def test_told_defaults_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     told = dict(cli_defaults())
-    known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
+    known = {"k", "superpixels", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
     known |= {"levels", "device", "checkpoint", "geometry"}
     assert set(told) == known
     assert library["robust"] is None

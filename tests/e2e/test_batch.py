@@ -123,7 +123,7 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
 
 
 def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
-    told = ("--effort", "draft", "--target-psnr", 90, "--density", 0.01, "--jobs", 1)
+    told = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
     outcome = run("batch", rooms / "room0", "--output", tmp_path, *told)
     assert outcome.code == 4
     assert "1 of 1 results miss the target" in outcome.err
@@ -133,8 +133,8 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
 @pytest.mark.parametrize(
     ("told", "code", "said"),
     [
-        (("--fit", "color", "--max-drop", 1, "--target-psnr", 30), 2, "expected one of max drop and target psnr"),
-        (("--method", "voxel", "--k", "auto"), 2, "method voxel"),
+        (("--fit", "color", "--quality", "30"), 2, 'quality: expected a PSNR as "30dB"'),
+        (("--method", "voxel", "--budget", "auto"), 2, "method voxel"),
         (("--require-checkpoint", "--checkpoint", "none"), 2, "require_checkpoint"),
         (("--jobs", "many"), 2, "auto"),
         (("--jobs", 0), 2, "auto"),
@@ -142,7 +142,7 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
         (("--retries", -1), 2, "retries"),
         (("--name", "{name}.ply"), 2, "{stem}"),
         (("--name", "{stem}.txt"), 2, "ends in .compressed.ply, .ply, .spz, .splat"),
-        (("--name", "{stem}.spz", "--max-bytes", "1MB"), 2, "max bytes: expected an output as .ply"),
+        (("--name", "{stem}.spz", "--budget", "1MB"), 2, "budget 1MB: expected an output as .ply"),
         (("--name", "same.ply"), 2, "a file of its own for each scene"),
         (("--address", "auto"), 2, "address: expected engine ray"),
         (("--exporter", "nobody"), 2, "nobody"),

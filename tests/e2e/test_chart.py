@@ -230,7 +230,7 @@ def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run
         "--json",
     )
     assert outcome.code == 0
-    assert {settings.get("density") for settings in merges} == {0.02}
+    assert {settings.get("superpixels") for settings in merges} == {"2%"}
     assert json.loads(outcome.out)["num_done"] == 1
 
 

@@ -25,7 +25,7 @@ def made(tmp_path: Path, run: Run) -> Path:
 def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
     found = json.loads(run("inspect", made / "scene_0001", "--json").out)
     assert (found["dialect"], found["num_views"], found["num_missing"], found["notes"]) == ("gsmerge", 3, 0, [])
-    compacted = run("compact", made / "scene_0001", "--density", 0.05, "--fit", "none")
+    compacted = run("compact", made / "scene_0001", "--superpixels", "5%", "--fit", "none")
     assert compacted.code == 0, compacted.err
     targets = made / "scene_0001" / "targets"
     scored = run("evaluate", made / "scene_0001", "--targets", targets, "--lpips", "none", "--json")

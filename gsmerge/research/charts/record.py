@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from gsmerge.budget import new_settings
+
 SCHEMA_VERSION = 1
 INPUT = "input"  # the method of a run that merges nothing
 METRICS = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
@@ -133,6 +135,7 @@ class RunRecord:
             raise ValueError(f"expected a run record, got one with another {odd}")
         for name in ("pictures", "notes"):
             known[name] = tuple(known.get(name, ()))
+        known["settings"] = new_settings(known.get("settings", {}))
         try:
             return RunRecord(**known)
         except TypeError as error:

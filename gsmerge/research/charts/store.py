@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsmerge import __version__
+from gsmerge.budget import old_settings
 from gsmerge.io.content_hash import digest
 from gsmerge.research.charts.record import SCHEMA_VERSION, RunRecord
 from gsmerge.runtime.jsonl import append_line, read_lines
@@ -28,7 +29,7 @@ def experiment_key(scene_sha256: str, method: str, settings: Mapping[str, Any], 
         {
             "scene": scene_sha256,
             "method": method,
-            "settings": dict(settings),
+            "settings": old_settings(settings),
             "views": views,
             "tool_version": __version__,
             "schema_version": SCHEMA_VERSION,

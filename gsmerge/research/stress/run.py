@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from gsmerge.budget import BudgetOptions
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import SceneLoad, align_scene, read_ply_with_hints
 from gsmerge.io.cameras.camera_file import from_viewmats, to_viewmats
@@ -191,8 +192,7 @@ def _again(given: Judged, usual: _Result, options: CompactOptions) -> tuple[bool
     """The result as a scene of its own, compacted to as many Gaussians as it has."""
     scene = given.scene
     loose = UnalignedScene(usual.gaussians, scene.cameras, scene.images, scene.names)
-    plain = replace(options.target, budget=usual.count, max_bytes=None, preset=None, max_drop=None, target_psnr=None)
-    once = replace(options, target=replace(plain, levels=1), decode=replace(options.decode, k=1))
+    once = replace(options, budget=BudgetOptions(budget=usual.count), decode=replace(options.decode, k=1))
     after = _quality(given, compact(loose, once).gaussians)[1]
     return after >= usual.after - SAME - _slack(options), f"{after:.2f} dB; before {usual.after:.2f} dB"
 

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
+from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io import SceneLoad, load_scene, read_targets
@@ -236,7 +237,7 @@ def _worked_out(
     subject: Subject, options: TrainOptions, density: float, name: str, progress: Told | None
 ) -> dict[str, Any]:
     """Arrays of an example, from scratch."""
-    settings = {"density": density, "match": options.match, "fit": "none", "robust": False}
+    settings = {"superpixels": share_text(density), "match": options.match, "fit": "none", "robust": False}
     chosen = CompactOptions().with_settings({**settings, "seed": options.seed})
     scene, members = subject.scene, subject.members
     groups = segment(scene_pictures(scene), chosen.segment)

@@ -104,7 +104,7 @@ def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: 
     told: list[tuple[str, int, int]] = []
     found = stress(
         load,
-        CompactOptions().with_settings({"fit_steps": 30, "density": 0.1}),
+        CompactOptions().with_settings({"fit_steps": 30, "superpixels": "10%"}),
         targets=Views(read.cameras, read.images, read.names),
         progress=lambda *step: told.append(step),
     )
