@@ -85,7 +85,7 @@ class CompactOptions:
             raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
 
     def networks(self, *, photos: bool, aligned: bool = True) -> str:
-        """The checkpoint to load: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
+        """The checkpoint to load: as asked, or the shipped one where it improves results (docs/internals/networks.md).
 
         That is where no fit follows, or a short one; not where time counts most (drafts, fast runs).
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch.find import output_name
-from gsmerge.batch.records import RECORDS, SUMMARY, Index
-from gsmerge.batch.task import Task, Work
+from gsmerge.batch.records import RECORDS, SUMMARY, RecordIndex
+from gsmerge.batch.task import BatchContext, Task
 from gsmerge.options import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
@@ -70,14 +70,14 @@ def holders(folder: Path) -> list[int]:
     return found
 
 
-def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, Work, Index]:
+def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, BatchContext, RecordIndex]:
     """What :func:`run_task` takes for a single scene, as a run would have it that begins now."""
     out.mkdir(exist_ok=True)
-    index = Index(out)
+    index = RecordIndex(out)
     index.read_on()
     name = output_name(options, scene, 0)
     return (
         Task(Job(0, str(scene), name, 0), index.known.get(name)),
-        Work(out, options, index.end),
-        Index(out, index.end),
+        BatchContext(out, options, index.end),
+        RecordIndex(out, index.end),
     )

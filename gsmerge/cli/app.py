@@ -13,7 +13,7 @@ import typer
 from gsmerge import __version__
 from gsmerge.cli.console import one_line, plain_warnings
 from gsmerge.cli.options import renamed
-from gsmerge.errors import GsmergeError
+from gsmerge.errors import DAMAGED_OPENCV, GsmergeError, is_opencv_damaged
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
@@ -97,6 +97,8 @@ def run(args: Sequence[str] | None = None) -> int:
     except Exception as error:
         if isinstance(error, _UsageErrors):
             return fail(_usage_message(error), 2)
+        if is_opencv_damaged(error):
+            return fail(DAMAGED_OPENCV, 1)
         first = f"{type(error).__name__}: {error}".splitlines()[0]
         return fail(f"unexpected error: {first}; run again with --debug", 1)
 

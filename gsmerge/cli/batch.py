@@ -17,8 +17,8 @@ from gsmerge.errors import BatchError, TargetError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
-    from gsmerge.batch.plan import Shape
-    from gsmerge.batch.records import Index
+    from gsmerge.batch.plan import Schedule
+    from gsmerge.batch.records import RecordIndex
     from gsmerge.batch.summary import Totals
 
 
@@ -78,8 +78,8 @@ def batch(args: opt.Args) -> None:
         raise UsageError(f"--output: expected a folder, found the file {out}")
     hints = args.hints()
     from gsmerge.batch import BatchOptions, find_jobs
-    from gsmerge.batch.plan import make_shape
-    from gsmerge.batch.records import Index
+    from gsmerge.batch.plan import make_schedule
+    from gsmerge.batch.records import RecordIndex
 
     with opt.usage_errors():
         options = BatchOptions(
@@ -91,17 +91,17 @@ def batch(args: opt.Args) -> None:
         from gsmerge.batch.ray_engine import require_ray
 
         require_ray()
-    index = Index(out)
+    index = RecordIndex(out)
     index.read_on()
-    jobs = find_jobs(args.scenes, out, options, index.results())
-    shape = make_shape(jobs, options)
+    jobs = find_jobs(args.scenes, out, options, index.result_paths())
+    schedule = make_schedule(jobs, options)
     damaged = [f"{index.damaged} damaged line(s) of the records were ignored"] if index.damaged else []
-    notes = [*damaged, *shape.notes]
+    notes = [*damaged, *schedule.notes]
     if args.dry_run:
-        _print_plan(args, jobs, options, index, shape, notes)
+        _print_plan(args, jobs, options, index, schedule, notes)
         return
     say_notes(notes, quiet=args.silent)
-    _run(args, jobs, options, index, shape)
+    _run(args, jobs, options, index, schedule)
 
 
 def _bytes(text: str | None) -> int | None:
@@ -113,7 +113,7 @@ def _bytes(text: str | None) -> int | None:
         raise UsageError(f'--max-memory: expected a size such as 8GB, got "{text}"') from None
 
 
-def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Index, shape: Shape) -> None:
+def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: RecordIndex, schedule: Schedule) -> None:
     """Compact all scenes, report each, and sum up.
 
     Raises:
@@ -124,14 +124,14 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Inde
     from gsmerge.batch.summary import Totals, summary_lines, write_summary
 
     totals, out = Totals(len(jobs)), args.output
-    at_once = f"{shape.jobs or 'all it has room for'} at once, {shape.threads} thread(s) each"
+    at_once = f"{schedule.jobs or 'all it has room for'} at once, {schedule.threads} thread(s) each"
     say(f"{len(jobs):,} scenes, {at_once}", quiet=args.silent)
     interrupted = False
     try:
         lines = sys.stdout if args.json else None
         with (
             _separate_stdout(options, quiet=args.silent),
-            closing(run_batch(jobs, out, options, index=index, shape=shape)) as records,
+            closing(run_batch(jobs, out, options, index=index, schedule=schedule)) as records,
         ):
             _follow(records, totals, lines, quiet=args.silent)
     except KeyboardInterrupt:
@@ -173,37 +173,44 @@ def _follow(records: Iterable[dict[str, Any]], totals: Totals, lines: TextIO | N
 
 
 def _print_plan(
-    args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Index, shape: Shape, notes: Sequence[str]
+    args: opt.Args,
+    jobs: Sequence[Job],
+    options: BatchOptions,
+    index: RecordIndex,
+    schedule: Schedule,
+    notes: Sequence[str],
 ) -> None:
     from gsmerge.batch.plan import estimate_seconds
-    from gsmerge.batch.task import Work, is_done
+    from gsmerge.batch.task import BatchContext, is_done
     from gsmerge.report import document_head, human_bytes
 
     out, done = args.output, set()
     if not options.rerun:
-        work = Work(out, options, 0)
-        done = {job.output for job in jobs if (known := index.known.get(job.output)) and is_done(job, known, work)}
+        shared = BatchContext(out, options, 0)
+        done = {job.output for job in jobs if (known := index.known.get(job.output)) and is_done(job, known, shared)}
     pending = [job for job in jobs if job.output not in done]
-    seconds = estimate_seconds(pending, options, shape)
+    seconds = estimate_seconds(pending, options, schedule)
     document = {
         **document_head(),
         "dry_run": True,
         "output": str(out),
         "num_scenes": len(jobs),
         "num_pending": len(pending),
-        "jobs": shape.jobs,
-        "threads": shape.threads,
-        "estimate": {"seconds": round(seconds, 1), "memory_bytes": shape.memory},
+        "jobs": schedule.jobs,
+        "threads": schedule.threads,
+        "estimate": {"seconds": round(seconds, 1), "memory_bytes": schedule.memory},
         "scenes": [
             {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output in done}
             for j in jobs
         ],
-        "options": options.told()["settings"],
+        "options": options.result_settings()["settings"],
         "notes": list(notes),
     }
     lines = [f"{job.scene} -> {out / job.output}" for job in pending]
     lines += [f"note: {note}" for note in notes]
     lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} scenes to do")
-    lines.append(f"at once     {shape.jobs or 'as many as the cluster has room for'}, {shape.threads} thread(s) each")
-    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(shape.memory)} of memory")
+    lines.append(
+        f"at once     {schedule.jobs or 'as many as the cluster has room for'}, {schedule.threads} thread(s) each"
+    )
+    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(schedule.memory)} of memory")
     print_document(document, lines, as_json=args.json)

@@ -127,13 +127,13 @@ def _make_plan(
 ) -> tuple[Plan, dict[str, RunRecord], list[str]]:
     """The runs of the grid, records of earlier runs, and notes."""
     from gsmerge.research.charts.experiment import Grid, make_experiments, parse_grid, read_grid
-    from gsmerge.research.charts.places import find_places
     from gsmerge.research.charts.run import make_plan
+    from gsmerge.research.charts.scenes import find_scenes
 
     base = Grid() if args.grid is None else read_grid(args.grid)
     base = replace(base, fixed=tuple(args.fixed)) if args.fixed else base
     experiments, notes = make_experiments(scenes, parse_grid({name: getattr(args, name) for name in LISTS}, base))
-    places = find_places(scenes, args.targets, args.target_images)
+    places = find_scenes(scenes, args.targets, args.target_images)
     plan, stored = make_plan(experiments, places, args.output, options)
     return plan, stored, [*notes, *plan.notes]
 
@@ -151,8 +151,7 @@ def _print_plan(
     args: opt.Args, plan: Plan, stored: dict[str, RunRecord], options: RunOptions, notes: Sequence[str]
 ) -> None:
     from gsmerge.report import document_head
-    from gsmerge.research.charts.estimate import estimate_seconds
-    from gsmerge.research.charts.run import describe
+    from gsmerge.research.charts.run import describe, estimate_seconds
     from gsmerge.runtime.threads import available_threads
 
     out, runs = args.output, [run for run in plan.runs if run[0] in plan.pending]
@@ -184,18 +183,18 @@ def _draw(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     """Draw charts and page of everything in the folder; returns the document about them."""
     from gsmerge.report import document_head
     from gsmerge.research.charts.draw import draw_figures
-    from gsmerge.research.charts.figures import make_figures, make_verdicts
+    from gsmerge.research.charts.figures import make_figures, make_verdict_tables
     from gsmerge.research.charts.page import make_page
     from gsmerge.research.charts.proxies import read_proxies
+    from gsmerge.research.charts.record import CHARTS, PAGE, read_runs
     from gsmerge.research.charts.series import newest
-    from gsmerge.research.charts.store import CHARTS, PAGE, read_runs
 
     stored, unread = read_runs(out)
     proxies, more = read_proxies(out)
     if not stored:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
     records, passed = newest(list(stored.values()))
-    figures, verdicts = make_figures(records, list(proxies.values())), make_verdicts(records)
+    figures, verdicts = make_figures(records, list(proxies.values())), make_verdict_tables(records)
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "chart", "--draw-only", "--output", str(out)])
     page = make_page(records, figures, drawings, verdicts, out, command=command)

@@ -54,11 +54,11 @@ def compact(args: opt.Args) -> None:
 
 def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into this machine's memory."""
-    from gsmerge.io.formats.ply_file import promised
+    from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
     from gsmerge.runtime.memory import machine_memory
 
-    count, num_rest = promised(files.ply)
+    count, num_rest = header_counts(files.ply)
     problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)

@@ -50,7 +50,7 @@ def _run(
 
     imported = perf_counter()
     with atomic_output(out, overwrite=args.overwrite) as temporary:
-        given = read_input(files, settings.segment, opacity=args.opacity, hints=hints)
+        given = read_input(files, opacity=args.opacity, hints=hints)
         read = perf_counter()
         with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
             encoded = encode_scene(given.scene, settings, max_k=args.max_k, progress=progress)

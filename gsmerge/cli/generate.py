@@ -12,7 +12,7 @@ from gsmerge.cli.console import announce_compilation, print_document, stage_prog
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.research.generate import Generated, GenerateOptions
+    from gsmerge.research.generate import GenerateOptions, SceneFolder
 
 
 @opt.command(
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     *opt.panel(
         "Errors",
         opt.option("noise", float, "Factor on the simulated errors of the network.", default=1.0, min=0.0, max=10.0),
-        opt.option("ranges", Path, "TOML or JSON file with ranges of the errors, as in docs/generator.md.",
+        opt.option("ranges", Path, "TOML or JSON file with ranges of the errors, as in docs/internals/generator.md.",
                    shown="the built-in ones"),
     ),
     opt.output("Folder for the scenes: scene_0000 and on.", default=opt.REQUIRED),
@@ -51,7 +51,7 @@ def generate(args: opt.Args) -> None:
     print_document(document, line, as_json=args.json, quiet=args.quiet)
 
 
-def _generate(args: opt.Args, options: GenerateOptions, seed: int) -> list[Generated]:
+def _generate(args: opt.Args, options: GenerateOptions, seed: int) -> list[SceneFolder]:
     """Make the scenes, or list which there would be."""
     from gsmerge.research.generate import generate as generate_scenes
     from gsmerge.research.generate import plan

@@ -11,7 +11,8 @@ def inspect(args: opt.Args) -> None:
     """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
     hints = args.hints()
     from gsmerge.measure.inspect import inspect as inspect_scene
-    from gsmerge.report import document_head, inspection_lines
+    from gsmerge.measure.inspection_lines import inspection_lines
+    from gsmerge.report import document_head
 
     facts = inspect_scene(
         args.scene, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints)

@@ -17,14 +17,15 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
     """Print what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
-    from gsmerge.report import plan_document, plan_lines
+    from gsmerge.report import document_head
+    from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
 
-    given = read_input(files, settings.segment, opacity=args.opacity, hints=hints)
+    given = read_input(files, opacity=args.opacity, hints=hints)
     scene, cameras = given.scene, given.scene.cameras
     with usage_errors():
-        wanted = budget_count(scene, settings)
+        budget = budget_count(scene, settings)
     _, unused = choose_baseline(settings, scene)
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
@@ -35,10 +36,10 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
-        usual=default_count(scene, settings),
-        wanted=wanted,
+        default_count=default_count(scene, settings),
+        budget=budget,
         notes=[*given.notes, *unused],
         count=scene.num_gaussians,
         num_rest=3 * scene.gaussians.shN.shape[1],
     )
-    print_document(document, plan_lines(document), as_json=args.json)
+    print_document({**document_head(), **document}, plan_lines(document), as_json=args.json)

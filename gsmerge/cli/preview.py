@@ -20,7 +20,7 @@ from gsmerge.cli.pictures import report_pictures, write_picture
 def preview(args: opt.Args) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
     hints, scenes = args.hints(), args.scenes
-    from gsmerge.io import place_views, ply_notes, read_ply, read_ply_with_hints
+    from gsmerge.io import place_cameras_in_scene, ply_notes, read_ply, read_ply_with_hints
     from gsmerge.measure.preview import contact_sheet
     from gsmerge.runtime.threads import use_threads
     from gsmerge.views import pick_views
@@ -31,7 +31,7 @@ def preview(args: opt.Args) -> None:
     check_cameras(files)
     plys = [read_ply_with_hints(files.ply, opacity=args.opacity, hints=hints)]
     plys += [read_ply(path, opacity=args.opacity) for path in scenes[1:]]
-    placed = place_views(plys[0], files, hints=hints)
+    placed = place_cameras_in_scene(plys[0], files, hints=hints)
     used = list(placed.views.used)
     cameras, photos = placed.views.cameras[used], placed.views.images
     photos = None if photos is None else photos[used]
@@ -42,7 +42,7 @@ def preview(args: opt.Args) -> None:
         gaussians = [placed.gaussians, *(ply.gaussians for ply in plys[1:])]
         parts = [(path.name, some) for path, some in zip(scenes, gaussians, strict=True)]
         with use_threads(args.threads), announce_compilation(quiet=args.silent):
-            sheet = contact_sheet(parts, cameras, photos, most_views=args.views)
+            sheet = contact_sheet(parts, cameras, photos, max_views=args.views)
         write_picture(args.output, sheet, overwrite=args.overwrite)
     ids = pick_views(len(cameras), args.views)
     facts = {

@@ -28,9 +28,8 @@ KINDS = ("borders", "means", "saliency")
 )
 def segment(args: opt.Args) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
-    from gsmerge.compact_file import superpixels_per_view
     from gsmerge.runtime.threads import use_threads
-    from gsmerge.stages.segment import SegmentOptions
+    from gsmerge.stages.segment import SegmentOptions, count_for
 
     with opt.usage_errors():
         options = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))
@@ -38,7 +37,7 @@ def segment(args: opt.Args) -> None:
     check_folder(args.output, input_files(files), overwrite=args.overwrite)
     load = args.load(files)
     scene = load.pixel_scene()
-    per_view = superpixels_per_view(options, scene.cameras.width, scene.cameras.height)
+    per_view = count_for(options, scene.cameras.height, scene.cameras.width)
     say_notes(load.notes, quiet=args.silent)
     stems = picture_stems(scene.names)
     pictures = [args.output / f"{stem}.{kind}.png" for stem in stems for kind in KINDS]

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 def train(args: opt.Args) -> None:
     """Train networks on what the fit changes in scenes and on photos; after an interruption the same call resumes."""
     from gsmerge.report import document_head
-    from gsmerge.research.training import network_device, preset_options, read_config
+    from gsmerge.research.training import choose_device, preset_options, read_config
     from gsmerge.research.training import train as train_networks
     from gsmerge.runtime.threads import use_threads
 
@@ -47,7 +47,7 @@ def train(args: opt.Args) -> None:
     if args.config is not None:
         options = read_config(args.config, options)
     with opt.usage_errors():
-        options, device = replace(options, **args.given(("steps", "seed"))), network_device(args.device or "cpu")
+        options, device = replace(options, **args.given(("steps", "seed"))), choose_device(args.device or "cpu")
     with (
         announce_compilation(quiet=args.silent),
         stage_progress(quiet=args.silent) as progress,

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.budget import parse_share
+from gsmerge.errors import UsageError
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.sweeps import refine
@@ -88,8 +89,17 @@ def _check(segmentation: str, effort: str, compactness: float) -> None:
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Superpixels that ``options`` ask for in a view of this size."""
-    return options.per_view or max(1, int(options.share * height * width))
+    """Superpixels that ``options`` ask for in a view of this size.
+
+    Raises:
+        UsageError: If there are more than pixels.
+    """
+    if options.per_view is not None:
+        if options.per_view > height * width:
+            limit = f"{height * width}, one per pixel of {width} x {height}"
+            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
+        return options.per_view
+    return max(1, int(options.share * height * width))
 
 
 def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -> Groups:

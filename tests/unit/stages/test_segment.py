@@ -96,7 +96,7 @@ def test_counts_of_options() -> None:
     assert count_for(SegmentOptions(superpixels="0.1%"), 5, 5) == 1
     with pytest.raises(ValueError, match="superpixels: expected at least 1, got 0"):
         SegmentOptions(superpixels=0)
-    with pytest.raises(ValueError, match='superpixels: expected a number, or a share as "4.4%", above 0'):
+    with pytest.raises(ValueError, match=r'superpixels: expected a number, or a share as "4\.4%", above 0'):
         SegmentOptions(superpixels="0%")
 
 
