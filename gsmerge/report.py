@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
+from gsmerge.options import to_schema
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Gaussians
 
@@ -128,7 +129,7 @@ def report_document(
             for path, level in coarser
         ],
         "ratio": numbers["num_output"] / max(numbers["num_input"], 1),
-        "options": numbers["options"],
+        "options": to_schema(report.options),
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
         **seconds_document(stages),

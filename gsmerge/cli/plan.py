@@ -17,6 +17,7 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
     """Print what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
+    from gsmerge.options import to_schema
     from gsmerge.report import document_head
     from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
@@ -42,4 +43,5 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
         count=scene.num_gaussians,
         num_rest=3 * scene.gaussians.shN.shape[1],
     )
-    print_document({**document_head(), **document}, plan_lines(document), as_json=args.json)
+    schema = {"options": to_schema(document["options"])}
+    print_document({**document_head(), **document, **schema}, plan_lines(document), as_json=args.json)

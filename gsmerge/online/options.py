@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsmerge.budget import new_settings
 from gsmerge.encoded.encoded import StoredScene
-from gsmerge.options import CompactOptions
+from gsmerge.options import CompactOptions, from_schema
 from gsmerge.stages.decode import MAX_CHILDREN
 
 
@@ -57,8 +56,8 @@ def merge_settings(
     """
     names = OnlineOptions.__dataclass_fields__.keys()
     known = names | CompactOptions().to_dict().keys()
-    before = {} if state is None else new_settings(state.about["options"])
-    before = {name: value for name, value in before.items() if name in known}
+    stored = {} if state is None else from_schema(state.about["options"])
+    before = {name: value for name, value in stored.items() if name in known}
     merged = {"fit": "color"} | before | dict(settings)
     online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})
     return CompactOptions().with_settings(merged), online

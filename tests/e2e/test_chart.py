@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gsmerge.research.charts.store import read_runs
 
 import gsmerge
 from gsmerge.research.charts import run as running
+from gsmerge.research.charts.record import read_runs
 
 from .conftest import Outcome, Run, listing
 
