@@ -150,9 +150,7 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     for style, name in (("views", "plain"), ("da3", "da3"), ("depthsplat", "depthsplat"), ("anysplat", "anysplat")):
         records = parts.get(style, ())
         if style == "views":
-            records = [
-                r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"} and r.settings.get("k") != "auto"
-            ]
+            records = [r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"}]
             records = [
                 *records,
                 *(r for r in parts.get("sizes", ()) if r.method == "paper" and r.settings.get("budget") == "4.4%"),
@@ -238,11 +236,11 @@ ABLATION = {
     (("fit", "color"),): "without the full fit: colours alone, merge chosen by the photos",
     (("checkpoint", "none"), ("fit", "none")): "without any fit: merge chosen by the photos",
     (("checkpoint", "shipped"), ("fit", "none")): "without any fit: the trained encoder, merger, refiner and heads",
-    (("density", 0.02),): "larger superpixels",
-    (("density", 0.087),): "smaller superpixels",
+    (("superpixels", "2%"),): "larger superpixels",
+    (("superpixels", "8.7%"),): "smaller superpixels",
     (("segmentation", "bass-st"),): "the paper's superpixels (BASS with Shi-Tomasi)",
     (("segmentation", "slic"),): "SLIC superpixels",
-    (("k", "auto"),): "as many Gaussians as the scene needs (`--k auto`)",
+    (("budget", "auto"),): "as many Gaussians as the scene needs (`--budget auto`)",
 }
 
 
@@ -316,9 +314,9 @@ def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
     gains = sorted(_gains(parts), key=lambda row: float(row[-1]))
     lost = [row for row in gains if float(row[-1]) < 0]
     head = ("scene", "part", "views", "settings", "input (dB)", "gsmerge")
-    shown = lost or gains[:5]
+    listed = lost or gains[:5]
     words = "are below their input" if lost else "gain least (none is below its input)"
-    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{_table(head, shown)}"
+    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{_table(head, listed)}"
     return "\n\n".join(filter(None, [text, _too_many(parts.get("sizes", ())), _without(parts.get("ablation", ()))]))
 
 

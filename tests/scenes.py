@@ -260,7 +260,7 @@ def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
 def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
     """A scene whose photos show exactly these Gaussians."""
     scene = make_scene(room(), arc(views, 48, 36), degree=degree)
-    gaussians = plain(scene, density=0.08)
+    gaussians = plain(scene, superpixels="8%")
     gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
     images = images_of(gaussians, scene.cameras)[0].clip(0, 1)
     return replace(scene, images=torch.from_numpy(images).float()), gaussians
@@ -288,7 +288,7 @@ def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:
 def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
     """``compact`` with the invariants checked; a tenth of the pixels unless told."""
     if "superpixels" not in settings:
-        settings = {"density": 0.1, **settings}
+        settings = {"superpixels": "10%", **settings}
     result = compact(scene, **settings)
     assert_invariants(result.gaussians, scene)
     assert_consistent(result.report, scene, result.gaussians)

@@ -101,10 +101,10 @@ def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
 
 def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
     read = read_held_out(load, made_scene / "targets")
-    told: list[tuple[str, int, int]] = []
+    steps: list[tuple[str, int, int]] = []
     found = stress(
         load,
-        CompactOptions().with_settings({"fit_steps": 30, "density": 0.1}),
+        CompactOptions().with_settings({"fit_steps": 30, "superpixels": "10%"}),
         targets=Views(read.cameras, read.images, read.names),
         progress=lambda *step: steps.append(step),
     )

@@ -144,7 +144,7 @@ def test_training_lowers_the_loss(example: Example, tmp_path: Path) -> None:
 
 def test_a_trained_checkpoint_works(example: Example, tmp_path: Path) -> None:
     done = train([example], [], tmp_path, replace(OPTIONS, steps=4))
-    chosen = {"fit": "none", "density": 0.1, "robust": False}
+    chosen = {"fit": "none", "superpixels": "10%", "robust": False}
     plain = gsmerge.compact(scene(), **chosen)
     learned = gsmerge.compact(scene(), **chosen, checkpoint=str(done.last), require_checkpoint=True)
     assert not torch.equal(plain.gaussians.means, learned.gaussians.means)
