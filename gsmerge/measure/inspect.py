@@ -79,7 +79,7 @@ class Inspection:
         rows: Which hints of the rows won, and by how much; None while there is none.
         alignment_score: Share of the Gaussians at most one pixel from their pixels' centres; None without pixels.
         alignment_margin: How many times nearer they are than under the next reading; None without pixels.
-        check_cameras: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
+        sight: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
             cameras that fit.
         coverage: What every view shows.
         estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
@@ -121,7 +121,7 @@ class Inspection:
     rows: str | None
     alignment_score: float | None
     alignment_margin: float | None
-    check_cameras: CameraCheck | None
+    sight: CameraCheck | None
     coverage: tuple[Coverage, ...]
     estimate: dict[str, float] | None
     notes: tuple[str, ...]
