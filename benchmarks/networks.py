@@ -1,6 +1,6 @@
 """What the trained networks gain on real scenes: learned against analytic at equal counts, and stage by stage.
 
-python benchmarks/networks.py eval                      # the tables of docs/networks.md; what is done is kept
+python benchmarks/networks.py eval                      # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
 
@@ -64,7 +64,6 @@ ABLATION = (
     Condition("matching by the K = 1 head", {**ONE, **PLAIN, "geometry": "decoded"}, learned=(True,)),
     Condition("larger superpixels", {"budget": "2%", **PLAIN}),
     Condition("smaller superpixels", {"budget": "8.7%", **PLAIN}),
-    Condition("bfloat16", {**ONE, **PLAIN, "precision": "bfloat16"}, learned=(True,)),
     Condition("the photos choose the merge", {**ONE, "fit": "none", "robust": True}),
 )
 PARTS = {"gain": GAIN, "children": MANY, "ablation": ABLATION}
@@ -170,9 +169,9 @@ def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse
         gain = paired_difference(pick(after, "psnr"), pick(before, "psnr"))
         worst = min(after[s]["psnr"] - before[s]["psnr"] for s in after)
         lpips = [run["lpips_vgg"] - before[s]["lpips_vgg"] for s, run in after.items() if "lpips_vgg" in run]
-        told = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
+        lpips_gain = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
         first = summary(before) if False in condition.learned else "(whole, no fit) " + summary(before)
-        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {told} |")
+        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {lpips_gain} |")
     return "\n".join(rows)
 
 

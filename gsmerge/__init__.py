@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from gsmerge.encoded.decode import decode_scene as decode_scene
     from gsmerge.encoded.encode import encode_scene as encode_scene
     from gsmerge.encoded.encoded import Encoded as Encoded
-    from gsmerge.encoded.file import load_encoded as load_encoded
-    from gsmerge.encoded.file import save_encoded as save_encoded
+    from gsmerge.encoded.gsm_file import load_encoded as load_encoded
+    from gsmerge.encoded.gsm_file import save_encoded as save_encoded
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
     from gsmerge.io import read_cameras as read_cameras
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_HOMES = {
+_PUBLIC = {
     "errors": ("GsmergeError", "SceneError"),
     "measure.evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "measure.inspect": ("inspect",),
@@ -64,10 +64,10 @@ _HOMES = {
     "encoded.decode": ("decode_scene",),
     "encoded.encode": ("encode_scene",),
     "encoded.encoded": ("Encoded",),
-    "encoded.file": ("load_encoded", "save_encoded"),
+    "encoded.gsm_file": ("load_encoded", "save_encoded"),
     "types": ("Cameras", "Gaussians", "UnalignedScene", "PixelScene"),
 }
-_EXPORTS = {name: home for home, names in _HOMES.items() for name in names}
+_EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}
 
 __all__ = ["__version__", *sorted(_EXPORTS)]  # noqa: PLE0604 - strings all, from the table above
 

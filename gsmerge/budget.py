@@ -17,7 +17,7 @@ SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """What decides the number of Gaussians, beside the superpixels of each view and K.
+    """What decides the number of Gaussians, next to the superpixels of each view and K.
 
     Args:
         budget: Gaussians in the result: a number, or a share of the input as "2%". Met, and never exceeded.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsmerge.types import SH_C0, Cameras
 
-_Array = TypeVar("_Array", np.ndarray, Tensor)
+Colors = TypeVar("Colors", np.ndarray, Tensor)
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 
@@ -78,7 +78,7 @@ def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     return project_points(means.double(), cameras.viewmats.double(), cameras.Ks.double())
 
 
-def project_points(points: _Array, viewmats: _Array, Ks: _Array) -> tuple[_Array, _Array]:
+def project_points(points: Colors, viewmats: Colors, Ks: Colors) -> tuple[Colors, Colors]:
     """:func:`project` for NumPy arrays and tensors of any leading shape, in their own precision.
 
     Args:
@@ -94,16 +94,6 @@ def project_points(points: _Array, viewmats: _Array, Ks: _Array) -> tuple[_Array
     return image[..., :2] / image[..., 2:], camera[..., 2]
 
 
-def sh0_to_rgb(sh0: _Array) -> _Array:
-    """Base colours, 0 to 1 where they are in range, of harmonics of degree 0."""
-    return 0.5 + SH_C0 * sh0
-
-
-def rgb_to_sh0(rgb: _Array) -> _Array:
-    """Harmonics of degree 0 of base colours in [0, 1]."""
-    return (rgb - 0.5) / SH_C0
-
-
 def morton_codes(points: np.ndarray) -> np.ndarray:
     """``[n]`` int64 places along a space-filling curve (Morton's) of points ``[n,3]``: the bits interleaved."""
     codes = np.zeros(len(points), np.int64)
@@ -115,3 +105,13 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
         for bit in range(MORTON_BITS):
             codes |= (column >> bit & 1) << (3 * bit + axis)
     return codes
+
+
+def sh0_to_rgb(sh0: Colors) -> Colors:
+    """Base colours (sRGB, 0 to 1 where they can be shown) of spherical harmonics of degree 0, same shape and type."""
+    return 0.5 + SH_C0 * sh0
+
+
+def rgb_to_sh0(rgb: Colors) -> Colors:
+    """The inverse of :func:`sh0_to_rgb`."""
+    return (rgb - 0.5) / SH_C0

@@ -30,7 +30,7 @@ class Members:
         scales: ``[n,3]``.
         opacities: ``[n]``.
         sh0: ``[n,1,3]``.
-        shN: ``[n,k-1,3]``, apart from the others: of degree 4 it is most of a scene, and only pooling looks at it.
+        shN: ``[n,k-1,3]``, apart from the others: of degree 4 it is most of a scene, and only pooling reads it.
         footprints: ``[n]`` size of one pixel of the own view at the member's depth, world units.
         pixels: ``[n]`` int64, the pixel (view-major, row-major over all views) that a member belongs to, -1 for none;
             None: one member per pixel, in order.

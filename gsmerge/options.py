@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.budget import TargetOptions
 from gsmerge.stages.assign import ContributionOptions
 from gsmerge.stages.backing import BackingOptions
-from gsmerge.stages.choose_merge import RobustOptions
+from gsmerge.stages.choose_merge import RobustOptions, photos_choose
 from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.encode import EncodeOptions
 from gsmerge.stages.fit import FitOptions
@@ -23,7 +23,7 @@ METHODS = (
 )  # fmt: skip
 
 CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
-PRECISIONS = ("float32", "bfloat16")
+AUTO_STEPS = 2  # times the usual ones
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 
 
@@ -42,15 +42,13 @@ class CompactOptions:
         decode: Gaussians per group.
         fit: Fit to the photos.
         target: What decides the number of Gaussians.
-        method: ``"gsmerge"``: the stages above. Any other: a rival method, see :mod:`gsmerge.baselines`, for which
+        method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
             come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
             analytic start shows the views better, see :meth:`networks`.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
-        precision: Of the networks' own arithmetic: ``"float32"`` or ``"bfloat16"``, which halves their memory and is
-            faster on processors that know it.
-        seed: Everything random hangs on it; on the CPU, runs with one seed are bit-identical.
+        seed: Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:
@@ -71,15 +69,12 @@ class CompactOptions:
     method: str = "gsmerge"
     checkpoint: str = "auto"
     require_checkpoint: bool = False
-    precision: str = "float32"
     seed: int = 0
     threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
-        if self.precision not in PRECISIONS:
-            raise ValueError(f"precision: expected {' or '.join(PRECISIONS)}, got {self.precision!r}")
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
@@ -89,23 +84,42 @@ class CompactOptions:
         for name in (name for name, wanted in asked.items() if wanted):
             raise ValueError(f"method {self.method}: expected a budget, a preset or a density, got {name}")
 
-    def networks(self, *, photos: bool) -> str:
-        """The checkpoint to load: as asked; otherwise the shipped one where it was measured to gain (docs/networks.md).
+    def networks(self, *, photos: bool, aligned: bool = True) -> str:
+        """The checkpoint to load: as asked, or the shipped one where it improves results (docs/internals/networks.md).
 
         That is where no fit follows, or a short one; not where time counts most (drafts, fast runs).
 
         Args:
             photos: Whether there are any to fit to.
+            aligned: Whether there is one Gaussian per pixel, which is what the shipped networks learnt from.
         """
         if self.checkpoint != "auto":
             return self.checkpoint
+        if not aligned:
+            return "none"
         short = not photos or self.fit.fit == "none" or (self.fit.fit == "full" and self.fit.steps <= SHORT_STEPS)
         hasty = self.fit.effort in ("draft", "fast")
         return "shipped" if short and not hasty and not self.robust.robust and self.encode.rule == "depth" else "none"
 
     def resolved(self, *, photos: bool) -> dict[str, Any]:
         """As :meth:`to_dict`, with the checkpoint and the matching that are used where nothing else was asked for."""
-        return self.to_dict() | {"checkpoint": self.networks(photos=photos), "match": self.match.method}
+        robust = photos_choose(self.robust.robust, self.fit.fit, self.fit.effort)
+        return self.to_dict() | {
+            "checkpoint": self.networks(photos=photos),
+            "match": self.match.method,
+            "robust": robust,
+        }
+
+    def with_auto_steps(self) -> CompactOptions:
+        """With ``k="auto"`` twice the steps, unless given: fewer Gaussians cost less each, and need them for detail."""
+        if self.decode.k != "auto" or self.fit.fit_steps is not None:
+            return self
+        return replace(self, fit=replace(self.fit, fit_steps=AUTO_STEPS * self.fit.steps))
+
+    @property
+    def needs_tree(self) -> bool:
+        """Whether the number of Gaussians is searched for, or further levels of detail are cut."""
+        return self.target.searches or self.decode.k == "auto" or self.target.levels > 1
 
     @property
     def whole_only(self) -> list[str]:
@@ -144,3 +158,44 @@ class CompactOptions:
         if unknown:
             raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(self.to_dict()))}")
         return replace(self, **changes)
+
+
+# Names of settings in reports, records and files, where the code's differ. They are a schema and do not change.
+SCHEMA_NAMES = {
+    "min_owner_weight": "min_contribution",
+    "half_res_share": "coarse",
+    "ssim_lambda": "dssim",
+    "opacity_reg": "opacity_pull",
+    "scale_reg": "size_pull",
+    "prior_weight": "pull",
+    "min_contribution": "prune",
+}
+RATE_SCHEMA_NAMES = {
+    "means_lr": "mean",
+    "scales_lr": "size",
+    "quats_lr": "quat",
+    "opacities_lr": "logit",
+    "colors_lr": "color",
+    "max_mean_shift": "reach_mean",
+    "max_scale_change": "reach_size",
+    "max_opacity_change": "reach_logit",
+    "single_view_share": "reach_alone",
+}
+
+
+def to_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by flat name -> the same by their names in reports, records and files."""
+    return _rename(settings, SCHEMA_NAMES, RATE_SCHEMA_NAMES)
+
+
+def from_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The inverse of :func:`to_schema`."""
+    names, rate_names = ({old: new for new, old in both.items()} for both in (SCHEMA_NAMES, RATE_SCHEMA_NAMES))
+    return _rename(settings, names, rate_names)
+
+
+def _rename(settings: Mapping[str, Any], names: Mapping[str, str], rates: Mapping[str, str]) -> dict[str, Any]:
+    renamed = {names.get(name, name): value for name, value in settings.items()}
+    if isinstance(renamed.get("rates"), Mapping):
+        renamed["rates"] = {rates.get(name, name): value for name, value in renamed["rates"].items()}
+    return renamed

@@ -1,27 +1,30 @@
-"""What each number of Gaussians would bring: short fits, judged by parts of the photos that they left out."""
+"""How many Gaussians: the knee of the scene's own curve, a quality target, further levels of detail.
+
+A curve is measured by short fits, judged by parts of the photos that they left out.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.build import Source, build
 from gsmerge.measure.lpips import lpips, lpips_available
-from gsmerge.options import CompactOptions
-from gsmerge.render import composite, plan_view, prepare
 from gsmerge.render.metrics import WINDOW, ssim
-from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.render.photos import Photos, photo_errors, scene_photos
+from gsmerge.report import CompactResult
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.fit.holdout import holdout_psnr, training_weights
-from gsmerge.stages.group import Canvas, cut_scene
-from gsmerge.stages.region_tree import RegionTree
+from gsmerge.stages.group import knee_count
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
+
+Build = Callable[[PreparedScene, int | None, RunLog], Gaussians]
 
 SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' blocks
@@ -35,7 +38,7 @@ KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaus
 SLOPE = 1.0  # dB per doubling of the count, until two counts have been tried
 CLOSE = 1.15  # counts this near to each other are one
 MAX_RUNS = 6
-MOST = 4  # times the usual count is the most that a quality target may take
+MAX_FACTOR = 4  # times the usual count is the most that a quality target may take
 
 
 @dataclass(frozen=True)
@@ -55,59 +58,110 @@ class CurvePoint:
     lpips: float | None = None
 
 
+def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | None:
+    """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say.
+
+    Args:
+        prepared: The scene.
+        build: What makes Gaussians of it, see :func:`gsmerge.pipeline.build`.
+        log: Takes the curve.
+    """
+    limits, options, drop = prepared.limits, prepared.options, prepared.options.target.max_drop
+    if drop is None and options.decode.k != "auto":
+        return limits.count
+    if prepared.given.images is None:
+        return knee_count(prepared)
+    with log.stage("curve"):
+        counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
+        points = measure_curve(prepared, build, SHORT if drop is None else LONG, counts, log)
+    log.choices["curve"] = [asdict(point) for point in points]
+    return curve_knee(points) if drop is None else count_within(points, drop)
+
+
+def search_quality(
+    prepared: PreparedScene, build_scored: Callable[[int, RunLog], CompactResult], log: RunLog
+) -> CompactResult:
+    """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do.
+
+    Args:
+        prepared: The scene, with ``target_psnr`` among its options.
+        build_scored: Number of Gaussians and a log -> scored result.
+        log: Of what came before; its seconds and notes enter the report.
+    """
+    target, limits = prepared.options.target.target_psnr, prepared.limits
+    assert target is not None
+    results: dict[int, CompactResult] = {}
+
+    def run(count: int) -> float:
+        results[count] = build_scored(count, RunLog(log.progress))
+        return results[count].report.psnr_after or 0.0
+
+    max_count = min(limits.max_count, MAX_FACTOR * limits.default)
+    search = search_count(run, target, min(limits.default, max_count), limits.min_count, max_count)
+    result = results[search.count]
+    seconds = dict(log.seconds)
+    for one in results.values():
+        for name, value in one.report.seconds.items():
+            seconds[name] = seconds.get(name, 0.0) + value
+    unmet = None
+    if not search.met:
+        unmet = (
+            f"target psnr: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
+            f" with {len(result.gaussians)} Gaussians"
+        )
+    choices = result.report.choices | {"search": asdict(search)}
+    notes = [*log.notes, *result.report.notes]
+    return replace(result, report=replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet))
+
+
 def measure_curve(
-    source: Source,
-    canvas: Canvas,
-    tree: RegionTree,
-    options: CompactOptions,
-    steps: int,
-    counts: Sequence[int],
-    log: RunLog,
+    prepared: PreparedScene, build: Build, steps: int, counts: Sequence[int], log: RunLog
 ) -> list[CurvePoint]:
     """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
-    PSNR and SSIM are those of blocks that the short fits do not look at, at full size; LPIPS needs whole pictures.
+    PSNR and SSIM are those of blocks that the short fits leave out, at full size; LPIPS needs whole pictures.
 
     Args:
-        source: The scene, which must have photos.
-        canvas: Its pictures.
-        tree: What superpixels are cut from.
-        options: All settings; the fit's own length does not matter.
-        steps: Length of the fits.
-        counts: Numbers of Gaussians, each within the canvas' limits.
-        log: Told the progress.
+        prepared: The scene, which must have photos.
+        build: What makes Gaussians of it.
+        steps: Length of the fits; those of the options do not matter.
+        counts: Numbers of Gaussians, each within the limits.
+        log: Takes the progress.
     """
-    short = FitOptions(fit="full", fit_steps=steps, coarse=1.0, holdout=HOLDOUT, rates=options.fit.rates)
-    quick = replace(options, fit=short)
-    whole = replace(canvas, share=1.0)  # so short a fit does not grow
-    photos = scene_photos(source.scene)
-    held = training_weights(photos, HOLDOUT, options.seed)
+    options = prepared.options
+    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
+    limits = replace(prepared.limits, share=1.0)  # so short a fit does not grow
+    quick = replace(prepared, options=replace(options, fit=short), limits=limits, checkpoint=None)
+    photos = scene_photos(prepared.scene)
+    weights = training_weights(photos, HOLDOUT, options.seed)
     points: list[CurvePoint] = []
     for count in counts:
         log.curve_progress(len(points), len(counts))
-        gaussians = build(source, cut_scene(source.scene, whole, tree, quick, count), quick, RunLog())
-        points.append(_point(count, gaussians, photos, held, quick.fit.min_gain))
+        points.append(_point(count, build(quick, count, RunLog()), photos, weights, short.min_gain))
     return points
 
 
-def _point(count: int, gaussians: Gaussians, photos: Photos, held: list[np.ndarray], min_gain: float) -> CurvePoint:
-    splats, views = prepare(gaussians), range(len(photos))
-    images = parallel_map(lambda v: np.clip(composite(plan_view(splats, **photos.camera(v)))[0], 0, 1), views)
-    similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], held[v] == 0), views)
+def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.ndarray], min_gain: float) -> CurvePoint:
+    def clipped(view: int, image: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return np.clip(image, 0, 1)
+
+    images = photo_errors(gaussians, photos, clipped)
+    views = range(len(photos))
+    similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
     perceptual = None
     if min(photos.height, photos.width) >= PERCEPTUAL_SIDE and lpips_available(NET):
         some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
         perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in some]))
-    psnr = holdout_psnr(images, photos, held, min_gain)
+    psnr = holdout_psnr(images, photos, weights, min_gain)
     return CurvePoint(count, psnr, float(np.mean(similar)), perceptual)
 
 
-def _similarity(image: np.ndarray, photo: np.ndarray, held: np.ndarray) -> float:
+def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
     """SSIM of the held-out windows that lie inside the picture; of the whole where none does, 0 where none can."""
-    if min(held.shape) < WINDOW:
+    if min(mask.shape) < WINDOW:
         return 0.0
     border = WINDOW // 2
-    return ssim(image, photo, held if held[border:-border, border:-border].any() else None)
+    return ssim(image, photo, mask if mask[border:-border, border:-border].any() else None)
 
 
 def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:

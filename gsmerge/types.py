@@ -1,6 +1,6 @@
 """The core types: frozen dataclasses of tensors, and nothing but indexing and moving.
 
-One convention in memory (docs/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
+One convention in memory (docs/reference/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
 rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres at +0.5, sRGB in [0, 1].
 """
 
@@ -76,7 +76,7 @@ class Gaussians:
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Rows of all parts in order; all must have the same SH degree."""
+        """Rows of all parts, one part after the other; all must have the same SH degree."""
         return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
 
 
@@ -255,6 +255,23 @@ class Groups:
 
 
 @dataclass(frozen=True)
+class Segmentation:
+    """The superpixels of a scene and the number of Gaussians that they become.
+
+    Args:
+        groups: Superpixels of every view.
+        coarse: Coarse ones for the backing layer; None: no such layer.
+        count: Gaussians in the end; never more.
+        exact: Whether that number was asked for as such, and is to be met.
+    """
+
+    groups: Groups
+    coarse: Groups | None
+    count: int
+    exact: bool
+
+
+@dataclass(frozen=True)
 class Matches:
     """Clusters of Feature Gaussians that show the same piece of surface.
 
@@ -322,7 +339,7 @@ class FeatureGaussians:
 
     @staticmethod
     def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
-        """All groups of all parts in order."""
+        """All groups, one part after the other."""
         names = [f.name for f in fields(FeatureGaussians) if f.name != "starts"]
         columns = {name: torch.cat([getattr(p, name) for p in parts]) for name in names}
         sizes = torch.cat([p.starts[1:] - p.starts[:-1] for p in parts])

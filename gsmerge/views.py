@@ -1,4 +1,4 @@
-"""Which views go in, which are held out (the paper's rule, supplement A, "View sampling"), and which are looked at."""
+"""Which views go in, which are held out (the paper's rule, supplement A, "View sampling"), and which are scored."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsmerge.runtime.estimate import MOST_JUDGED
+from gsmerge.runtime.estimate import MAX_SCORED_VIEWS
 from gsmerge.types import PixelScene, UnalignedScene
 
 
@@ -26,12 +26,12 @@ def even_views(num_views: int, count: int) -> list[int]:
     return [round(i * (num_views - 1) / (count - 1)) for i in range(count)]
 
 
-def judged_views(num_views: int) -> list[int]:
+def scored_views(num_views: int) -> list[int]:
     """The views that whole scenes are judged by: all, of many evenly spread ones.
 
     Rendering the unmerged input costs as many views as Gaussians, so with all of many views it would be most of a run.
     """
-    return even_views(num_views, min(num_views, MOST_JUDGED))
+    return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
 def pick_views(num_views: int, most: int) -> list[int]:
@@ -83,7 +83,7 @@ def _equal_views(scene: PixelScene | UnalignedScene, one: int, other: int) -> bo
 def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> PixelScene | UnalignedScene:
     """The scene as if only some of its views had been given: their Gaussians, cameras and photos.
 
-    Gaussians in no order belong to no view, and all stay.
+    Unaligned Gaussians belong to no view, and all stay.
     """
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]

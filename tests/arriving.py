@@ -11,7 +11,7 @@ import scenes
 import torch
 
 from gsmerge import Compactor, PixelScene
-from gsmerge.online.state import OnlineState, Parts
+from gsmerge.online.state import GroupSet, OnlineState
 from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
 
@@ -47,7 +47,7 @@ def state_of(compactor: Compactor) -> OnlineState:
 
 def same_state(one: OnlineState, other: OnlineState) -> None:
     """To the last bit, and in everything that is told."""
-    same_parts(one.parts, other.parts)
+    same_groups(one.groups, other.groups)
     assert (one.kept is None) == (other.kept is None)
     if one.kept is not None and other.kept is not None:
         assert scenes.identical(one.kept, other.kept)
@@ -62,26 +62,27 @@ def same_state(one: OnlineState, other: OnlineState) -> None:
     assert one.about == other.about
 
 
-def same_parts(one: Parts, other: Parts) -> None:
+def same_groups(one: GroupSet, other: GroupSet) -> None:
     """To the last bit, types included."""
     for f in fields(one.features):
         a, b = getattr(one.features, f.name), getattr(other.features, f.name)
         assert a.dtype == b.dtype, f.name
         assert torch.equal(a, b), f.name
     assert scenes.identical(one.children, other.children)
-    assert torch.equal(one.solved, other.solved)
-    assert torch.equal(one.held, other.held)
+    assert torch.equal(one.fitted_sh0, other.fitted_sh0)
+    assert torch.equal(one.color_precision, other.color_precision)
 
 
-def group(parts: Parts, row: int) -> tuple[dict[str, torch.Tensor], Gaussians]:
+def group(groups: GroupSet, row: int) -> tuple[dict[str, torch.Tensor], Gaussians]:
     """One group's columns and its children."""
-    one = take(parts.features, torch.tensor([row]))
+    one = take(groups.features, torch.tensor([row]))
     names = [f.name for f in fields(one) if f.name not in ("starts", "members")]
     columns = {name: getattr(one, name) for name in names}
-    return columns | {"solved": parts.solved[row], "held": parts.held[row]}, parts.children[one.members]
+    columns |= {"fitted_sh0": groups.fitted_sh0[row], "color_precision": groups.color_precision[row]}
+    return columns, groups.children[one.members]
 
 
-def same_group(one: Parts, row: int, other: Parts, place: int) -> bool:
+def same_group(one: GroupSet, row: int, other: GroupSet, place: int) -> bool:
     """Whether a group of one is a group of the other, to the last bit."""
     (columns, children), (others, those) = group(one, row), group(other, place)
     return scenes.identical(children, those) and all(torch.equal(columns[name], others[name]) for name in columns)

@@ -10,7 +10,7 @@ import torch
 from scenes import arc, make_scene, room
 
 from gsmerge.moments import Members, scene_members
-from gsmerge.networks import Learned, NetworkOptions, Networks, save_checkpoint
+from gsmerge.networks import NetworkContext, NetworkOptions, Networks, save_checkpoint
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.types import FeatureGaussians, Groups, PixelScene
 
@@ -49,9 +49,9 @@ class Made:
     members: Members
     features: FeatureGaussians
 
-    def learned(self, networks: Networks, seed: int = 0) -> Learned:
+    def networks(self, networks: Networks, seed: int = 0) -> NetworkContext:
         """The networks for this scene."""
-        return Learned(networks, self.members, self.scene.cameras, seed)
+        return NetworkContext(networks, self.members, self.scene.cameras, seed)
 
 
 def made(num_views: int = 2) -> Made:

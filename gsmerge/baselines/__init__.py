@@ -1,6 +1,71 @@
-"""Rival methods behind one interface: one file each, run by ``compact(scene, method=NAME)``."""
+"""Baselines, other methods behind one interface, run by ``compact(scene, method=NAME)``."""
+
+from __future__ import annotations
 
 from gsmerge.baselines.baseline import Baseline
-from gsmerge.baselines.registry import BASELINES, check_scene, find_baseline, unused_notes
+from gsmerge.baselines.greedy import GREEDY
+from gsmerge.baselines.paper import PAPER
+from gsmerge.baselines.simple import (
+    BLOCKS,
+    CONTRIBUTION,
+    OPACITY,
+    RANDOM,
+    UNMERGED,
+    UNMERGED_COLOR,
+    UNMERGED_FIT,
+)
+from gsmerge.baselines.splat_transform import SPLAT_TRANSFORM, find_program
+from gsmerge.baselines.voxel import VOXEL
+from gsmerge.errors import UsageError
+from gsmerge.options import CompactOptions
+from gsmerge.types import PixelScene, UnalignedScene
 
-__all__ = ["BASELINES", "Baseline", "check_scene", "find_baseline", "unused_notes"]
+_ALL = (
+    UNMERGED, UNMERGED_COLOR, UNMERGED_FIT, PAPER, VOXEL, OPACITY, CONTRIBUTION, RANDOM, BLOCKS, GREEDY,
+    SPLAT_TRANSFORM,
+)  # fmt: skip
+BASELINES = {baseline.name: baseline for baseline in _ALL}
+COMMON_SETTINGS = {"method", "seed", "threads"}  # that every method uses
+
+
+def find_baseline(name: str) -> Baseline | None:
+    """The baseline of that name; None for our own method, "gsmerge".
+
+    Raises:
+        ValueError: If there is none of that name.
+    """
+    if name == "gsmerge":
+        return None
+    if name not in BASELINES:
+        raise ValueError(f"method: expected gsmerge or one of {', '.join(BASELINES)}, got {name!r}")
+    return BASELINES[name]
+
+
+def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene) -> tuple[Baseline | None, list[str]]:
+    """The baseline of the options, fit for the scene, and a note on changed settings that it does not use.
+
+    Raises:
+        UsageError: If the scene does not have what it needs, or a program is missing.
+    """
+    baseline = find_baseline(options.method)
+    if baseline is None:
+        return None, []
+    method = f"method {baseline.name}"
+    if "photos" in baseline.needs and scene.images is None:
+        raise UsageError(f"{method}: expected photos, found none; give --images, or another --method")
+    if "pixels" in baseline.needs and isinstance(scene, UnalignedScene):
+        raise UsageError(f"{method}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
+    check_program(baseline)
+    default, used = CompactOptions().to_dict(), {*baseline.uses, *COMMON_SETTINGS}
+    unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
+    return baseline, [f"{method} does not use {', '.join(unused)}"] if unused else []
+
+
+def check_program(baseline: Baseline) -> None:
+    """Refuse a method whose program is missing.
+
+    Raises:
+        UsageError: If it is.
+    """
+    if "node" in baseline.needs:
+        find_program()

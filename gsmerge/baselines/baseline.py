@@ -1,4 +1,4 @@
-"""What a rival method is: a name, what it needs, which settings it looks at, and a function."""
+"""What a baseline (another method) is: a name, what it needs, which settings it uses, and a function."""
 
 from __future__ import annotations
 
@@ -6,29 +6,34 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
+import numpy as np
+import torch
+from torch import Tensor
+
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
-from gsmerge.types import Gaussians, PixelScene
+from gsmerge.stages.assign import assign_members
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.prepare import PreparedScene
+from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
 
 Need = Literal["photos", "pixels", "node"]
-Run = Callable[[Source, Canvas, CompactOptions, int, RunLog], Gaussians]
+Run = Callable[[PreparedScene, int, RunLog], Gaussians]
 
 COUNTS = ("budget", "max_bytes", "preset", "superpixels", "density", "k")  # settings that decide how many
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """One rival method.
+    """One other method.
 
     Args:
         name: As on the command line.
         title: What it does, in a few words.
-        run: Source, canvas, options, number of Gaussians, journal -> canonical Gaussians, at most that many unless
-            the method keeps the input's. It times itself, by stages of the journal.
+        run: Prepared scene, number of Gaussians, log -> canonical Gaussians, at most that many unless the method keeps
+            the input's. It times itself, by stages of the log.
         needs: ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js.
-        uses: Settings that it looks at, by flat name; seed and threads are everybody's.
+        uses: Settings that it uses, by flat name, besides those that all methods use.
     """
 
     name: str
@@ -37,15 +42,45 @@ class Baseline:
     needs: tuple[Need, ...] = ()
     uses: tuple[str, ...] = COUNTS
 
+    def build(self, prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
+        """Canonical Gaussians: ``count``, or None for as many as ``superpixels`` and K give."""
+        return self.run(prepared, prepared.limits.default if count is None else count, log)
 
-def own_gaussians(source: Source) -> Gaussians:
+
+def own_gaussians(scene: PixelScene | UnalignedScene) -> Gaussians:
     """The Gaussians that the file has, without the rows that only stand in for missing or broken ones."""
-    scene = source.scene
     if isinstance(scene, PixelScene) and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
 
 
-def view_shares(count: int, num_views: int, most: int) -> list[int]:
-    """A number dealt out evenly over the views, at most ``most`` each; the first views get the rest."""
-    return [min(most, count // num_views + (view < count % num_views)) for view in range(num_views)]
+def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
+    """A number divided evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
+    return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
+
+
+def most_important(importance: Tensor | np.ndarray, count: int) -> Tensor:
+    """Indices, rising, of the ``count`` most important Gaussians; of equal ones the first are kept.
+
+    Args:
+        importance: ``[n]``, for instance the summed blending weight over all photos.
+        count: How many to keep; all if there are fewer.
+
+    Raises:
+        ValueError: If ``count`` is negative.
+    """
+    if count < 0:
+        raise ValueError(f"count: expected at least 0, got {count}")
+    values = torch.as_tensor(importance).double().nan_to_num(nan=-torch.inf, neginf=-torch.inf)
+    return torch.sort(torch.argsort(values, descending=True, stable=True)[:count]).values
+
+
+def merge_groups(
+    prepared: PreparedScene, groups: Groups, log: RunLog, rule: Literal["depth", "paper"] = "depth"
+) -> Gaussians:
+    """One Gaussian for each group, without matching across views; groups that hold nothing are left out."""
+    with log.stage("encode"):
+        members = prepared.members or assign_members(prepared.scene, groups, prepared.options.contribution)
+        features = encode(prepared.scene, members, groups, EncodeOptions(rule=rule))
+    with log.stage("decode"):
+        return decode(features, members, DecodeOptions(min_opacity=0.0), rule=rule)

@@ -16,13 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, principal_axes
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
@@ -30,16 +28,16 @@ Ints = NDArray[np.int64]
 
 NEIGHBORS = 10  # 16 bring 0.03 dB on a real capture and take half as long again
 COLOR_WEIGHT = 1.0  # of squared distances of harmonics against nats
-FLAT = 0.01  # least scale, as a share of the largest: the logarithm of the volume stays finite
-MIN_OPACITY = 1e-4
-KNUD = 1.6075  # exponent of Thomsen's formula for the area of an ellipsoid
-ROWS = 65536  # Gaussians per piece of work
+MIN_FLATNESS = 0.01  # of the smallest scale over the largest, so that the logarithm of the volume stays finite
+MIN_OPACITY = 1e-4  # of what is merged, so that masses stay positive
+AREA_EXPONENT = 1.6075  # of Thomsen's formula for the area of an ellipsoid
+CHUNK = 65536  # Gaussians per piece of work
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """n Gaussians as the merging sees them.
+    """n Gaussians in the form that is merged.
 
     Args:
         means: ``[n,3]``.
@@ -61,8 +59,8 @@ class Cloud:
 
 def area(scales: Floats) -> Floats:
     """``[n]`` surfaces of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
-    a, b, c = (scales**KNUD).T
-    return 4 * np.pi * ((a * b + a * c + b * c) / 3) ** (1 / KNUD)
+    a, b, c = (scales**AREA_EXPONENT).T
+    return 4 * np.pi * ((a * b + a * c + b * c) / 3) ** (1 / AREA_EXPONENT)
 
 
 def log_determinants(covars: Floats) -> Floats:
@@ -75,7 +73,7 @@ def log_determinants(covars: Floats) -> Floats:
 def cloud_of(gaussians: Gaussians) -> Cloud:
     """Moments and masses of some Gaussians; flat ones get a little thickness."""
     scales = gaussians.scales.double()
-    scales = torch.maximum(scales, FLAT * scales.amax(1, keepdim=True).clamp(min=1e-12))
+    scales = torch.maximum(scales, MIN_FLATNESS * scales.amax(1, keepdim=True).clamp(min=1e-12))
     full = covariances(gaussians.quats.double(), scales).numpy()
     covars = np.stack([full[:, i, j] for i, j in UPPER], 1)
     opacities = gaussians.opacities.double().numpy().clip(MIN_OPACITY, 1)
@@ -98,7 +96,7 @@ def gaussians_of(cloud: Cloud) -> Gaussians:
     )
 
 
-def merged(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Floats]:
+def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Floats]:
     """Shares ``[m]`` of the left ones, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
     share = cloud.masses[left] / (cloud.masses[left] + cloud.masses[right])
     p, q = share[:, None], 1 - share[:, None]
@@ -110,7 +108,7 @@ def merged(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Float
 
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
     """``[m]`` what merging two costs: Runnalls' bound over their common weight, and the distance of the harmonics."""
-    share, _, covars = merged(cloud, left, right)
+    share, _, covars = merge_moments(cloud, left, right)
     lost = log_determinants(covars) - share * cloud.logdets[left] - (1 - share) * cloud.logdets[right]
     return 0.5 * lost + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
@@ -125,17 +123,17 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
     near = near.astype(np.int32)
 
     def piece(first: int) -> tuple[Ints, Ints, Floats]:
-        own = near[first : first + ROWS]
+        own = near[first : first + CHUNK]
         rows = np.repeat(np.arange(first, first + len(own)), own.shape[1])
         others = own.reshape(-1).astype(np.int64)
-        known = (others <= rows).nonzero()[0]  # itself, or a pair that the other one may tell of, too
+        known = (others <= rows).nonzero()[0]  # itself, or a pair that the other one may list too
         twice = (near[others[known]] == rows[known, None]).any(1)
         keep = np.ones(len(rows), bool)
         keep[known[twice | (others[known] == rows[known])]] = False
         left, right = np.minimum(rows, others)[keep], np.maximum(rows, others)[keep]
         return left, right, pair_costs(cloud, left, right)
 
-    parts = parallel_map(piece, range(0, len(cloud), ROWS))
+    parts = parallel_map(piece, range(0, len(cloud), CHUNK))
     left, right, costs = (np.concatenate(column) for column in zip(*parts, strict=True))
     return left, right, costs
 
@@ -144,13 +142,13 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
     """At most ``limit`` pairs without a common member, as taken one by one in the order of their costs.
 
     A pair that is the cheapest of both of its members is taken sooner or later, whatever comes before it; so all of
-    those are taken at once, and again among what is left. Of equal costs the first pair counts as cheaper.
+    those are taken at once, and again among the rest. Of equal costs the first pair counts as cheaper.
 
     Args:
         left: ``[m]`` one member of each pair.
         right: ``[m]`` the other.
         costs: ``[m]``.
-        limit: Most pairs.
+        limit: The largest number of pairs.
 
     Returns:
         Indices of the pairs, by rising cost.
@@ -158,22 +156,22 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
     first = np.empty(1 + int(right.max(initial=0)), np.int64)
-    taken, found = np.zeros(len(first), bool), np.empty(0, np.int64)
+    taken, chosen = np.zeros(len(first), bool), np.empty(0, np.int64)
     while len(ranks):
         ends = np.stack([left[ranks], right[ranks]], 1)
         first[ends[::-1].reshape(-1)] = np.repeat(ranks[::-1], 2)  # the last that is written is the cheapest
         best = ranks[(first[ends] == ranks[:, None]).all(1)]
         taken[left[best]] = taken[right[best]] = True
-        found = np.sort(np.concatenate([found, best]))[:limit]
+        chosen = np.sort(np.concatenate([chosen, best]))[:limit]
         ranks = ranks[~taken[ends].any(1)]
-        if len(found) == limit:
-            ranks = ranks[ranks < found[-1]]
-    return order[found]
+        if len(chosen) == limit:
+            ranks = ranks[ranks < chosen[-1]]
+    return order[chosen]
 
 
 def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
     """Those in no pair in their order, then the merged pairs."""
-    share, means, covars = merged(cloud, left, right)
+    share, means, covars = merge_moments(cloud, left, right)
     alone = np.ones(len(cloud), bool)
     alone[left] = alone[right] = False
     p = share[:, None].astype(np.float32)
@@ -199,9 +197,9 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Exactly ``count``; the input itself where it has no more."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians
     with log.stage("reduce"):

@@ -9,34 +9,25 @@ from __future__ import annotations
 
 import torch
 
-from gsmerge.baselines.baseline import Baseline, view_shares
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
+from gsmerge.baselines.baseline import Baseline, merge_groups, view_shares
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.decode import DecodeOptions, decode
-from gsmerge.stages.encode import EncodeOptions, encode
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import superpixels
-from gsmerge.stages.unaligned import members_of
 from gsmerge.types import Gaussians, Groups
 
 SEGMENTATION = "bass-st"
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """As many superpixels as Gaussians, the same number in every view; those that hold nothing are left out."""
-    scene = source.scene
+    scene = prepared.scene
     counts = view_shares(count, len(scene), scene.pixels_per_view)
     with log.stage("segment"):
         views = range(len(scene))
-        labels = parallel_map(lambda view: superpixels(canvas.pictures[view], counts[view], SEGMENTATION), views)
+        labels = parallel_map(lambda view: superpixels(prepared.pictures[view], counts[view], SEGMENTATION), views)
         groups = Groups(torch.stack(labels), tuple(counts))
-    with log.stage("encode"):
-        members = members_of(scene, groups, options) if source.members is None else source.members
-        features = encode(scene, members, groups, EncodeOptions(rule="paper"))
-    with log.stage("decode"):
-        return decode(features, members, DecodeOptions(min_opacity=0.0), rule="paper")
+    return merge_groups(prepared, groups, log, rule="paper")
 
 
 PAPER = Baseline("paper", "the superpixel merging paper's moment matching", run)

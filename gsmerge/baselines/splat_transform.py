@@ -13,17 +13,15 @@ import tempfile
 from pathlib import Path
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.io import read_ply, write_ply
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
-LONGEST = 300  # characters of the program's own words in an error
+MAX_OUTPUT = 300  # characters of the program's own output in an error
 
 
 def find_program() -> str:
@@ -33,40 +31,40 @@ def find_program() -> str:
         UsageError: If there is none.
     """
     named = os.environ.get(VARIABLE)
-    found = shutil.which(named or PROGRAM)
-    if found is None:
+    program = shutil.which(named or PROGRAM)
+    if program is None:
         place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
         raise UsageError(
             f"method splat-transform: expected the program {place}, found none; install it with: {INSTALL}"
         )
-    return found
+    return program
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that.
 
     Raises:
         UsageError: If the program is not installed.
         GsmergeError: If it fails.
     """
-    gaussians, program = own_gaussians(source), find_program()
+    gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:
         return gaussians
     with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
-        given, made = Path(folder) / "in.ply", Path(folder) / "out.ply"
-        write_ply(given, gaussians)
-        command = [program, "-w", "-g", "cpu", str(given), "-d", str(count), str(made)]
+        before, after = Path(folder) / "in.ply", Path(folder) / "out.ply"
+        write_ply(before, gaussians)
+        command = [program, "-w", "-g", "cpu", str(before), "-d", str(count), str(after)]
         with log.stage("reduce"):
             done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-        if done.returncode != 0 or not made.exists():
+        if done.returncode != 0 or not after.exists():
             raise GsmergeError(_failure(program, done))
-        return read_ply(made, opacity="logit").gaussians
+        return read_ply(after, opacity="logit").gaussians
 
 
 def _failure(program: str, done: subprocess.CompletedProcess[bytes]) -> str:
-    """One line: the exit code and the program's last words."""
-    words = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-LONGEST:]
-    return f"{program}: expected a decimated .ply, it ended with code {done.returncode}: {words or 'without a word'}"
+    """One line: the exit code and the end of the program's output."""
+    output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
+    return f"{program}: expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
 
 
 SPLAT_TRANSFORM = Baseline("splat-transform", "PlayCanvas' splat-transform, if installed", run, needs=("node",))

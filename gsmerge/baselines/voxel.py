@@ -1,8 +1,8 @@
 """AnySplat's rule (Jiang et al. 2025): one Gaussian for each voxel, a softmax-weighted mean of what lies in it.
 
 The means run over the parameters as a network puts them out: logarithms of scales, logits of opacities. AnySplat
-weighs with the softmax of a confidence that no file keeps; opacity stands in for it. The size of the voxels is found
-by bisection, so the count is met from below.
+weighs with the softmax of a confidence that no file stores; opacity replaces it. Bisection gives the size of the
+voxels, so the count is met from below.
 """
 
 from __future__ import annotations
@@ -13,16 +13,14 @@ import numpy as np
 import torch
 
 from gsmerge.baselines.baseline import Baseline, own_gaussians
-from gsmerge.build import Source
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.stages.group import Canvas
+from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 BITS = 21  # of a voxel's number along each axis; what lies farther out is in the outermost ones
 FINEST = -17.0  # octaves of the canonical unit: there the outermost voxels lie 8 units away, farther for larger ones
 PRECISION = 1e-4  # octaves
-MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12
+MIN_OPACITY, MIN_SCALE = 1e-6, 1e-12  # least that logits and logarithms are taken of
 
 
 def voxel_keys(means: np.ndarray, size: float) -> np.ndarray:
@@ -39,8 +37,8 @@ def voxel_size(means: np.ndarray, count: int) -> float:
         keys = np.sort(voxel_keys(means, 2.0**octave))
         return 1 + int((keys[1:] != keys[:-1]).sum())
 
-    reach = float(np.abs(means).max(initial=0))
-    fine, coarse = FINEST, max(FINEST, math.log2(4 * reach)) if reach > 0 else FINEST  # coarse: all in one
+    extent = float(np.abs(means).max(initial=0))
+    fine, coarse = FINEST, max(FINEST, math.log2(4 * extent)) if extent > 0 else FINEST  # coarse: all in one
     if occupied(fine) <= count:
         return 2.0**fine
     while coarse - fine > PRECISION:
@@ -79,9 +77,9 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)).float() for array in arrays))
 
 
-def run(source: Source, canvas: Canvas, options: CompactOptions, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """At most ``count`` voxels, and hardly fewer."""
-    gaussians = own_gaussians(source)
+    gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
         means = gaussians.means.double().numpy()
         size = voxel_size(means, count)

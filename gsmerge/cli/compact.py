@@ -56,7 +56,6 @@ def compact(
     method: opt.MethodOption = None,
     checkpoint: net.CheckpointOption = None,
     require_checkpoint: net.RequireCheckpointOption = False,
-    precision: net.PrecisionOption = None,
     output: opt.OutputOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -165,36 +164,36 @@ def print_plan(
     files: SceneFiles, settings: CompactOptions, out: Path, *, opacity: OpacityChoice, hints: ReadHints, as_json: bool
 ) -> None:
     """Say what would be done, as lines or JSON."""
-    from gsmerge.baselines import check_scene, find_baseline, unused_notes
+    from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
-    from gsmerge.report import plan_document, plan_lines, to_json
+    from gsmerge.options import to_schema
+    from gsmerge.report import document_head, to_json
+    from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
-    from gsmerge.stages.group import asked_per_view, limit_of, usual_count
+    from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
 
-    given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+    given = read_input(files, opacity=opacity, hints=hints)
     scene, cameras = given.scene, given.scene.cameras
-    baseline, unused = find_baseline(settings.method), []
     with told_as_usage():
-        wanted = limit_of(scene, settings)
-    if baseline is not None:
-        check_scene(baseline, scene)
-        unused = unused_notes(baseline, settings)
+        wanted = budget_count(scene, settings)
+    _, unused = choose_baseline(settings, scene)
     document = plan_document(
         {name: path and str(path) for name, path in vars(files).items()},
         (len(cameras), cameras.height, cameras.width),
         settings.resolved(photos=scene.images is not None),
         output_path=out,
-        per_view=asked_per_view(scene, settings) if len(scene) else 0,
+        per_view=superpixels_per_view(scene, settings) if len(scene) else 0,
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
-        usual=usual_count(scene, settings),
-        wanted=wanted,
+        default_count=default_count(scene, settings),
+        budget=wanted,
         notes=[*given.notes, *unused],
         count=scene.num_gaussians,
         num_rest=3 * scene.gaussians.shN.shape[1],
     )
     if as_json:
-        sys.stdout.write(to_json(document))
+        options = {"options": to_schema(document["options"])}
+        sys.stdout.write(to_json({**document_head(), **document, **options}))
     else:
         print("\n".join(map(one_line, plan_lines(document))))

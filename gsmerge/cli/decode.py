@@ -103,8 +103,8 @@ def _run(
     """Read, decode and write; returns the report."""
     from gsmerge.encoded.decode import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
+    from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
-    from gsmerge.online.fitted import as_decoded, check_fit, decode_stored, num_photos, usual_fit
     from gsmerge.report import document_head, seconds_document
 
     imported, wish = perf_counter(), {"k": params["k"], "budget": params["budget"]}
@@ -117,10 +117,10 @@ def _run(
         **wish,
     }
     notes = [lost] if lost else []
-    fit = settings.fit if params["fit"] is not None or num_photos(stored) else usual_fit(stored)
+    fit = settings.fit if params["fit"] is not None or num_photos(stored) else default_fit(stored)
     check_fit(stored, fit)
     if params["dry_run"]:
-        encoded = as_decoded(stored)
+        encoded = decodable(stored)
         plan = plan_decode(encoded, **wish)
         most = int(plan.counts.sum()) + encoded.num_kept
         told = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}

@@ -65,7 +65,6 @@ def encode(
     unseen: opt.UnseenOption = None,
     checkpoint: net.CheckpointOption = None,
     require_checkpoint: net.RequireCheckpointOption = False,
-    precision: net.PrecisionOption = None,
     output: EncodedOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -115,13 +114,13 @@ def _run(
     """Read, encode and write; returns the report."""
     from gsmerge.compact_file import read_input
     from gsmerge.encoded.encode import encode_scene
-    from gsmerge.encoded.file import save_encoded
+    from gsmerge.encoded.gsm_file import save_encoded
     from gsmerge.io import atomic_output
     from gsmerge.report import file_sha256
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+        given = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
             encoded = encode_scene(given.scene, settings, max_k=max_k, progress=progress)
@@ -147,7 +146,7 @@ def _document(
 
     settings, size = encoded.settings, out.stat().st_size
     told = {name: value for name, value in found.items() if name not in ("name", "comments", "notes")}
-    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.num_most, "max_k": settings.most}
+    counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": settings.max_k}
     return {
         **document_head(),
         "input": {"path": str(ply), "num_gaussians": settings.num_input, **told},

@@ -99,7 +99,6 @@ def extend(
     unseen: opt.UnseenOption = None,
     checkpoint: net.CheckpointOption = None,
     require_checkpoint: net.RequireCheckpointOption = False,
-    precision: net.PrecisionOption = None,
     replay: ReplayOption = None,
     seed: opt.SeedOption = None,
     threads: opt.ThreadsOption = None,
@@ -113,7 +112,7 @@ def extend(
     if len(scenes) > 1 and (cameras is not None or images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.io import find_scene_files
-    from gsmerge.online.files import extend_file
+    from gsmerge.online.file import extend_file
 
     batches = [find_scene_files(scene, cameras=cameras, images=images) for scene in scenes]
     for files in batches:

@@ -18,13 +18,6 @@ class Geometry(str, Enum):
     decoded = "decoded"
 
 
-class Precision(str, Enum):
-    """Arithmetic of the networks."""
-
-    float32 = "float32"
-    bfloat16 = "bfloat16"
-
-
 GeometryOption = Annotated[
     Geometry | None,
     typer.Option(
@@ -50,10 +43,6 @@ RequireCheckpointOption = Annotated[
         help="A checkpoint that cannot be used is an error, instead of a note.",
         rich_help_panel=MERGING,
     ),
-]
-PrecisionOption = Annotated[
-    Precision | None,
-    typer.Option(help="Arithmetic of the networks.", show_default="float32", rich_help_panel=MERGING),
 ]
 TrainDeviceOption = Annotated[Device, typer.Option(help="Where the networks run; windows are rendered on the CPU.")]
 

@@ -57,7 +57,7 @@ def preview(
         shown = [placed.gaussians, *(ply.gaussians for ply in plys[1:])]
         parts = [(path.name, gaussians) for path, gaussians in zip(scenes, shown, strict=True)]
         with use_threads(threads), announce_compilation(quiet=quiet or json):
-            sheet = contact_sheet(parts, seen_from, photos, most_views=views)
+            sheet = contact_sheet(parts, seen_from, photos, max_views=views)
         write_picture(output, sheet, overwrite=overwrite)
     ids = pick_views(len(seen_from), views)
     facts = {

@@ -12,30 +12,30 @@ from gsmerge.encoded.divide import pick_children
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_described, described_by
+from gsmerge.networks import NetworkContext, decode_with_group_features, make_group_features
 from gsmerge.render.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import MAX_CHILDREN
-from gsmerge.stages.fit import shown
+from gsmerge.stages.fit import visible_mask
 from gsmerge.types import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class DecodePlan:
     """What a file is decoded to.
 
     Args:
         counts: ``[g]`` most Gaussians of each group.
-        prune: Least contribution to some view, see :class:`StoredSettings`; 0: not looked at.
-        notes: What is not quite as asked, one sentence each.
+        min_contribution: See :class:`StoredSettings`; 0: contributions are not measured.
+        notes: What differs from what was asked for, one sentence each.
     """
 
     counts: np.ndarray
-    prune: float
+    min_contribution: float
     notes: tuple[str, ...] = ()
 
 
-def plan_decode(encoded: Encoded, *, k: int | str | None = None, budget: int | str | None = None) -> Plan:
+def plan_decode(encoded: Encoded, *, k: int | str | None = None, budget: int | str | None = None) -> DecodePlan:
     """How many Gaussians each group becomes, see :func:`decode_scene`.
 
     Raises:
@@ -45,48 +45,47 @@ def plan_decode(encoded: Encoded, *, k: int | str | None = None, budget: int | s
     if budget is not None:
         if k is not None:
             raise UsageError("expected one of k and budget, got both")
-        return _dealt(encoded, _budget(encoded, budget))
-    if s.wanted is not None and (k is None or k == s.k == "auto"):
-        return _dealt(encoded, s.wanted)
-    asked = s.k if k is None else k
-    if asked == "auto":
-        plan = _dealt(encoded, max(len(encoded), s.knee))
-        if s.knee >= len(encoded):
+        return _distribute(encoded, _group_budget(encoded, budget))
+    if s.target_count is not None and (k is None or k == s.k == "auto"):
+        return _distribute(encoded, s.target_count)
+    k = s.k if k is None else k
+    if k == "auto":
+        plan = _distribute(encoded, max(len(encoded), s.knee_count))
+        if s.knee_count >= len(encoded):
             return plan
-        note = f"k auto would take {s.knee} Gaussians, fewer than there are groups; encoded with k auto it can"
+        note = f"k auto would take {s.knee_count} Gaussians, fewer than there are groups; encoded with k auto it can"
         return replace(plan, notes=(note,))
-    if not isinstance(asked, int) or not 1 <= asked <= s.most:
-        most = f'1 to {s.most} or "auto"' + (
-            "" if s.most == MAX_CHILDREN else ", as encoded (more with a larger max k)"
-        )
-        raise UsageError(f"k: expected {most}, got {asked!r}")
-    if s.places is not None:
-        return replace(_dealt(encoded, s.places * asked), prune=s.prune)
-    return Plan(np.full(len(encoded), asked), s.prune)
+    if not isinstance(k, int) or not 1 <= k <= s.max_k:
+        more = "" if s.max_k == MAX_CHILDREN else ", as encoded (more with a larger max k)"
+        raise UsageError(f'k: expected 1 to {s.max_k} or "auto"{more}, got {k!r}')
+    if s.num_slots is not None:
+        return replace(_distribute(encoded, s.num_slots * k), min_contribution=s.min_contribution)
+    return DecodePlan(np.full(len(encoded), k), s.min_contribution)
 
 
-def _budget(encoded: Encoded, budget: int | str) -> int:
+def _group_budget(encoded: Encoded, budget: int | str) -> int:
     """Gaussians that a budget leaves for the groups."""
     try:
-        wanted = parse_budget(budget, encoded.settings.num_input)
+        count = parse_budget(budget, encoded.settings.num_input)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    least = len(encoded) + encoded.num_kept
-    if wanted < least:
+    min_count = len(encoded) + encoded.num_kept
+    if count < min_count:
         raise UsageError(
-            f"budget: expected at least {least}, one for each group, got {wanted}; encode with that budget"
+            f"budget: expected at least {min_count}, one for each group, got {count}; encode with that budget"
         )
-    return wanted - encoded.num_kept
+    return count - encoded.num_kept
 
 
-def _dealt(encoded: Encoded, wanted: int) -> Plan:
-    """A number of Gaussians, dealt out to the groups where they help most."""
-    deals, extra = encoded.division.deals.numpy(), max(0, wanted - len(encoded))
-    counts = 1 + np.bincount(deals[:extra], minlength=len(encoded))
-    if extra <= len(deals):
-        return Plan(counts, 0.0)
-    most, asked = len(encoded) + len(deals) + encoded.num_kept, wanted + encoded.num_kept
-    return Plan(counts, 0.0, (f"{asked} Gaussians were asked for, and the groups divide into {most} at most",))
+def _distribute(encoded: Encoded, total: int) -> DecodePlan:
+    """A number of Gaussians, given to the groups where they help most."""
+    order, extra = encoded.division.growth_order.numpy(), max(0, total - len(encoded))
+    counts = 1 + np.bincount(order[:extra], minlength=len(encoded))
+    if extra <= len(order):
+        return DecodePlan(counts, 0.0)
+    limit, count = len(encoded) + len(order) + encoded.num_kept, total + encoded.num_kept
+    note = f"{count} Gaussians were asked for, and the groups divide into {limit} at most"
+    return DecodePlan(counts, 0.0, (note,))
 
 
 def decode_scene(
@@ -101,7 +100,7 @@ def decode_scene(
     Args:
         encoded: From :func:`encode_scene` or :func:`load_encoded`.
         k: Gaussians of each group, 1 to what was encoded, or ``"auto"``: as many in all as ``compact`` would take
-            without photos, dealt out where they help most. None: as it was encoded.
+            without photos, where they help most. None: as it was encoded.
         budget: Gaussians in all instead: a number from one for each group on, or a share of the input as "2%".
         threads: Threads to use; None: all processors. The result does not depend on it.
 
@@ -112,8 +111,8 @@ def decode_scene(
     with use_threads(threads), torch.no_grad():
         gaussians, _ = children_of(encoded, plan.counts)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
-        if plan.prune > 0:
-            gaussians = gaussians[shown(gaussians, blank_photos(encoded.cameras, 2), plan.prune)]
+        if plan.min_contribution > 0:
+            gaussians = gaussians[visible_mask(gaussians, blank_photos(encoded.cameras, 2), plan.min_contribution)]
         if encoded.kept is not None:
             gaussians = Gaussians.concat([gaussians, encoded.kept])
         return encoded.frame.leave(gaussians)
@@ -123,11 +122,10 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
     """At most ``counts [g]`` canonical Gaussians of each group, however faint, and the group of each, rising."""
     features, heads = encoded.features, encoded.heads
     rows, parents = pick_children(encoded.division, counts)
-    every = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])
-    gaussians = every[torch.from_numpy(rows)]
+    gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[torch.from_numpy(rows)]
     if heads is not None:
-        described = described_by(features, heads.views, heads.group, encoded.cameras)
+        group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-        learned = Learned(heads.networks, nothing, encoded.cameras, precision=heads.precision)
-        gaussians = decode_described(gaussians, parents, features, described, learned)
+        networks = NetworkContext(heads.networks, nothing, encoded.cameras)
+        gaussians = decode_with_group_features(gaussians, parents, features, group_features, networks)
     return gaussians, parents

@@ -1,4 +1,4 @@
-"""Children of every Feature Gaussian for every K, once; and those of one K picked from them."""
+"""The children of every Feature Gaussian for every K, and the choice of those of one K."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import torch
 from gsmerge.encoded.encoded import Division
 from gsmerge.kernels.gaussians.bisect import gather_groups
 from gsmerge.moments import Members, Rule
-from gsmerge.stages.decode import halve, pool_children
-from gsmerge.stages.region_tree import deal_order
+from gsmerge.stages.decode import deal_order, halve, pool_children
 from gsmerge.types import FeatureGaussians, Gaussians
 
 
-def divide_all(features: FeatureGaussians, members: Members, most: int, rule: Rule) -> Division:
-    """All children of every group, up to ``most`` of each; the backing layer is never divided.
+def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: Rule) -> Division:
+    """All children of every group, up to ``max_k`` of each; the backing layer is never divided.
 
     Args:
         features: g Feature Gaussians with their members.
         members: The scene's Gaussians.
-        most: Most children of a group, 1 to 8.
+        max_k: Most children of a group, 1 to 8.
         rule: How children are pooled.
     """
     count = len(features)
@@ -27,17 +26,17 @@ def divide_all(features: FeatureGaussians, members: Members, most: int, rule: Ru
     sizes = np.diff(features.starts.numpy())[rows][:, None]
     none = np.zeros(0, np.int64)
     parts = [pool_children(features, members, np.zeros(1, np.int64), none, none, rule)]
-    owners, slots, alone, whole = [none], [none], none, parts[0]
-    for number in range(2, most + 1):
+    owners, slots, uniform, uniform_children = [none], [none], none, parts[0]
+    for number in range(2, max_k + 1):
         if len(rows) == 0:
             break
         starts, ids, parents = halve(features, members, rows, np.full(count, number))
-        found = np.bincount(parents, minlength=count)[rows]
-        grown, first = found == number, np.cumsum(found) - found
+        run_counts = np.bincount(parents, minlength=count)[rows]
+        grown, first = run_counts == number, np.cumsum(run_counts) - run_counts
         if number == 2:
-            alone = rows[~grown]
+            uniform = rows[~grown]
             own_starts, own = gather_groups(starts, ids, first[~grown])
-            whole = pool_children(features, members, own_starts, own, alone, rule)
+            uniform_children = pool_children(features, members, own_starts, own, uniform, rule)
         rows, before = rows[grown], sizes[grown]
         sizes = np.diff(starts)[first[grown, None] + np.arange(number)]
         slot = np.argmax(sizes[:, :-1] != before, axis=1)  # the run that got smaller is the one that was split
@@ -52,9 +51,9 @@ def divide_all(features: FeatureGaussians, members: Members, most: int, rule: Ru
     return Division(
         splits=torch.from_numpy(np.bincount(owner, minlength=count).astype(np.uint8)),
         slots=torch.from_numpy(np.concatenate(slots)[order].astype(np.uint8)),
-        whole=torch.from_numpy(alone),
-        children=Gaussians.concat([halves, whole]),
-        deals=torch.from_numpy(deal_order(features, members, most)),
+        uniform=torch.from_numpy(uniform),
+        children=Gaussians.concat([halves, uniform_children]),
+        growth_order=torch.from_numpy(deal_order(features, members, max_k)),
     )
 
 
@@ -69,18 +68,18 @@ def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, n
         ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children.
     """
     splits, slots = division.splits.numpy().astype(np.int64), division.slots.numpy().astype(np.int64)
-    count, whole = len(splits), division.whole.numpy()
-    taken, first = np.minimum(counts, splits + 1), np.cumsum(splits) - splits
-    widest = int(taken.max(initial=1))
-    table = np.zeros((count, widest), np.int64)
+    count, uniform = len(splits), division.uniform.numpy()
+    sizes, first = np.minimum(counts, splits + 1), np.cumsum(splits) - splits
+    max_size = int(sizes.max(initial=1))
+    table = np.zeros((count, max_size), np.int64)
     table[:, 0] = np.arange(count)
-    asked = counts[whole] > 1
-    table[whole[asked], 0] = count + 2 * len(slots) + np.flatnonzero(asked)
-    for step in range(1, widest):
-        rows = np.flatnonzero(taken > step)
+    divided = counts[uniform] > 1
+    table[uniform[divided], 0] = count + 2 * len(slots) + np.flatnonzero(divided)
+    for step in range(1, max_size):
+        rows = np.flatnonzero(sizes > step)
         split = first[rows] + step - 1
         slot, places = slots[split][:, None], np.arange(step + 1)
         moved = np.take_along_axis(table[rows, : step + 1], places - (places > slot), 1)
         halves = count + 2 * split[:, None] + (places - slot)
         table[rows, : step + 1] = np.where((places == slot) | (places == slot + 1), halves, moved)
-    return table[np.arange(widest) < taken[:, None]], np.repeat(np.arange(count), taken)
+    return table[np.arange(max_size) < sizes[:, None]], np.repeat(np.arange(count), sizes)

@@ -1,4 +1,4 @@
-"""What is kept of a scene: frozen dataclasses, nothing but sizes."""
+"""What a ``.gsm`` file holds: frozen dataclasses, no behaviour beyond sizes."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class Division:
     Args:
         splits: ``[g]`` uint8, times that each group is split.
         slots: ``[s]`` uint8, which child, counted in order from 0, each split replaces; group by group.
-        whole: ``[w]`` int64, rising: the groups whose members are all alike. Asked for more, they give one child.
-        children: 2s + w Gaussians, canonical: two for each split, then one for each of ``whole``.
-        deals: ``[d]`` int64, the group that each further Gaussian goes to, where it helps most first.
+        uniform: ``[w]`` int64, rising: the groups whose members are all alike. Asked for more, they give one child.
+        children: 2s + w Gaussians, canonical: two for each split, then one for each of ``uniform``.
+        growth_order: ``[d]`` int64, the group that each further Gaussian goes to, where it helps most first.
     """
 
     splits: Tensor
     slots: Tensor
-    whole: Tensor
+    uniform: Tensor
     children: Gaussians
-    deals: Tensor
+    growth_order: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,11 @@ class StoredHeads:
 
     Args:
         networks: All of a checkpoint's networks.
-        precision: Of their arithmetic, ``"float32"`` or ``"bfloat16"``.
         views: ``[g]`` int64, the view that each group's frame belongs to.
         group: ``[g,n]`` the numbers that describe each group.
     """
 
     networks: Networks
-    precision: str
     views: Tensor
     group: Tensor
 
@@ -59,49 +57,61 @@ class StoredSettings:
 
     Args:
         num_input: Gaussians of the scene.
-        k: Gaussians of each group unless told otherwise, or ``"auto"``: ``wanted`` of them, found for the scene.
-        most: Most children of a group that are kept.
+        k: Gaussians of each group by default, or ``"auto"``: ``target_count`` of them, found for the scene.
+        max_k: Most children of a group that are stored.
         min_opacity: Gaussians below this opacity are left out.
-        prune: Gaussians that add less than this to every pixel of every view that they lie in are left out, where no
-            number is to be met; 0: none are.
-        wanted: Gaussians that a budget asked for, without those that no view sees; None without one.
-        places: Groups, and empty superpixels whose Gaussians the others get, of a scene in no order; None: K each.
-        knee: Gaussians at the knee of the scene's own curve of distortion: ``--k auto`` without photos.
+        min_contribution: Gaussians that add less than this to every pixel of every view that they lie in are left out,
+            where no number is to be met; 0: none are.
+        target_count: Gaussians that a budget asked for, without those that no view sees; None without one.
+        num_slots: Of an unaligned scene, its groups and the empty superpixels whose Gaussians other groups get;
+            None: K Gaussians for each group.
+        knee_count: Gaussians at the knee of the scene's own curve of distortion: ``--k auto`` without photos.
     """
 
     num_input: int
     k: int | str
-    most: int
+    max_k: int
     min_opacity: float
-    prune: float
-    wanted: int | None
-    places: int | None
-    knee: int
+    min_contribution: float
+    target_count: int | None
+    num_slots: int | None
+    knee_count: int
 
 
-@dataclass(frozen=True, eq=False)
-class Encoded:
-    """A scene as merged Feature Gaussians, ready to be decoded at any K without its images.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StoredScene:
+    """What encoded scenes and states have in common.
 
     Args:
-        features: g Feature Gaussians, canonical, without their members.
-        division: Their children.
-        kept: Gaussians that no view sees, merged already, canonical; None without any.
+        kept: Gaussians that no view sees, canonical, merged already; None without any.
         frame: From canonical to world.
-        cameras: The views, canonical; what shows in none of them is left out.
+        cameras: The views, canonical.
         settings: What decoding needs to know.
-        heads: Networks that correct the children; None without any.
-        about: Where it comes from: version, options, choices, notes, and the source if it was a file. Plain JSON types.
+        about: Where it comes from: version and options, further of each kind. Plain JSON types.
     """
 
-    features: FeatureGaussians
-    division: Division
     kept: Gaussians | None
     frame: Frame
     cameras: Cameras
     settings: StoredSettings
-    heads: StoredHeads | None
     about: Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Encoded(StoredScene):
+    """A scene as merged Feature Gaussians, ready to be decoded at any K without its images.
+
+    What shows in none of its views is left out. ``about`` also has choices, notes, and the source if it was a file.
+
+    Args:
+        features: g Feature Gaussians, canonical, without their members.
+        division: Their children.
+        heads: Networks that correct the children; None without any.
+    """
+
+    features: FeatureGaussians
+    division: Division
+    heads: StoredHeads | None
 
     def __len__(self) -> int:
         return len(self.features)
@@ -117,12 +127,12 @@ class Encoded:
         return 0 if self.kept is None else len(self.kept)
 
     @property
-    def num_most(self) -> int:
+    def max_gaussians(self) -> int:
         """Most Gaussians that it decodes to."""
         return len(self) + len(self.division.slots) + self.num_kept
 
 
 def without_members(features: FeatureGaussians) -> FeatureGaussians:
-    """Feature Gaussians that know of no members."""
+    """The Feature Gaussians without their members."""
     starts = torch.zeros(len(features) + 1, dtype=torch.int64)
     return replace(features, starts=starts, members=torch.zeros(0, dtype=torch.int64))

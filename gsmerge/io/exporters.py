@@ -1,6 +1,6 @@
 """Exporters that are known by name: what their files look like, and how they are to be read.
 
-To add one, add an :class:`Exporter` to the tuple below and a row to docs/exporters.md.
+To add one, add an :class:`Exporter` to the tuple below and a row to docs/reference/exporters.md.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ def read_scene(
 ) -> PixelScene | UnalignedScene:
     """Read a scene: ``.ply``, cameras, and images where there are any.
 
-    Which row belongs to which pixel is decided by measuring (docs/exporters.md).
+    Which row belongs to which pixel is found by measuring (docs/reference/exporters.md).
 
     Args:
         path: The ``.ply``, or a folder that has it.

@@ -2,7 +2,7 @@
 
 Compiled kernels are cached where the user may write: ``GSMERGE_CACHE_DIR`` if it is set, beside the sources, in the
 user's cache folder, or below the system's temporary one, whichever is the first that can be written. The folder's
-name carries a hash of all kernel sources: numba looks at a kernel's own file alone and would go on with an old copy of
+name carries a hash of all kernel sources: numba checks a kernel's own file alone and would go on using an old copy of
 what it inlined from another.
 """
 
@@ -52,10 +52,10 @@ def _temporary_folder() -> Path:
     folder = Path(tempfile.gettempdir()) / f"gsmerge-{user}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
+        status = folder.lstat()
     except OSError:
         return Path(tempfile.mkdtemp(prefix="gsmerge-"))
-    own = stat.S_ISDIR(found.st_mode) and (os.name == "nt" or (found.st_uid == user and not found.st_mode & 0o022))
+    own = stat.S_ISDIR(status.st_mode) and (os.name == "nt" or (status.st_uid == user and not status.st_mode & 0o022))
     return folder if own else Path(tempfile.mkdtemp(prefix="gsmerge-"))
 
 

@@ -1,9 +1,9 @@
-"""The paper's networks as bounded corrections of the analytic stages, and the checkpoints that hold them."""
+"""The paper's networks as bounded corrections of the analytic stages, and their checkpoints."""
 
 from gsmerge.networks.apply import (
-    Learned,
-    decode_described,
+    NetworkContext,
     decode_gaussians,
+    decode_with_group_features,
     encode_features,
     match_geometry,
     merge_features,
@@ -12,20 +12,20 @@ from gsmerge.networks.apply import (
 from gsmerge.networks.checkpoint import Checkpoint, find_checkpoint, load_checkpoint, save_checkpoint
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds, NetworkOptions
-from gsmerge.networks.tokens import described_by
+from gsmerge.networks.tokens import make_group_features
 
 __all__ = [
     "Bounds",
     "Checkpoint",
-    "Learned",
+    "NetworkContext",
     "NetworkOptions",
     "Networks",
-    "decode_described",
     "decode_gaussians",
-    "described_by",
+    "decode_with_group_features",
     "encode_features",
     "find_checkpoint",
     "load_checkpoint",
+    "make_group_features",
     "match_geometry",
     "merge_features",
     "refine_features",

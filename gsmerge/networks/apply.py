@@ -1,4 +1,4 @@
-"""Feature Gaussians through the networks: tables by size, worked off in parallel, corrections applied."""
+"""Feature Gaussians through the networks: padded tables by size, run in parallel, and the corrections applied."""
 
 from __future__ import annotations
 
@@ -12,287 +12,292 @@ from torch import Tensor, nn
 from gsmerge.geometry import rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
-from gsmerge.networks.residuals import HALF, RESIDUAL, bounded, move_features, move_gaussians, squashed
-from gsmerge.networks.subsets import choose, point_dice, runs, tables
-from gsmerge.networks.tokens import Described, describe, member_tokens, part_tokens
+from gsmerge.networks.residuals import (
+    HALF,
+    RESIDUAL,
+    bound_residuals,
+    move_features,
+    move_gaussians,
+    tanh_bounded,
+)
+from gsmerge.networks.tables import group_rows, point_seeds, sample_members, split_tables
+from gsmerge.networks.tokens import GroupFeatures, compute_group_features, member_tokens, part_tokens
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
-Work = Callable[[np.ndarray, int], Tensor]  # rows of a table and its width -> [rows, columns]
+RunTable = Callable[[np.ndarray, int], Tensor]  # rows and width of a table -> [rows, columns]
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
-    """The networks, and what they look at besides the Feature Gaussians.
+class NetworkContext:
+    """The networks, and what they read besides the Feature Gaussians."""
 
-    Args:
-        networks: Encoder, merger, refiner and decoder heads.
-        members: The scene's Gaussians.
-        cameras: Its views.
-        seed: Chooses the members of groups that are too large to look at all.
-        precision: ``"float32"`` or ``"bfloat16"``, of the networks' own arithmetic.
-    """
+    networks: Networks  # encoder, merger, refiner and decoder heads
+    members: Members  # the scene's Gaussians
+    cameras: Cameras  # its views
+    seed: int = 0  # chooses the members of groups that are too large to read whole
 
-    networks: Networks
-    members: Members
-    cameras: Cameras
-    seed: int = 0
-    precision: str = "float32"
+    def describe(self, features: FeatureGaussians) -> GroupFeatures:
+        """The inputs of the networks for Feature Gaussians."""
+        return compute_group_features(features, self.members, self.cameras)
 
-    def describe(self, features: FeatureGaussians) -> Described:
-        """The Feature Gaussians as the networks see them."""
-        return describe(features, self.members, self.cameras)
-
-    def through(self, network: nn.Module, *inputs: Tensor) -> Tensor:
-        """What one of the networks says: float32 on the CPU, wherever it runs; several outputs side by side."""
+    def run(self, network: nn.Module, *inputs: Tensor) -> Tensor:
+        """Output of one of the networks, on the CPU wherever it runs; several outputs side by side."""
         device = next(network.parameters()).device
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
-            found = network(*(one.to(device) for one in inputs))
-        return (torch.cat(found, 1) if isinstance(found, tuple) else found).float().cpu()
+        outputs = network(*(tensor.to(device) for tensor in inputs))
+        return (torch.cat(outputs, 1) if isinstance(outputs, tuple) else outputs).cpu()
 
 
-def by_table(sizes: np.ndarray, most: int, columns: int, work: Work) -> Tensor:
-    """``[g,columns]`` outputs of all groups; with gradients where they are wanted, then one table after the other."""
-    found = list(tables(sizes, most))
+def run_tables(sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -> Tensor:
+    """``[g,columns]`` outputs of all groups; in parallel, but one table after the other where gradients are needed."""
+    tables = list(split_tables(sizes, max_width))
     if torch.is_grad_enabled():
-        parts = [work(rows, width) for rows, width in found]
+        outputs = [run(rows, width) for rows, width in tables]
     else:
 
-        def quietly(table: tuple[np.ndarray, int]) -> Tensor:
-            with torch.no_grad():  # threads of the pool do not know of the caller's
-                return work(*table)
+        def run_without_grad(table: tuple[np.ndarray, int]) -> Tensor:
+            with torch.no_grad():  # the mode of the caller's thread does not reach the pool's threads
+                return run(*table)
 
-        parts = parallel_map(quietly, found)
-    if not parts:
+        outputs = parallel_map(run_without_grad, tables)
+    if not outputs:
         return torch.zeros(0, columns)
-    order = torch.from_numpy(np.concatenate([rows for rows, _ in found]))
-    return torch.zeros(len(sizes), columns).index_copy(0, order, torch.cat(parts))
+    order = torch.from_numpy(np.concatenate([rows for rows, _ in tables]))
+    return torch.zeros(len(sizes), columns).index_copy(0, order, torch.cat(outputs))
 
 
-def encode_features(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
-    """Feature Gaussians with latents, and with means that the encoder has moved (paper section 4.2).
-
-    Args:
-        features: g analytic Feature Gaussians.
-        learned: The networks and the scene.
-    """
-    described = learned.describe(features)
-    encoded = encoder_outputs(features, described, learned)
-    return with_encoding(features, described, encoded, learned.networks)[0]
+def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
+    """Feature Gaussians with latents, and with means moved by the encoder (paper section 4.2)."""
+    group_features = context.describe(features)
+    encoded = run_encoder(features, group_features, context)
+    return apply_encoding(features, group_features, encoded, context.networks)[0]
 
 
-def encoder_outputs(features: FeatureGaussians, described: Described, learned: Learned) -> Tensor:
+def run_encoder(features: FeatureGaussians, group_features: GroupFeatures, context: NetworkContext) -> Tensor:
     """``[g,latent+3]`` raw latents and shifts."""
     starts, ids = features.starts.numpy(), features.members.numpy()
-    sizes, options = np.diff(starts), learned.networks.options
-    dice, axes = point_dice(features.means.numpy(), learned.seed), _longest_axes(described.base)
+    sizes, options = np.diff(starts), context.networks.options
+    seeds, axes = point_seeds(features.means.numpy(), context.seed), _longest_axes(group_features.base)
 
-    def work(rows: np.ndarray, width: int) -> Tensor:
-        found, owners = runs(starts[rows], sizes[rows])
-        away = learned.members.means[ids[found]] - described.base.means.numpy()[rows[owners]]
-        picked, mask = choose((away * axes[rows[owners]]).sum(1), sizes[rows], width, dice[rows])
+    def run(rows: np.ndarray, width: int) -> Tensor:
+        positions, owners = group_rows(starts[rows], sizes[rows])
+        offsets = context.members.means[ids[positions]] - group_features.base.means.numpy()[rows[owners]]
+        keys = (offsets * axes[rows[owners]]).sum(1)
+        sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
         own = torch.from_numpy(np.repeat(rows, width))
-        tokens = member_tokens(learned.members, ids[found][picked.reshape(-1)], described, own)
-        group = described.group[torch.from_numpy(rows)]
-        return learned.through(learned.networks.encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
+        tokens = member_tokens(context.members, ids[positions][sample.reshape(-1)], group_features, own)
+        group = group_features.group[torch.from_numpy(rows)]
+        return context.run(context.networks.encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
 
-    return by_table(sizes, options.members, options.latent + 3, work)
+    return run_tables(sizes, options.members, options.latent + 3, run)
 
 
 def _longest_axes(base: Gaussians) -> np.ndarray:
-    """``[g,3]`` third axis of each Gaussian, whose scales rise: the last column of its rotation."""
+    """``[g,3]`` third axis of each Gaussian, whose scales are ascending: the last column of its rotation."""
     w, x, y, z = base.quats.numpy().T
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
 
 
-def with_encoding(
-    features: FeatureGaussians, described: Described, encoded: Tensor, networks: Networks
+def apply_encoding(
+    features: FeatureGaussians, group_features: GroupFeatures, encoded: Tensor, networks: Networks
 ) -> tuple[FeatureGaussians, Tensor]:
-    """The Feature Gaussians with what the encoder says of them, and the corrections ``[g,13]``.
+    """The Feature Gaussians with the encoder's output applied, and the corrections ``[g,13]``.
 
     Gradients flow through the latents and the corrections, never through the geometry.
     """
-    shift = networks.options.bounds.mean * HALF * squashed(encoded[:, -3:])
+    shift = networks.options.bounds.mean * HALF * tanh_bounded(encoded[:, -3:])
     shift = torch.where(features.backing[:, None], 0, shift)
     residuals = torch.cat([shift, torch.zeros(len(features), RESIDUAL - 3)], 1)
-    moved = move_features(features, described.base, residuals.detach(), described.frames)
-    return replace(moved, latents=squashed(encoded[:, :-3])), residuals
+    moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
+    return replace(moved, latents=tanh_bounded(encoded[:, :-3])), residuals
 
 
-def match_geometry(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
+def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Feature Gaussians as the K = 1 head would decode them, for matching (paper section 4.3)."""
-    if learned.networks.options.outputs == "absolute":
-        return features  # a head that begins at nothing says nothing of moments
-    described = learned.describe(features)
-    residuals = head_residuals(described.base, np.arange(len(features)), features, described, learned)
-    return move_features(features, described.base, residuals, described.frames)
+    if context.networks.options.outputs == "absolute":
+        return features  # such a head does not correct the moments
+    group_features = context.describe(features)
+    residuals = run_heads(group_features.base, np.arange(len(features)), features, group_features, context)
+    return move_features(features, group_features.base, residuals, group_features.frames)
 
 
 def merge_features(
-    pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, learned: Learned
+    pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
 ) -> FeatureGaussians:
     """Pooled Feature Gaussians with the merger's corrections (paper section 4.4).
 
     Args:
-        pooled: One for each run of ``order``.
-        parts: What was pooled.
+        pooled: c Feature Gaussians, one for each run of ``order``.
+        parts: The n Feature Gaussians that were pooled.
         order: ``[n]`` rows of ``parts``, cluster by cluster.
         cuts: ``[c]`` where each cluster begins in ``order``.
-        learned: The networks and the scene.
+        context: The networks and the scene.
     """
-    described = learned.describe(pooled)
-    raw = merger_outputs(pooled, described, parts, order, cuts, learned)
-    return with_corrections(pooled, described, raw, learned.networks)[0]
+    group_features = context.describe(pooled)
+    raw = run_merger(pooled, group_features, parts, order, cuts, context)
+    return apply_corrections(pooled, group_features, raw, context.networks)[0]
 
 
-def merger_outputs(
+def run_merger(
     pooled: FeatureGaussians,
-    described: Described,
+    group_features: GroupFeatures,
     parts: FeatureGaussians,
     order: np.ndarray,
     cuts: np.ndarray,
-    learned: Learned,
+    context: NetworkContext,
 ) -> Tensor:
     """``[c,13+latent]`` raw corrections of clusters, see :func:`merge_features`."""
     base = feature_to_gaussians(parts)
-    sizes, options = np.diff(np.append(cuts, len(order))), learned.networks.options
-    dice = point_dice(pooled.means.numpy(), learned.seed)
+    sizes, options = np.diff(np.append(cuts, len(order))), context.networks.options
+    seeds = point_seeds(pooled.means.numpy(), context.seed)
 
-    def work(rows: np.ndarray, width: int) -> Tensor:
-        found, owners = runs(cuts[rows], sizes[rows])
-        keys = ((base.means.numpy()[order[found]] - pooled.means.numpy()[rows[owners]]) ** 2).sum(1)
-        picked, mask = choose(keys, sizes[rows], width, dice[rows])
-        ids = torch.from_numpy(order[found][picked.reshape(-1)])
-        beside = part_tokens(base[ids], described, torch.from_numpy(np.repeat(rows, width)))
-        tokens = torch.cat([beside, parts.latents[ids]], 1).unflatten(0, mask.shape)
-        group = described.group[torch.from_numpy(rows)]
-        return learned.through(learned.networks.merger, tokens, torch.from_numpy(mask), group)
+    def run(rows: np.ndarray, width: int) -> Tensor:
+        positions, owners = group_rows(cuts[rows], sizes[rows])
+        keys = ((base.means.numpy()[order[positions]] - pooled.means.numpy()[rows[owners]]) ** 2).sum(1)
+        sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
+        ids = torch.from_numpy(order[positions][sample.reshape(-1)])
+        relative = part_tokens(base[ids], group_features, torch.from_numpy(np.repeat(rows, width)))
+        tokens = torch.cat([relative, parts.latents[ids]], 1).unflatten(0, mask.shape)
+        group = group_features.group[torch.from_numpy(rows)]
+        return context.run(context.networks.merger, tokens, torch.from_numpy(mask), group)
 
-    return by_table(sizes, options.members, RESIDUAL + options.latent, work)
+    return run_tables(sizes, options.members, RESIDUAL + options.latent, run)
 
 
-def refine_features(features: FeatureGaussians, learned: Learned) -> FeatureGaussians:
-    """Feature Gaussians with what the refiner reads off their neighbours (paper section 4.5)."""
+def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
+    """Feature Gaussians with the refiner's corrections, which depend on their neighbours (paper section 4.5)."""
     if len(features) == 0:
         return features
-    neighbors = nearest(features, learned.networks.options.neighbors)
-    described = learned.describe(features)
-    raw = refiner_outputs(features, described, neighbors, learned)
-    return with_corrections(features, described, raw, learned.networks)[0]
+    neighbors = find_neighbors(features, context.networks.options.neighbors)
+    group_features = context.describe(features)
+    raw = run_refiner(features, group_features, neighbors, context)
+    return apply_corrections(features, group_features, raw, context.networks)[0]
 
 
-def refiner_outputs(
-    features: FeatureGaussians, described: Described, neighbors: np.ndarray, learned: Learned
+def run_refiner(
+    features: FeatureGaussians, group_features: GroupFeatures, neighbors: np.ndarray, context: NetworkContext
 ) -> Tensor:
     """``[g,13+latent]`` raw corrections from ``neighbors [g,k]``, -1 where there are fewer."""
     count, width = len(features), neighbors.shape[1] + 1
     table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
     views = features.views
 
-    def work(rows: np.ndarray, _: int) -> Tensor:
+    def run(rows: np.ndarray, _: int) -> Tensor:
         ids, own = torch.from_numpy(table[rows].reshape(-1)), torch.from_numpy(np.repeat(rows, width))
         mask = ids >= 0
         ids = torch.where(mask, ids, own)
-        beside = part_tokens(described.base[ids], described, own)
-        same = (views[ids] == views[own]).float()[:, None]
-        tokens = torch.cat([beside, same, features.latents[ids]], 1).unflatten(0, (len(rows), width))
-        inside, group = mask.unflatten(0, (len(rows), width)), described.group[torch.from_numpy(rows)]
-        return learned.through(learned.networks.refiner, tokens, inside, group)
+        relative = part_tokens(group_features.base[ids], group_features, own)
+        same_view = (views[ids] == views[own]).float()[:, None]
+        tokens = torch.cat([relative, same_view, features.latents[ids]], 1).unflatten(0, (len(rows), width))
+        group = group_features.group[torch.from_numpy(rows)]
+        return context.run(context.networks.refiner, tokens, mask.unflatten(0, (len(rows), width)), group)
 
-    columns = RESIDUAL + learned.networks.options.latent
-    return by_table(np.full(count, width), 1 << (width - 1).bit_length(), columns, work)
+    columns = RESIDUAL + context.networks.options.latent
+    return run_tables(np.full(count, width), 1 << (width - 1).bit_length(), columns, run)
 
 
-def nearest(features: FeatureGaussians, count: int) -> np.ndarray:
-    """``[g,k]`` int64 nearest Feature Gaussians of the same layer in 3D, itself left out; -1 where there are fewer."""
+def find_neighbors(features: FeatureGaussians, count: int) -> np.ndarray:
+    """``[g,k]`` int64 nearest other Feature Gaussians of the same layer in 3D; -1 where there are fewer."""
     from scipy.spatial import cKDTree  # late: a quarter of a second that the analytic path does not need
 
-    means, found = features.means.double().numpy(), np.full((len(features), count), -1, np.int64)
+    means, neighbors = features.means.double().numpy(), np.full((len(features), count), -1, np.int64)
     with use_threads() as threads:
-        somewhere = np.isfinite(means).all(1)
+        finite = np.isfinite(means).all(1)
         for layer in (features.backing.numpy(), ~features.backing.numpy()):
-            rows = np.flatnonzero(layer & somewhere)
+            rows = np.flatnonzero(layer & finite)
             if len(rows) < 2:
                 continue
             near = min(count + 1, len(rows))
             _, ids = cKDTree(means[rows]).query(means[rows], k=near, workers=threads)
             itself = ids == np.arange(len(rows))[:, None]
-            itself[~itself.any(1), -1] = True  # among many at one place
-            found[rows, : near - 1] = rows[ids[~itself].reshape(len(rows), -1)]
-    return found
+            itself[~itself.any(1), -1] = True  # among many at the same place
+            neighbors[rows, : near - 1] = rows[ids[~itself].reshape(len(rows), -1)]
+    return neighbors
 
 
-def with_corrections(
-    features: FeatureGaussians, described: Described, raw: Tensor, networks: Networks
+def apply_corrections(
+    features: FeatureGaussians, group_features: GroupFeatures, raw: Tensor, networks: Networks
 ) -> tuple[FeatureGaussians, Tensor]:
     """Feature Gaussians with the raw corrections of merger or refiner, and the bounded ones ``[g,13]``.
 
     The backing layer stays as it is. Gradients flow through the latents and the corrections alone.
     """
     own = torch.where(features.backing[:, None], 0, raw)
-    residuals = bounded(own[:, :RESIDUAL], networks.options.bounds, HALF)
-    moved = move_features(features, described.base, residuals.detach(), described.frames)
-    return replace(moved, latents=features.latents + squashed(own[:, RESIDUAL:])), residuals
+    residuals = bound_residuals(own[:, :RESIDUAL], networks.options.bounds, HALF)
+    moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
+    return replace(moved, latents=features.latents + tanh_bounded(own[:, RESIDUAL:])), residuals
 
 
 def decode_gaussians(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, learned: Learned
+    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, context: NetworkContext
 ) -> Gaussians:
     """Children of Feature Gaussians with the corrections of the head for their number (paper section 4.3).
 
-    Three children take three slots of the head for four; from five on they stay as they are.
+    Three children take three slots of the head for four; five and more stay as they are.
 
     Args:
         children: Analytic Gaussians, those of one Feature Gaussian next to each other.
-        parents: ``[n]`` the Feature Gaussian of each, rising.
+        parents: ``[n]`` the Feature Gaussian of each, ascending.
         features: The Feature Gaussians.
-        learned: The networks and the scene.
+        context: The networks and the scene.
     """
-    return decode_described(children, parents, features, learned.describe(features), learned)
+    return decode_with_group_features(children, parents, features, context.describe(features), context)
 
 
-def decode_described(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+def decode_with_group_features(
+    children: Gaussians,
+    parents: np.ndarray,
+    features: FeatureGaussians,
+    group_features: GroupFeatures,
+    context: NetworkContext,
 ) -> Gaussians:
-    """:func:`decode_gaussians` of Feature Gaussians that are described already: no members are looked at."""
-    children = head_starts(children, parents, features, described, learned.networks)
-    residuals = head_residuals(children, parents, features, described, learned)
-    return move_gaussians(children, residuals, described.frames[torch.from_numpy(parents)])
+    """:func:`decode_gaussians` with group features that are known already, without the scene's members."""
+    children = prepare_children(children, parents, features, group_features, context.networks)
+    residuals = run_heads(children, parents, features, group_features, context)
+    return move_gaussians(children, residuals, group_features.frames[torch.from_numpy(parents)])
 
 
-def head_starts(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, networks: Networks
+def prepare_children(
+    children: Gaussians,
+    parents: np.ndarray,
+    features: FeatureGaussians,
+    group_features: GroupFeatures,
+    networks: Networks,
 ) -> Gaussians:
-    """What the heads correct: the children; for absolute outputs a round grey Gaussian in the place of each.
+    """The Gaussians that the heads correct: the children; for absolute outputs a round grey Gaussian for each.
 
-    It stands at its group's place, as large as the group, half transparent, with the axes of the group's frame. Those
-    of the backing layer, and five or more of one parent, stay: no head looks at them.
+    It lies at its group's mean, as large as the group, half transparent, with the axes of the group's frame. Children
+    of the backing layer, and five or more of one parent, stay as they are: no head corrects them.
     """
     if networks.options.outputs == "residual":
         return children
     sizes = np.bincount(parents, minlength=len(features))[parents]
-    taken = torch.from_numpy((sizes <= SLOTS[-1]) & ~features.backing.numpy()[parents])
+    replaced = torch.from_numpy((sizes <= SLOTS[-1]) & ~features.backing.numpy()[parents])
     own = torch.from_numpy(parents)
-    place, size = described.base.means[own], described.sizes[own, None].expand(-1, 3)
-    axes = rotmat_to_quat(described.frames.double())[own].to(children.quats)
+    means, scales = group_features.base.means[own], group_features.sizes[own, None].expand(-1, 3)
+    quats = rotmat_to_quat(group_features.frames.double())[own].to(children.quats)
     return replace(
         children,
-        means=torch.where(taken[:, None], place, children.means),
-        quats=torch.where(taken[:, None], axes, children.quats),
-        scales=torch.where(taken[:, None], size, children.scales),
-        opacities=torch.where(taken, 0.5, children.opacities),
-        sh0=torch.where(taken[:, None, None], 0.0, children.sh0),
+        means=torch.where(replaced[:, None], means, children.means),
+        quats=torch.where(replaced[:, None], quats, children.quats),
+        scales=torch.where(replaced[:, None], scales, children.scales),
+        opacities=torch.where(replaced, 0.5, children.opacities),
+        sh0=torch.where(replaced[:, None, None], 0.0, children.sh0),
     )
 
 
-def head_residuals(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, described: Described, learned: Learned
+def run_heads(
+    children: Gaussians,
+    parents: np.ndarray,
+    features: FeatureGaussians,
+    group_features: GroupFeatures,
+    context: NetworkContext,
 ) -> Tensor:
     """``[n,13]`` bounded corrections of children; zero for the backing layer and for five or more of one parent."""
-    networks, count = learned.networks, len(children)
+    networks = context.networks
     sizes = np.bincount(parents, minlength=len(features))
     first = np.cumsum(sizes) - sizes
-    residuals = torch.zeros(count, RESIDUAL)
+    residuals = torch.zeros(len(children), RESIDUAL)
     for slots, fewest in zip(SLOTS, (1, 2, 3), strict=True):
         rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots) & ~features.backing.numpy())
         if len(rows) == 0:
@@ -300,30 +305,30 @@ def head_residuals(
         places = np.arange(slots)[None]
         mask = places < sizes[rows, None]
         ids = first[rows, None] + np.where(mask, places, 0)
-        raw = _head_outputs(slots, children, (rows, ids, mask), features, described, learned)
-        taken = torch.from_numpy(mask.reshape(-1))
-        where = torch.from_numpy(ids.reshape(-1))[taken]
-        residuals = residuals.index_copy(0, where, bounded(raw[taken], networks.options.head_bounds))
+        raw = _run_head(slots, children, (rows, ids, mask), features, group_features, context)
+        valid = torch.from_numpy(mask.reshape(-1))
+        ids_valid = torch.from_numpy(ids.reshape(-1))[valid]
+        residuals = residuals.index_copy(0, ids_valid, bound_residuals(raw[valid], networks.options.head_bounds))
     return residuals
 
 
-def _head_outputs(
+def _run_head(
     slots: int,
     children: Gaussians,
     table: tuple[np.ndarray, np.ndarray, np.ndarray],
     features: FeatureGaussians,
-    described: Described,
-    learned: Learned,
+    group_features: GroupFeatures,
+    context: NetworkContext,
 ) -> Tensor:
     """``[r·slots,13]`` raw corrections of a table of parents' rows, children's rows and mask."""
     parents, ids, mask = table
-    head = learned.networks.heads[str(slots)]
+    head = context.networks.heads[str(slots)]
 
-    def work(rows: np.ndarray, _: int) -> Tensor:
+    def run(rows: np.ndarray, _: int) -> Tensor:
         own = torch.from_numpy(parents[rows])
-        picked = torch.from_numpy(ids[rows].reshape(-1))
-        beside = part_tokens(children[picked], described, own.repeat_interleave(slots)).unflatten(0, (len(rows), slots))
-        known = features.latents[own], described.group[own]
-        return learned.through(head, *known, beside, torch.from_numpy(mask[rows])).flatten(1)
+        parts = children[torch.from_numpy(ids[rows].reshape(-1))]
+        tokens = part_tokens(parts, group_features, own.repeat_interleave(slots)).unflatten(0, (len(rows), slots))
+        inputs = features.latents[own], group_features.group[own], tokens, torch.from_numpy(mask[rows])
+        return context.run(head, *inputs).flatten(1)
 
-    return by_table(np.full(len(parents), slots), slots, slots * RESIDUAL, work).reshape(-1, RESIDUAL)
+    return run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run).reshape(-1, RESIDUAL)

@@ -1,4 +1,4 @@
-"""Networks in a file: safetensors, so data alone, with what they are and how they were trained in the header."""
+"""Networks in a file: safetensors, so data alone, with their sizes and their training in the header."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import NetworkOptions
 
-SCHEMA = 1  # of the tensors' names and of the tokens that they were trained on
+SCHEMA = 1  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --checkpoint none"
 SHIPPED = Path(__file__).with_name("shipped.safetensors")
@@ -28,22 +28,15 @@ SHIPPED = Path(__file__).with_name("shipped.safetensors")
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Networks from a file.
+    """Networks from a file."""
 
-    Args:
-        networks: Ready for use, without gradients.
-        path: The file.
-        version: The gsmerge that wrote it.
-        training: Figures of the training, as the trainer wrote them.
-    """
-
-    networks: Networks
-    path: Path
-    version: str
-    training: Mapping[str, Any]
+    networks: Networks  # ready for use, without gradients
+    path: Path  # the file
+    version: str  # the gsmerge that wrote it
+    training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
-        """What a report says of it."""
+        """Entry of a report."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
         name = "shipped" if self.path == SHIPPED else str(self.path)
         head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
@@ -51,7 +44,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: str | PathLike[str], networks: Networks, training: Mapping[str, Any]) -> None:
-    """Write networks and what is known of their training; an existing file is replaced.
+    """Write networks and facts about their training; an existing file is replaced.
 
     Raises:
         SceneError: If the file cannot be written.
@@ -63,11 +56,11 @@ def save_checkpoint(path: str | PathLike[str], networks: Networks, training: Map
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
-    """Networks of a file; nothing in it is ever executed.
+    """Read networks from a file; nothing in it is ever executed.
 
     Raises:
-        SceneError: If the file is missing or damaged, of another format or version, or holds other tensors than its
-            sizes ask for, or numbers that are not finite.
+        SceneError: If the file is missing or damaged, of another format or version, or its tensors do not fit the
+            sizes in its header or are not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -77,8 +70,8 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError) as error:
-        told = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a safetensors file, could not read it ({told})", REMEDY) from error
+        reason = str(error).splitlines()[0]
+        raise SceneError(path, f"expected a safetensors file, could not read it ({reason})", REMEDY) from error
     options, training, version = _header(path, header)
     return Checkpoint(build_networks(path, options, tensors), path, version, training)
 
@@ -86,64 +79,61 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 def build_networks(
     path: Path, options: Mapping[str, Any], tensors: Mapping[str, Tensor], remedy: str = REMEDY
 ) -> Networks:
-    """Networks of some sizes and weights, ready for use.
-
-    Args:
-        path: The file that they are from.
-        options: Sizes, as ``asdict`` gave them.
-        tensors: Weights by name.
-        remedy: What to do where they do not fit.
+    """Networks from sizes (as of ``asdict``) and weights by name; ``path`` and ``remedy`` are for the error.
 
     Raises:
-        SceneError: If the sizes are out of range, or the weights others than they ask for.
+        SceneError: If the sizes are out of range, or the weights do not fit them.
     """
     try:
         networks = Networks(NetworkOptions.from_dict(options))
     except (ValueError, TypeError) as error:
-        words = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a header that describes the networks ({words})", remedy) from error
+        raise _header_error(path, error, remedy) from error
     _check_tensors(path, tensors, networks.state_dict(), remedy)
     networks.load_state_dict(dict(tensors))
     return networks.eval().requires_grad_(False)
 
 
 def _header(path: Path, header: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """Sizes of the networks, figures of the training, and the version that wrote them."""
+    """Sizes of the networks, facts about the training, and the version that wrote them."""
     if FORMAT not in header:
         raise SceneError(path, "expected networks of gsmerge, found another safetensors file", REMEDY)
     try:
-        told = json.loads(header[FORMAT])
-        if not isinstance(told, dict) or told.get("schema") != SCHEMA:
-            found = told.get("schema") if isinstance(told, dict) else "none"
-            raise SceneError(path, f"expected schema {SCHEMA}, found {found!r}", REMEDY)
+        values = json.loads(header[FORMAT])
+        if not isinstance(values, dict) or values.get("schema") != SCHEMA:
+            schema = values.get("schema") if isinstance(values, dict) else "none"
+            raise SceneError(path, f"expected schema {SCHEMA}, found {schema!r}", REMEDY)
         for name, kind in (("options", dict), ("training", dict), ("gsmerge", str)):
-            if not isinstance(told.get(name), kind):
+            if not isinstance(values.get(name), kind):
                 raise ValueError(f"no {name}")
-        return told["options"], told["training"], told["gsmerge"]
+        return values["options"], values["training"], values["gsmerge"]
     except (ValueError, RecursionError) as error:
-        words = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a header that describes the networks ({words})", REMEDY) from error
+        raise _header_error(path, error, REMEDY) from error
 
 
-def _check_tensors(path: Path, tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor], remedy: str) -> None:
-    """Whether all tensors are there, and what they should be."""
-    for name in sorted(tensors.keys() ^ wanted.keys()):
-        found = "a tensor too many" if name in tensors else "none"
-        raise SceneError(path, f"expected the tensors of its networks, found {found}: {name}", remedy)
+def _header_error(path: Path, error: Exception, remedy: str) -> SceneError:
+    reason = str(error).splitlines()[0]
+    return SceneError(path, f"expected a header that describes the networks ({reason})", remedy)
+
+
+def _check_tensors(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], remedy: str) -> None:
+    """Raise unless all tensors are there, with the expected shape and type, and finite."""
+    for name in sorted(tensors.keys() ^ expected.keys()):
+        difference = "a tensor too many" if name in tensors else "none"
+        raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", remedy)
     for name, tensor in tensors.items():
-        if tensor.shape != wanted[name].shape or tensor.dtype != torch.float32:
-            have, want = list(tensor.shape), list(wanted[name].shape)
+        if tensor.shape != expected[name].shape or tensor.dtype != torch.float32:
+            have, want = list(tensor.shape), list(expected[name].shape)
             raise SceneError(path, f"{name}: expected float32 {want}, found {tensor.dtype} {have}", remedy)
         if not bool(torch.isfinite(tensor).all()):
             raise SceneError(path, f"{name}: expected finite numbers, found others", remedy)
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
-    """The checkpoint that was asked for and what to tell the user; None where the analytic stages work alone.
+    """The checkpoint of this name, and notes for the user; None for the analytic stages alone.
 
     Args:
         name: A file, ``"shipped"``: the one in the package, or ``"none"``.
-        required: A checkpoint that cannot be used is an error; otherwise it is told, and the stages work without.
+        required: A checkpoint that cannot be used is an error; otherwise a note, and the stages run without.
 
     Raises:
         SceneError: If it is required and cannot be used.

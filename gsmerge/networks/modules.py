@@ -1,24 +1,97 @@
 """Encoder, decoder heads, merger and refiner (paper sections 4.2 to 4.5, fig. architecture).
 
-All of them take tokens and give corrections: raw outputs that :mod:`gsmerge.networks.residuals` bounds and applies to
-what the analytic stages made. The last layers start at zero, so untrained networks change nothing.
+All of them take tokens and return raw corrections, which :mod:`gsmerge.networks.residuals` bounds and applies to the
+results of the analytic stages. The last layers start at zero, so untrained networks change nothing.
+
+They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded; ``mask`` is True where a token
+is one of the set's own. Padded tokens are never attended to.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
 
-from gsmerge.networks.layers import AttentionBlock, Pooling, mlp, silent
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.networks.residuals import RESIDUAL
 from gsmerge.networks.tokens import GROUP, MEMBER, PART
 
-SLOTS = (1, 2, 4)  # children that there is a decoder head for
+SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
+
+
+def mlp(*widths: int) -> nn.Sequential:
+    """Linear layers with GELU between them."""
+    layers: list[nn.Module] = []
+    for before, after in pairwise(widths):
+        layers += [nn.Linear(before, after), nn.GELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def zero_init(layer: nn.Linear) -> nn.Linear:
+    """The layer with weights and bias zero: until trained, it corrects nothing."""
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class Attention(nn.Module):
+    """Multi-head attention from ``x [b,q,w]`` to ``context [b,n,w]`` with ``mask [b,n]``."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
+
+    def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
+        """``[b,q,w]``."""
+        key, value = self.pair(context).chunk(2, -1)
+        split = [t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query(x), key, value)]
+        mixed = scaled_dot_product_attention(split[0], split[1], split[2], attn_mask=mask[:, None, None])
+        return self.out(mixed.transpose(1, 2).flatten(2))
+
+
+class AttentionBlock(nn.Module):
+    """Attention and an MLP, both residual with normalised inputs (paper fig. architecture: SAB).
+
+    ``first``: computes only the first token, ``[b,1,w]``.
+    """
+
+    def __init__(self, width: int, heads: int, *, first: bool = False) -> None:
+        super().__init__()
+        self.first = first
+        self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """``[b,n,w]`` tokens after attending to each other."""
+        context = self.before(x)
+        if self.first:
+            x = x[:, :1]
+        x = x + self.attention(context[:, : x.shape[1]], context, mask)
+        return x + self.mlp(self.between(x))
+
+
+class Pooling(nn.Module):
+    """One token for a set, from a learned query (paper fig. architecture: PMA)."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.seed = nn.Parameter(torch.randn(1, 1, width) / width**0.5)
+        self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """``[b,w]``."""
+        query = self.seed.expand(len(x), -1, -1)
+        pooled = query + self.attention(query, self.before(x), mask)
+        return (pooled + self.mlp(self.between(pooled)))[:, 0]
 
 
 class SetNetwork(nn.Module):
-    """The pattern that encoder and merger share: MLP tokens, attention blocks, pooling, an MLP that sees the group."""
+    """Common to encoder and merger: MLP of the tokens, attention blocks, pooling, MLP with the group's numbers."""
 
     def __init__(self, token: int, out: int, options: NetworkOptions) -> None:
         super().__init__()
@@ -41,12 +114,12 @@ class Encoder(nn.Module):
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
         self.set = SetNetwork(MEMBER, options.width, options)
-        self.latent, self.shift = nn.Linear(options.width, options.latent), silent(nn.Linear(options.width, 3))
+        self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
         """Raw latent ``[b,latent]`` and raw shift ``[b,3]``."""
-        found = nn.functional.gelu(self.set(tokens, mask, group))
-        return self.latent(found), self.shift(found)
+        hidden = nn.functional.gelu(self.set(tokens, mask, group))
+        return self.latent(hidden), self.shift(hidden)
 
 
 class Head(nn.Module):
@@ -58,7 +131,7 @@ class Head(nn.Module):
         self.seeds = mlp(options.latent + GROUP, width, slots * width)
         self.child = nn.Linear(PART, width)
         self.block, self.norm = AttentionBlock(width, options.heads), nn.LayerNorm(width)
-        self.out = silent(nn.Linear(width, RESIDUAL))
+        self.out = zero_init(nn.Linear(width, RESIDUAL))
 
     def forward(self, latents: Tensor, group: Tensor, children: Tensor, mask: Tensor) -> Tensor:
         """Raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART]`` with ``mask [b,slots]``."""
@@ -72,7 +145,7 @@ class Merger(nn.Module):
     def __init__(self, options: NetworkOptions) -> None:
         super().__init__()
         self.set = SetNetwork(PART + options.latent, options.width, options)
-        self.out = silent(nn.Linear(options.width, RESIDUAL + options.latent))
+        self.out = zero_init(nn.Linear(options.width, RESIDUAL + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
         """Raw corrections ``[b,RESIDUAL+latent]``."""
@@ -90,7 +163,7 @@ class Refiner(nn.Module):
             AttentionBlock(width, options.heads, first=i == last) for i in range(options.refine_blocks)
         )
         self.norm, self.join = nn.LayerNorm(width), mlp(width + GROUP, 2 * width, width)
-        self.out = silent(nn.Linear(width, RESIDUAL + options.latent))
+        self.out = zero_init(nn.Linear(width, RESIDUAL + options.latent))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> Tensor:
         """Raw corrections ``[b,RESIDUAL+latent]``; the first token is the Feature Gaussian itself."""
@@ -102,7 +175,7 @@ class Refiner(nn.Module):
 
 
 class Networks(nn.Module):
-    """All of them, for one checkpoint."""
+    """All networks of a checkpoint."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
@@ -112,5 +185,5 @@ class Networks(nn.Module):
 
     @property
     def num_parameters(self) -> int:
-        """Numbers in the checkpoint."""
+        """Weights in the checkpoint."""
         return sum(p.numel() for p in self.parameters())

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 
-def _expect_number(name: str, value: Any, most: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= most:
-        raise ValueError(f"{name}: expected a number above 0, at most {most:g}, got {value!r}")
+def _expect_number(name: str, value: Any, maximum: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= maximum:
+        raise ValueError(f"{name}: expected a number above 0, at most {maximum:g}, got {value!r}")
 
 
-def _expect_count(name: str, value: Any, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        raise ValueError(f"{name}: expected a whole number from 1 to {most}, got {value!r}")
+def _expect_count(name: str, value: Any, maximum: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= maximum:
+        raise ValueError(f"{name}: expected a whole number from 1 to {maximum}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Bounds:
         color: Change of each channel of the base colour, sRGB in [0, 1].
 
     Raises:
-        ValueError: If one is not above 0, or so large that it bounds nothing.
+        ValueError: If one is not above 0, or too large to bound anything.
     """
 
     mean: float = 1.0
@@ -43,13 +43,13 @@ class Bounds:
             _expect_number(f.name, getattr(self, f.name), 8.0)
 
 
-WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of outputs that begin at nothing
+WIDE = Bounds(mean=4.0, size=6.0, turn=3.2, logit=8.0, color=0.75)  # of absolute outputs
 OUTPUTS = ("residual", "absolute")
 
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Sizes of the networks, and what their heads say.
+    """Sizes of the networks, and the kind of their heads' output.
 
     Args:
         width: Width of the tokens, a multiple of ``heads``.
@@ -57,11 +57,11 @@ class NetworkOptions:
         blocks: Set attention blocks of the encoder and of the merger.
         refine_blocks: Attention blocks of the refiner.
         latent: Width of a Feature Gaussian's latent.
-        members: Most members of a group that the encoder looks at; larger groups are sampled.
-        neighbors: Neighbours that the refiner looks at.
+        members: Largest number of members that the encoder reads; larger groups are sampled.
+        neighbors: Neighbours that the refiner reads.
         bounds: Largest corrections.
-        outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, the paper's: they know none,
-            and correct a round grey Gaussian at the group's place, within bounds that exclude nothing sensible.
+        outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, as in the paper: they do not
+            read these, and correct a round grey Gaussian at the group's mean, within wide bounds.
 
     Raises:
         ValueError: If a size is out of range or they do not go together.
@@ -79,14 +79,14 @@ class NetworkOptions:
 
     @property
     def head_bounds(self) -> Bounds:
-        """What the heads may change at most."""
+        """Largest corrections of the heads."""
         return WIDE if self.outputs == "absolute" else self.bounds
 
     def __post_init__(self) -> None:
         if self.outputs not in OUTPUTS:
             raise ValueError(f"outputs: expected {' or '.join(OUTPUTS)}, got {self.outputs!r}")
-        most = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
-        for name, limit in (most | {"neighbors": 64}).items():
+        limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
+        for name, limit in (limits | {"neighbors": 64}).items():
             _expect_count(name, getattr(self, name), limit)
         if self.width % self.heads:
             raise ValueError(f"width: expected a multiple of {self.heads} heads, got {self.width}")

@@ -1,8 +1,8 @@
-"""What the networks read: numbers without a unit, in a frame of each group.
+"""Inputs of the networks: numbers without a unit, in a frame of each group.
 
-The frame stands on the ray that the group was seen along, with the image's right and down of its own view. Lengths are
-in units of the Feature Gaussian's size or of one pixel's footprint there. So depth, focal length, resolution and the
-scale of the world drop out.
+The frame is aligned to the ray that the group was seen along, with the image's right and down of its own view. Lengths
+are in units of the Feature Gaussian's size or of one pixel's footprint there, so that nothing depends on depth, focal
+length, resolution or the scale of the world.
 """
 
 from __future__ import annotations
@@ -15,62 +15,54 @@ from torch import Tensor
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import Members, feature_to_gaussians
-from gsmerge.networks.evidence import EVIDENCE, evidence
-from gsmerge.networks.residuals import sizes_of
+from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
+from gsmerge.networks.residuals import gaussian_sizes
+from gsmerge.networks.tables import group_rows
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
 
-PART = 13  # of a Gaussian beside another one: place, log scales, opacity, colour, normal
-MEMBER = PART + 6  # and place in footprints, colour itself
-GROUP = 19 + EVIDENCE
-TINY = 1e-12
+PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
+MEMBER = PART + 6  # and its position in footprints and its colour
+GROUP = 19 + NUM_STATS  # columns of a whole group
+TINY = 1e-12  # world units; lengths are clamped to it before a division or logarithm
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
-    """Feature Gaussians as the networks see them.
+class GroupFeatures:
+    """Feature Gaussians as the networks read them."""
 
-    Args:
-        base: ``g`` Gaussians without corrections.
-        frames: ``[g,3,3]`` axes (right, down, away) as columns, world.
-        sizes: ``[g]`` geometric mean of the two largest scales, world units.
-        footprints: ``[g]`` size of one pixel, world units.
-        views: ``[g]`` int64 view that the frame belongs to.
-        group: ``[g,GROUP]`` numbers that describe the whole group.
-    """
-
-    base: Gaussians
-    frames: Tensor
-    sizes: Tensor
-    footprints: Tensor
-    views: Tensor
-    group: Tensor
+    base: Gaussians  # g Gaussians without corrections
+    frames: Tensor  # [g,3,3] axes (right, down, away) as columns, world
+    sizes: Tensor  # [g] geometric mean of the two largest scales, world units
+    footprints: Tensor  # [g] size of one pixel, world units
+    views: Tensor  # [g] int64 view that the frame belongs to
+    group: Tensor  # [g,GROUP] numbers that describe the whole group
 
 
-def describe(features: FeatureGaussians, members: Members, cameras: Cameras) -> Described:
-    """Feature Gaussians for the networks."""
-    views = own_views(features, members, cameras)
-    bare = described_by(features, views, torch.zeros(len(features), 0), cameras)
-    places = image_places(features.means, views, cameras)
-    told = evidence(features.means, features.sh0, views, members, cameras)
-    return replace(bare, group=torch.cat([_group_numbers(features, bare), places, told], 1).nan_to_num())
+def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
+    """Inputs of the networks for Feature Gaussians."""
+    views = _choose_views(features, members, cameras)
+    bare = make_group_features(features, views, torch.zeros(len(features), 0), cameras)
+    tangents = _image_tangents(features.means, views, cameras)
+    stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
+    return replace(bare, group=torch.cat([_group_numbers(features, bare), tangents, stats], 1).nan_to_num())
 
 
-def described_by(features: FeatureGaussians, views: Tensor, group: Tensor, cameras: Cameras) -> Described:
-    """Feature Gaussians whose ``views [g]`` and numbers ``group [g,GROUP]`` are known: no members are looked at."""
+def make_group_features(features: FeatureGaussians, views: Tensor, group: Tensor, cameras: Cameras) -> GroupFeatures:
+    """Inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the scene's members."""
     base = feature_to_gaussians(features)
-    sizes = sizes_of(base.scales / features.spreads[:, None]).clamp_min(TINY)
-    frames = ray_frames(features.means, views, cameras)
-    return Described(base, frames, sizes, features.footprints.clamp_min(TINY), views, group)
+    sizes = gaussian_sizes(base.scales / features.spreads[:, None]).clamp_min(TINY)
+    frames = _ray_frames(features.means, views, cameras)
+    return GroupFeatures(base, frames, sizes, features.footprints.clamp_min(TINY), views, group)
 
 
-def _group_numbers(features: FeatureGaussians, bare: Described) -> Tensor:
+def _group_numbers(features: FeatureGaussians, bare: GroupFeatures) -> Tensor:
     """``[g,17]``: scales, opacity, mass, optical depth, members, colour, covariance."""
     base, frames, sizes, footprints = bare.base, bare.frames, bare.sizes, bare.footprints
     num_members = (features.starts[1:] - features.starts[:-1]).float()
     local = frames.transpose(1, 2) @ (features.covars / sizes[:, None, None] ** 2) @ frames
     columns = [
         torch.log(base.scales.clamp_min(TINY) / footprints[:, None]).clamp(-12, 12) / 4,
-        logits(base.opacities)[:, None],
+        _logits(base.opacities)[:, None],
         torch.log(features.masses.clamp_min(1e-30) / footprints**3)[:, None].clamp(-30, 30) / 10,
         torch.log(features.extinctions.clamp_min(1e-30) / footprints**2)[:, None].clamp(-30, 30) / 10,
         torch.log(num_members)[:, None] / 4,
@@ -81,21 +73,20 @@ def _group_numbers(features: FeatureGaussians, bare: Described) -> Tensor:
     return torch.cat(columns, 1)
 
 
-def logits(opacities: Tensor) -> Tensor:
-    """Logits of opacities, held within finite bounds, divided by 3."""
+def _logits(opacities: Tensor) -> Tensor:
+    """Logits of opacities, clamped to finite bounds, divided by 3."""
     return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
 
 
-def own_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> Tensor:
+def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> Tensor:
     """``[g]`` int64 view of each Feature Gaussian: its own; of merged ones, the view that gave it most opacity."""
     views = features.views.clone()
     merged = torch.nonzero(views < 0)[:, 0].numpy()
     if len(merged) == 0:
         return views
     starts, sizes = features.starts.numpy()[merged], np.diff(features.starts.numpy())[merged]
-    owners = np.repeat(np.arange(len(merged)), sizes)
-    offsets = np.arange(len(owners)) - (np.cumsum(sizes) - sizes)[owners]
-    ids = features.members.numpy()[starts[owners] + offsets]
+    positions, owners = group_rows(starts, sizes)
+    ids = features.members.numpy()[positions]
     pixels = ids if members.pixels is None else members.pixels[ids]
     seen = pixels // (cameras.width * cameras.height)
     sums = np.bincount(owners * len(cameras) + seen, members.opacities[ids], len(merged) * len(cameras))
@@ -103,7 +94,7 @@ def own_views(features: FeatureGaussians, members: Members, cameras: Cameras) ->
     return views
 
 
-def ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
+def _ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
     """``[n,3,3]`` frames of points ``[n,3]`` seen in ``views [n]``: image right, image down and the ray as columns."""
     rotations, centres = cameras.viewmats[:, :3, :3].float()[views], cameras.centres.float()[views]
     normalize = torch.nn.functional.normalize
@@ -114,48 +105,36 @@ def ray_frames(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
     return torch.stack([right, torch.linalg.cross(away, right), away], 2)
 
 
-def image_places(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
-    """``[n,2]`` tangents of the angles to the axis of each point's view, held within 3."""
+def _image_tangents(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
+    """``[n,2]`` tangents of the angles to the axis of each point's view, clamped to 3."""
     viewmats = cameras.viewmats.float()[views]
     camera = (viewmats[:, :3, :3] @ means[:, :, None])[:, :, 0] + viewmats[:, :3, 3]
     return (camera[:, :2] / camera[:, 2:].clamp_min(1e-6)).clamp(-3, 3)
 
 
-def part_tokens(parts: Gaussians, described: Described, owners: Tensor) -> Tensor:
-    """``[n,PART]``: Gaussians beside the Feature Gaussians that they belong to.
-
-    Args:
-        parts: n Gaussians.
-        described: The Feature Gaussians.
-        owners: ``[n]`` the Feature Gaussian of each.
-    """
-    frames, d = described.frames[owners].transpose(1, 2), described
+def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor) -> Tensor:
+    """``[n,PART]``: n Gaussians relative to the Feature Gaussians ``owners [n]`` that they belong to."""
+    g = group_features
+    frames = g.frames[owners].transpose(1, 2)
     normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
-    axes = frames @ torch.stack([parts.means - d.base.means[owners], normals], 2)
+    axes = frames @ torch.stack([parts.means - g.base.means[owners], normals], 2)
     scales = parts.scales.sort(1).values.clamp_min(TINY)
-    flat = 1 - scales[:, :1] / scales[:, 1:2]  # a round Gaussian has no normal, and rounding must not choose one
+    flat = 1 - scales[:, :1] / scales[:, 1:2]  # a round Gaussian has no normal, so that rounding cannot choose one
     normals = -flat * axes[:, :, 1] * torch.sign(axes[:, 2:, 1])  # towards the camera
     columns = [
-        torch.asinh(axes[:, :, 0] / d.sizes[owners, None]),
-        torch.log(scales / d.footprints[owners, None]).clamp(-12, 12) / 4,
-        logits(parts.opacities)[:, None],
-        SH_C0 * (parts.sh0[:, 0] - d.base.sh0[owners, 0]),
+        torch.asinh(axes[:, :, 0] / g.sizes[owners, None]),
+        torch.log(scales / g.footprints[owners, None]).clamp(-12, 12) / 4,
+        _logits(parts.opacities)[:, None],
+        SH_C0 * (parts.sh0[:, 0] - g.base.sh0[owners, 0]),
         normals,
     ]
     return torch.cat(columns, 1).nan_to_num()
 
 
-def member_tokens(members: Members, ids: np.ndarray, described: Described, owners: Tensor) -> Tensor:
-    """``[n,MEMBER]``: members of groups, relative to their Feature Gaussians.
-
-    Args:
-        members: The scene's Gaussians.
-        ids: ``[n]`` rows of them.
-        described: The Feature Gaussians.
-        owners: ``[n]`` the group of each.
-    """
+def member_tokens(members: Members, ids: np.ndarray, group_features: GroupFeatures, owners: Tensor) -> Tensor:
+    """``[n,MEMBER]``: rows ``ids [n]`` of the members, relative to their Feature Gaussians ``owners [n]``."""
     columns = (members.means, members.quats, members.scales, members.opacities, members.sh0, members.shN[:, :0])
     picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
-    tokens = part_tokens(picked, described, owners)
-    places = described.sizes[owners, None] / described.footprints[owners, None] * torch.sinh(tokens[:, :3])
+    tokens = part_tokens(picked, group_features, owners)
+    places = group_features.sizes[owners, None] / group_features.footprints[owners, None] * torch.sinh(tokens[:, :3])
     return torch.cat([tokens, torch.asinh(places), SH_C0 * picked.sh0[:, 0]], 1)

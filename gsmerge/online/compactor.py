@@ -1,4 +1,4 @@
-"""Views in batches, Gaussians at any time: the state and its settings in one object."""
+"""The state and its settings in one object: views in batches, Gaussians at any time."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
+from gsmerge.online.decode import decode_stored
 from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
-from gsmerge.online.fitted import decode_stored
-from gsmerge.online.options import OnlineOptions
+from gsmerge.online.options import merge_settings
 from gsmerge.online.state import OnlineState
-from gsmerge.options import CompactOptions
 from gsmerge.runtime.run_log import Progress
 from gsmerge.stages.fit import FitOptions
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
@@ -35,12 +34,12 @@ class Compactor:
     """
 
     def __init__(self, **settings: Any) -> None:
-        self._options, self._online = settled(settings)
+        self._options, self._online = merge_settings(settings)
         self._state: OnlineState | None = None
 
     @classmethod
     def load(cls, path: str | PathLike[str], **settings: Any) -> Compactor:
-        """One that goes on where a state was saved, with its settings unless others are given.
+        """A compactor that continues from a saved state, with its settings unless others are given.
 
         Raises:
             SceneError: If the file cannot be read or is damaged.
@@ -49,7 +48,7 @@ class Compactor:
         state = load_state(path)
         compactor = cls.__new__(cls)
         compactor._state = state
-        compactor._options, compactor._online = settled(settings, state)
+        compactor._options, compactor._online = merge_settings(settings, state)
         return compactor
 
     def __len__(self) -> int:
@@ -58,7 +57,7 @@ class Compactor:
 
     @property
     def state(self) -> OnlineState | None:
-        """What was made of all batches so far; None before the first."""
+        """The state after all batches so far; None before the first."""
         return self._state
 
     @property
@@ -79,16 +78,16 @@ class Compactor:
         progress: Progress | None = None,
         **fit: Any,
     ) -> Gaussians:
-        """The Gaussians so far, see :func:`gsmerge.online.fitted.decode_stored`.
+        """The Gaussians so far, see :func:`gsmerge.online.decode.decode_stored`.
 
         Args:
-            k: Gaussians of each group; None: as the settings have it.
+            k: Gaussians of each group; None: as in the settings.
             budget: Gaussians in all instead.
             progress: As of :func:`gsmerge.compact`.
-            **fit: Settings of the fit to the photos that were kept, such as ``fit="none"`` or ``effort="fast"``.
+            **fit: Settings of the fit to the stored photos, such as ``fit="none"`` or ``effort="fast"``.
 
         Raises:
-            ValueError: If there was no batch yet, or what is asked for cannot be had.
+            ValueError: If there was no batch yet, or K or the budget is out of range.
         """
         if self._state is None:
             raise ValueError("expected at least one batch of views before decoding, got none")
@@ -107,19 +106,3 @@ class Compactor:
         if self._state is None:
             raise ValueError("expected at least one batch of views before saving, got none")
         save_state(path, self._state, overwrite=overwrite)
-
-
-def settled(settings: Mapping[str, Any], state: OnlineState | None = None) -> tuple[CompactOptions, OnlineOptions]:
-    """All settings: as given, otherwise those that the state was made with, otherwise the defaults.
-
-    Colours are what is fitted batch by batch, unless told otherwise; a full fit has its place when decoding.
-
-    Raises:
-        ValueError: If a setting is unknown or out of range.
-    """
-    names = OnlineOptions.__dataclass_fields__.keys()
-    known = names | CompactOptions().to_dict().keys()
-    before = {} if state is None else {n: v for n, v in state.about["options"].items() if n in known}
-    merged = {"fit": "color"} | before | dict(settings)
-    online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})
-    return CompactOptions().with_settings(merged), online

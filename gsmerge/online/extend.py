@@ -8,26 +8,45 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsmerge import __version__
-from gsmerge.build import Merged, merged_groups
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.colors import solve_colors
-from gsmerge.online.cover import group_errors, pixel_errors, rows_in_view
-from gsmerge.online.join import absorb, partners
+from gsmerge.online.novelty import novel_rows, rows_in_view
 from gsmerge.online.options import OnlineOptions
-from gsmerge.online.pictures import Shots, joined_cameras, kept_photos, resized, shots_at, view_places
-from gsmerge.online.state import OnlineState, Parts, baked, joined, no_photos, pick, with_solved
-from gsmerge.options import CompactOptions
-from gsmerge.pipeline import Work, begin, choose_groups, decide, keeps_all
+from gsmerge.online.photos import (
+    BatchPhotos,
+    concat_cameras,
+    fit_batch_colors,
+    resize_cameras,
+    resize_photos,
+    update_replay,
+    view_ids,
+)
+from gsmerge.online.state import (
+    GroupSet,
+    OnlineState,
+    bake,
+    concat_groups,
+    limit_children,
+    no_photos,
+    replace_groups,
+    select_groups,
+    with_fitted_colors,
+)
+from gsmerge.options import CompactOptions, to_schema
+from gsmerge.pipeline import build, merge_views
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.fit import shown
-from gsmerge.stages.merge import take
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.search import choose_count
+from gsmerge.stages.fit import visible_mask
+from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.merge import MergedViews, merge, take
+from gsmerge.stages.prepare import PreparedScene, prepare
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelScene, UnalignedScene
 
 
 @dataclass(frozen=True)
@@ -37,15 +56,15 @@ class BatchReport:
     Args:
         num_views: Views of the batch.
         num_input: Gaussians of the batch.
-        num_new: Groups that it was cut to and merged to among its own views.
+        num_new: Groups that it became, merged across its own views.
         num_covered: Of these, left out because the state shows their pixels as well.
-        num_joined: Of the rest, those that became part of groups that were there.
+        num_joined: Of the rest, those that were merged into groups of the state.
         num_hidden: Of the rest, left out because none of the batch's views shows them.
         num_groups: Groups of the state afterwards.
         seconds: Wall time of each stage.
         choices: What the stages decided.
-        notes: Things worth telling, one sentence each.
-        options: All settings by flat name.
+        notes: Warnings, one sentence each.
+        options: All settings, by their names in reports.
     """
 
     num_views: int
@@ -86,154 +105,185 @@ def extend(
             is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
-    _check(state, scene, options, online.max_k if state is None else state.settings.most)
+    _check(state, scene, options, online.max_k if state is None else state.settings.max_k)
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
-        work = begin(scene, options, log, None if state is None else state.frame)
-        work = replace(work, canvas=replace(work.canvas, share=1.0))  # nothing grows here
-        count = decide(work, log)
-        if keeps_all(work, count):
+        prepared = prepare(scene, options, log, None if state is None else state.frame)
+        prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
+        count = choose_count(prepared, build, log)
+        if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        grouping = choose_groups(work, count, log)
-        merged = merged_groups(work.source, grouping, work.options, log)
-        shots = _shots(state, work)
-        counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
-        rows = torch.zeros(0, dtype=torch.int64)
-        if state is not None:
-            with log.stage("cover"):
-                rows = rows_in_view(state.parts.features, shots.cameras)
-                fresh = _uncovered(pick(state.parts, rows), merged, shots, work.source.scene, online)
-                counts["num_covered"] = len(merged.features) - len(fresh)
-                merged = replace(merged, features=take(merged.features, fresh))
-        most = online.max_k if state is None else state.settings.most
-        places = np.arange(len(shots)) if state is None else view_places(state.cameras, shots.cameras)
-        with log.stage("decode"):
-            new = baked(merged.features, merged.members, merged.learned, most, options.encode.rule)
-        with log.stage("join"):
-            state, found = _entered(state, new, work, (shots, places, rows), online)
-            counts |= found
-        if work.scene.images is not None:
-            state = _with_photos(state, (shots, places), work.options, online, log)
-    numbers = {"num_views": len(work.source.scene), "num_input": scene.num_gaussians, **counts}
-    told = options.to_dict() | asdict(online)
-    done = BatchReport(
-        **numbers, num_groups=len(state), seconds=log.seconds, choices=log.choices,
-        notes=tuple(log.notes), options=told,
+        merged = merge_views(prepared, count, log)
+        state, counts = _add_batch(state, prepared, merged, online, log)
+    numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
+    settings = to_schema(options.to_dict()) | asdict(online)
+    stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
+    about = {"gsmerge": __version__, "options": stored, "batches": [*state.about.get("batches", []), numbers]}
+    report = BatchReport(
+        **numbers, seconds=log.seconds, choices=log.choices, notes=tuple(log.notes), options=settings
     )  # fmt: skip
-    batches = [*state.about.get("batches", []), numbers | {"num_groups": len(state)}]
-    about = {"gsmerge": __version__, "options": _lasting(told), "batches": batches}
-    return replace(state, about=about), done
+    return replace(state, about=about), report
 
 
-def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, options: CompactOptions, most: int) -> None:
-    """Refuse what no state can have; ``most``: children of a group."""
+def _add_batch(
+    state: OnlineState | None, prepared: PreparedScene, merged: MergedViews, online: OnlineOptions, log: RunLog
+) -> tuple[OnlineState, dict[str, int]]:
+    """The state with a batch in it, and what became of the batch's groups by key of the report."""
+    scene, options = prepared.scene, prepared.options
+    max_k = online.max_k if state is None else state.settings.max_k
+    size = scene.cameras if state is None else state.cameras
+    photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
+    counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+    features, rows = merged.features, torch.zeros(0, dtype=torch.int64)
+    if state is not None:
+        with log.stage("cover"):
+            rows = rows_in_view(state.groups.features, photos.cameras)
+            there = feature_to_gaussians(with_fitted_colors(select_groups(state.groups, rows)).features)
+            novel = novel_rows(there, features, merged.members, photos.photos(2), scene.cameras, online)
+            counts["num_covered"] = len(features) - len(novel)
+            features = take(features, novel)
+    with log.stage("decode"):
+        new = bake(features, merged.members, merged.networks, max_k, options.encode.rule)
+    ids = np.arange(len(photos)) if state is None else view_ids(state.cameras, photos.cameras)
+    with log.stage("join"):
+        if state is None:
+            state = _first_state(new, prepared, max_k)
+        else:
+            groups, entered = _enter(state.groups, new, prepared, photos, rows, max_k)
+            new_views = torch.from_numpy(ids >= len(state.cameras))
+            state = _grown_state(state, groups, prepared, photos.cameras[new_views])
+            counts |= entered
+    if prepared.given.images is None:
+        return state, counts
+    groups = state.groups
+    if options.fit.fit == "color":
+        with log.stage("fit"):
+            groups, report = fit_batch_colors(groups, photos, options.fit, options.seed)
+            log.choices["fit"] = asdict(report)
+    replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
+    return replace(state, groups=groups, replay=replay), counts
+
+
+def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, options: CompactOptions, max_k: int) -> None:
+    """Refuse what no state can have.
+
+    Raises:
+        UsageError: If a setting or the harmonics do not fit.
+    """
     for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
         raise UsageError(
             "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
         )
-    if options.decode.count > most:
-        raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {most}")
+    if options.decode.count > max_k:
+        raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
-        have = state.sh_degree
-        raise UsageError(f"expected Gaussians with harmonics of degree {have} as the state's, got degree {degree}")
+        expected = state.sh_degree
+        raise UsageError(f"expected Gaussians with harmonics of degree {expected} as the state's, got degree {degree}")
 
 
-def _with_photos(
-    state: OnlineState,
-    seen: tuple[Shots, np.ndarray],
-    options: CompactOptions,
-    online: OnlineOptions,
-    log: RunLog,
-) -> OnlineState:
-    """The state after its newest photos were looked at, with some of them among those that are kept."""
-    parts, (shots, places) = state.parts, seen
-    if options.fit.fit == "color":
-        with log.stage("fit"):
-            parts, report = solve_colors(parts, shots, options.fit, options.seed)
-            log.choices["fit"] = asdict(report)
-    replay = kept_photos(state.replay, shots, places, len(state.cameras), online.replay)
-    return replace(state, parts=parts, replay=replay)
+def _enter(
+    groups: GroupSet, new: GroupSet, prepared: PreparedScene, photos: BatchPhotos, rows: Tensor, max_k: int
+) -> tuple[GroupSet, dict[str, int]]:
+    """The state's groups with new ones among them, and how many were merged and how many no view shows.
 
-
-def _lasting(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options without what depends on the machine."""
-    return {name: value for name, value in options.items() if name != "threads"}
-
-
-def _shots(state: OnlineState | None, work: Work) -> Shots:
-    """Photos of the batch, or what stands in for them, at the size of the state's views."""
-    scene = work.source.scene
-    size = scene.cameras if state is None else state.cameras
-    return shots_at(scene_pictures(scene), scene.cameras, size.width, size.height)
-
-
-def _uncovered(
-    parts: Parts, batch: Merged, shots: Shots, scene: PixelScene | UnalignedScene, online: OnlineOptions
-) -> torch.Tensor:
-    """Rows of the batch's groups that show something which the groups in view do not show as well."""
-    features, members = batch.features, batch.members
-    if online.tolerance == 0:
-        return torch.arange(len(features))
-    pictures, size = shots.photos(2), (scene.cameras.height, scene.cameras.width)
-    solved = feature_to_gaussians(with_solved(parts).features)
-    there = group_errors(features, members, pixel_errors(solved, pictures, *size))
-    own = group_errors(features, members, pixel_errors(feature_to_gaussians(features), pictures, *size))
-    return torch.from_numpy(np.flatnonzero(there > np.maximum(online.tolerance**2, online.margin**2 * own)))
-
-
-def _entered(
-    state: OnlineState | None,
-    new: Parts,
-    work: Work,
-    seen: tuple[Shots, np.ndarray, torch.Tensor],
-    online: OnlineOptions,
-) -> tuple[OnlineState, dict[str, int]]:
-    """The state with new groups in it, and how many joined what was there and how many nothing shows.
-
-    ``seen`` are the batch's photos, which of all views they show, and the rows of the state's groups in their view.
+    Args:
+        groups: The state's groups.
+        new: The batch's groups.
+        prepared: The batch.
+        photos: Its photos.
+        rows: The state's groups that its views may see.
+        max_k: Most children of a group.
     """
-    options, scene, (shots, places, rows) = work.options, work.source.scene, seen
-    if state is None:
-        return _begun(new, work, online), {}
-    found = partners(take(state.parts.features, rows), new.features, options.match)
-    joins = found >= 0
-    parts = absorb(state.parts, pick(new, torch.nonzero(joins)[:, 0]), rows[found[joins]], state.settings.most)
-    alone = pick(new, torch.nonzero(~joins)[:, 0])
-    counts = {"num_joined": int(joins.sum())}
-    if options.fit.prune > 0 and scene.images is not None:
-        beside = take(parts.features, rows)
-        every = Gaussians.concat([feature_to_gaussians(beside), feature_to_gaussians(alone.features)])
-        shows = shown(every, shots.photos(2), options.fit.prune)[len(beside) :]
-        counts["num_hidden"] = int((~shows).sum())
-        alone = pick(alone, torch.nonzero(shows)[:, 0])
-    kept = [one for one in (state.kept, work.kept) if one is not None]
-    total = state.settings.num_input + work.scene.num_gaussians
-    settings = replace(state.settings, num_input=total, k=options.decode.k)
-    further = shots.cameras[torch.from_numpy(places >= len(state.cameras))]
+    options = prepared.options
+    partners = find_partners(take(groups.features, rows), new.features, options.match)
+    has_partner = partners >= 0
+    joining = select_groups(new, torch.nonzero(has_partner)[:, 0])
+    groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
+    alone = select_groups(new, torch.nonzero(~has_partner)[:, 0])
+    counts = {"num_joined": int(has_partner.sum())}
+    if options.fit.min_contribution > 0 and prepared.scene.images is not None:
+        in_view = feature_to_gaussians(take(groups.features, rows))
+        both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
+        visible = visible_mask(both, photos.photos(2), options.fit.min_contribution)[len(in_view) :]
+        counts["num_hidden"] = int((~visible).sum())
+        alone = select_groups(alone, torch.nonzero(visible)[:, 0])
+    return concat_groups([groups, alone]), counts
+
+
+def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> Tensor:
+    """``[n]`` int64: the state's group that shows the same surface as each new one, -1 for none; no group gets two.
+
+    Matched as across the views of one batch, the state being one view and the batch another.
+
+    Args:
+        features: The state's groups that the batch's views see.
+        new: n new groups, merged among themselves.
+        options: Of matching across views.
+    """
+    both = FeatureGaussians.concat([features, new])
+    sides = (torch.arange(len(both)) >= len(features)).long()
+    matches = match(replace(both, views=sides), replace(options, cluster_size=2))
+    owner = torch.full((matches.count,), -1)
+    owner[matches.clusters[: len(features)]] = torch.arange(len(features))
+    return owner[matches.clusters[len(features) :]]
+
+
+def merge_into(groups: GroupSet, new: GroupSet, rows: Tensor, max_k: int) -> GroupSet:
+    """The state's groups, some of them merged with new ones: moments add up, in place.
+
+    Args:
+        groups: The state's groups.
+        new: n new groups.
+        rows: ``[n]`` int64 the group that each is merged into, all different.
+        max_k: Most children of a group.
+    """
+    if len(rows) == 0:
+        return groups
+    old = select_groups(groups, rows)
+    both = concat_groups([old, new])
+    pairs = torch.arange(len(rows)).repeat(2)
+    features = merge(both.features, Matches(pairs, len(rows)))
+    children = both.children[features.members]
+    fitted_sh0 = torch.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
+    merged = GroupSet(replace(features, members=torch.arange(len(children))), children, fitted_sh0, old.color_precision)
+    return replace_groups(groups, rows, limit_children(merged, max_k))
+
+
+def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> OnlineState:
+    """The state that a first batch makes."""
+    options, cameras = prepared.options, prepared.scene.cameras
+    settings = StoredSettings(
+        num_input=prepared.given.num_gaussians,
+        k=options.decode.k,
+        max_k=max_k,
+        min_opacity=options.decode.min_opacity,
+        min_contribution=options.fit.min_contribution if prepared.given.images is not None else 0.0,
+        target_count=None,
+        num_slots=None,
+        knee_count=0,
+    )
+    return OnlineState(
+        groups=groups,
+        kept=prepared.hidden,
+        frame=prepared.frame,
+        cameras=resize_cameras(cameras, cameras.width, cameras.height),
+        replay=no_photos(cameras),
+        settings=settings,
+        about={},
+    )
+
+
+def _grown_state(state: OnlineState, groups: GroupSet, prepared: PreparedScene, new_cameras: Cameras) -> OnlineState:
+    """The state with other groups, and with the views and the unseen Gaussians of a further batch."""
+    kept = [gaussians for gaussians in (state.kept, prepared.hidden) if gaussians is not None]
+    num_input = state.settings.num_input + prepared.given.num_gaussians
     return replace(
         state,
-        parts=joined([parts, alone]),
+        groups=groups,
         kept=Gaussians.concat(kept) if kept else None,
-        cameras=joined_cameras(state.cameras, further),
-        settings=settings,
-    ), counts
-
-
-def _begun(new: Parts, work: Work, online: OnlineOptions) -> OnlineState:
-    """The state that a first batch makes."""
-    options, cameras = work.options, work.source.scene.cameras
-    settings = StoredSettings(
-        num_input=work.scene.num_gaussians,
-        k=options.decode.k,
-        most=online.max_k,
-        min_opacity=options.decode.min_opacity,
-        prune=options.fit.prune if work.scene.images is not None else 0.0,
-        wanted=None,
-        places=None,
-        knee=0,
+        cameras=concat_cameras(state.cameras, new_cameras),
+        settings=replace(state.settings, num_input=num_input, k=prepared.options.decode.k),
     )
-    same = resized(cameras, cameras.width, cameras.height)
-    return OnlineState(new, work.kept, work.frame, same, no_photos(cameras), settings, {})

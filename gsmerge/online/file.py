@@ -1,49 +1,35 @@
-"""The ``.gsm`` file of a state: data alone, bit for bit what is in memory."""
+"""States in files: save, load, and extend one by the views of a scene's files."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from gsmerge.compact_file import read_input
 from gsmerge.encoded.encoded import Encoded
-from gsmerge.encoded.file import FORMAT as ENCODED
-from gsmerge.encoded.file import load_encoded
-from gsmerge.encoded.parts import (
-    REMEDY,
-    Take,
-    camera_tensors,
-    feature_tensors,
-    gaussian_tensors,
-    read_cameras,
-    read_features,
-    read_file,
-    read_gaussians,
-    read_header,
-    read_settings,
-    read_unit,
-    taker,
-    to_bytes,
-)
-from gsmerge.errors import SceneError
-from gsmerge.io.atomic import atomic_output
-from gsmerge.online.state import OnlineState, Parts, Replay, from_encoded, owning
-from gsmerge.stages.prepare import Frame
-
-MINOR = 0  # what was added since the first files of the schema
-FORMAT = "gsmerge-state"
-PREFIXES = ("features.", "children.", "kept.", "cameras.", "frame.", "replay.")
-KINDS = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}
+from gsmerge.encoded.gsm_file import ENCODED, STATE, GsmFile, read_encoded, read_gsm, write_gsm
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import AUTO, ReadHints, SceneFiles, atomic_output
+from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.online.extend import extend
+from gsmerge.online.options import merge_settings
+from gsmerge.online.state import GroupSet, OnlineState, Replay, from_encoded, with_child_rows
+from gsmerge.report import document_head, seconds_document
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.run_log import Progress
+from gsmerge.types import Cameras
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
-    """Write a state.
+    """Write a state, bit for bit as it is in memory.
 
     Args:
         path: The file, ``.gsm`` by convention; complete, or what it was before.
@@ -53,40 +39,27 @@ def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool
     Raises:
         SceneError: If the file exists or cannot be written.
     """
-    header = {
-        "minor": MINOR,
-        "settings": asdict(state.settings),
-        "unit": state.frame.unit,
-        "width": state.cameras.width,
-        "height": state.cameras.height,
-        "about": dict(state.about),
+    groups, replay = state.groups, state.replay
+    tensors = {
+        "children.counts": groups.features.starts.diff().to(torch.uint8),
+        "features.solved": groups.fitted_sh0.float(),
+        "features.held": groups.color_precision.float(),
+        "replay.images": torch.from_numpy(replay.images),
+        "replay.views": torch.from_numpy(replay.views).int(),
     }
-    data = to_bytes(FORMAT, header, _tensors(state))
-    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.write(data)
-
-
-def _tensors(state: OnlineState) -> dict[str, Tensor]:
-    """Everything by name, in the file's own types."""
-    parts, replay = state.parts, state.replay
-    found = feature_tensors(parts.features) | camera_tensors(state.cameras)
-    found |= gaussian_tensors("children", parts.children)
-    found |= gaussian_tensors("kept", state.kept if state.kept is not None else parts.children[:0])
-    found |= {"children.counts": parts.features.starts.diff().to(torch.uint8)}
-    found |= {"features.solved": parts.solved.float(), "features.held": parts.held.float()}
-    found |= {"replay.images": torch.from_numpy(replay.images), "replay.views": torch.from_numpy(replay.views).int()}
-    return found | {"frame.origin": state.frame.origin.double()}
+    entries, children = {"about": dict(state.about)}, ("children", groups.children)
+    write_gsm(path, STATE, state, groups.features, children, entries, tensors, overwrite=overwrite)
 
 
 def load_state(path: str | PathLike[str]) -> OnlineState:
-    """A state from a file, or what an encoded scene (:func:`gsmerge.save_encoded`) is as one.
+    """A state from a file, or an encoded scene (:func:`gsmerge.save_encoded`) as a state.
 
     Raises:
         SceneError: If the file is missing or damaged, of another format or a newer schema, lacks a tensor, or holds
-            numbers that cannot be.
+            numbers out of range.
     """
-    found = load_stored(path)
-    return from_encoded(found) if isinstance(found, Encoded) else found
+    stored = load_stored(path)
+    return from_encoded(stored) if isinstance(stored, Encoded) else stored
 
 
 def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
@@ -95,54 +68,106 @@ def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
     Raises:
         SceneError: As :func:`load_state`.
     """
-    path = Path(path)
-    told, tensors = read_file(path, PREFIXES)
-    if ENCODED in told:
-        return load_encoded(path)
-    if FORMAT not in told:
-        raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
-    header, take = read_header(path, told[FORMAT], KINDS), taker(path, tensors)
-    settings = read_settings(path, header["settings"])
-    parts, cameras = _parts(path, take, settings.most), read_cameras(path, take, header)
-    kept = read_gaussians(take, "kept", None, parts.children.shN.shape[1])
-    return OnlineState(
-        parts=parts,
-        kept=kept if len(kept) else None,
-        frame=Frame(take("frame.origin", torch.float64, 3), read_unit(path, header["unit"])),
-        cameras=cameras,
-        replay=_replay(path, take, (len(cameras), cameras.height, cameras.width)),
-        settings=settings,
-        about=_about(path, header["about"]),
+    file = read_gsm(path, ENCODED, STATE)
+    if file.kind == ENCODED:
+        return read_encoded(file)
+    about, settings = file.header["about"], file.settings()
+    if not (isinstance(about.get("options"), dict) and isinstance(about.get("batches"), list)):
+        raise file.error("about: expected options and batches in the header, found none")
+    groups = _read_groups(file, settings.max_k)
+    common = file.common(groups.children.shN.shape[1])
+    replay = _read_replay(file, common["cameras"])
+    return OnlineState(groups=groups, replay=replay, settings=settings, about=about, **common)
+
+
+def _read_groups(file: GsmFile, max_k: int) -> GroupSet:
+    """The groups, each with at least one child and no more than ``max_k``."""
+    features = file.features()
+    g = len(features)
+    counts = file.tensor("children.counts", torch.uint8, g).long()
+    if g and not 1 <= int(counts.min()) <= int(counts.max()) <= max_k:
+        raise file.error(f"children.counts: expected 1 to {max_k}, found others")
+    return GroupSet(
+        features=with_child_rows(features, torch.arange(g).repeat_interleave(counts).numpy()),
+        children=file.gaussians("children", int(counts.sum()), features.shN.shape[1]),
+        fitted_sh0=file.tensor("features.solved", torch.float32, g, 1, 3),
+        color_precision=file.tensor("features.held", torch.float32, g),
     )
 
 
-def _parts(path: Path, take: Take, most: int) -> Parts:
-    """The groups, each with at least one child and no more than ``most``."""
-    features = read_features(take)
-    g = len(features)
-    counts = take("children.counts", torch.uint8, g).long()
-    if g and not 1 <= int(counts.min()) <= int(counts.max()) <= most:
-        raise SceneError(path, f"children.counts: expected 1 to {most}, found others", REMEDY)
-    children = read_gaussians(take, "children", int(counts.sum()), features.shN.shape[1])
-    solved, held = take("features.solved", torch.float32, g, 1, 3), take("features.held", torch.float32, g)
-    return Parts(owning(features, torch.arange(g).repeat_interleave(counts).numpy()), children, solved, held)
-
-
-def _replay(path: Path, take: Take, shape: tuple[int, int, int]) -> Replay:
-    """The photos, of views that are there."""
-    count, height, width = shape
-    views = take("replay.views", torch.int32, None).long().numpy()
-    images = take("replay.images", torch.uint8, len(views), height, width, 3).numpy()
-    if len(views) and not (views[0] >= 0 and views[-1] < count and (np.diff(views) > 0).all()):
-        raise SceneError(
-            path, "replay.views: expected views of the state, each once and in order, found others", REMEDY
-        )
+def _read_replay(file: GsmFile, cameras: Cameras) -> Replay:
+    """The stored photos, of views that are there."""
+    views = file.tensor("replay.views", torch.int32, None).long().numpy()
+    images = file.tensor("replay.images", torch.uint8, len(views), cameras.height, cameras.width, 3).numpy()
+    if len(views) and not (views[0] >= 0 and views[-1] < len(cameras) and (np.diff(views) > 0).all()):
+        raise file.error("replay.views: expected views of the state, each once and in order, found others")
     return Replay(images, views)
 
 
-def _about(path: Path, about: Mapping[str, Any]) -> dict[str, Any]:
-    """Options and batches, of the types that later batches count on."""
-    ok = isinstance(about.get("options"), dict) and isinstance(about.get("batches"), list)
-    if not ok:
-        raise SceneError(path, "about: expected options and batches in the header, found none", REMEDY)
-    return dict(about)
+def extend_file(
+    path: Path,
+    files: SceneFiles,
+    settings: Mapping[str, Any],
+    *,
+    opacity: OpacityChoice = "auto",
+    hints: ReadHints = AUTO,
+    progress: Progress | None = None,
+    seconds_before: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
+    """Add a batch of views to the state in a file, or make the file if there is none.
+
+    The file is replaced when all is done, and not at all if anything goes wrong or another process has changed it.
+
+    Args:
+        path: The state, or an encoded scene.
+        files: The new views.
+        settings: As of :class:`gsmerge.Compactor`; by default the state's own.
+        opacity: How opacities are stored.
+        hints: What is known of the batch's file and need not be recognised.
+        progress: As of :func:`gsmerge.compact`.
+        seconds_before: Wall time by name of what the caller did before.
+
+    Returns:
+        The report, in plain JSON types.
+
+    Raises:
+        SceneError: If the state or the scene cannot be read, or the state cannot be written or was changed meanwhile.
+        UsageError: If a setting is unknown, out of range, or needs what the state or the scene does not have.
+    """
+    start, identity = perf_counter(), _file_identity(path)
+    state = None if identity is None else load_state(path)
+    try:
+        options, online = merge_settings(settings, state)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    with atomic_output(path, overwrite=identity is not None) as temporary:
+        loaded = perf_counter()
+        given = read_input(files, opacity=opacity, hints=hints)
+        read = perf_counter()
+        state, report = extend(state, given.scene, options, online, progress=progress)
+        done = perf_counter()
+        save_state(temporary, state, overwrite=True)
+        if _file_identity(path) != identity:
+            raise SceneError(path, "was changed by another process meanwhile", "extend it again; it is as that left it")
+    seconds = {**(seconds_before or {}), "load": loaded - start, "read": read - loaded, **report.seconds}
+    seconds["other"] = done - read - sum(report.seconds.values())
+    numbers = {name: value for name, value in asdict(report).items() if name not in ("seconds", "notes", "options")}
+    return {
+        **document_head(),
+        "input": {"path": str(files.ply), **given.recognised},
+        **numbers,
+        "state": {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(state.about["batches"])},
+        "options": dict(report.options),
+        **seconds_document(seconds | {"write": perf_counter() - done}),
+        "peak_memory_bytes": peak_memory(),
+        "notes": [*given.notes, *report.notes],
+    }
+
+
+def _file_identity(path: Path) -> tuple[int, int, int] | None:
+    """What differs between one file of this name and the next; None where there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:  # other problems show when it is written
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size

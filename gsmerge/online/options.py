@@ -1,9 +1,13 @@
-"""Settings of what becomes of a batch of new views."""
+"""Settings of how a batch of new views enters a state."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from gsmerge.encoded.encoded import StoredScene
+from gsmerge.options import CompactOptions, from_schema
 from gsmerge.stages.decode import MAX_CHILDREN
 
 
@@ -12,13 +16,13 @@ class OnlineOptions:
     """How new views enter a state.
 
     Args:
-        max_k: Most Gaussians of a group that can be decoded later, 1 to 8; of a state that is there already, its own.
+        max_k: Most Gaussians of a group that can be decoded later, 1 to 8; an existing state keeps its own.
         tolerance: A new group is left out where the state shows its pixels with a colour error (root mean square,
             sRGB in [0, 1], holes counted) below this, or no larger than ``margin`` times that of the new views' own
-            Gaussians: what is there already needs no second Gaussian. 0: nothing is left out.
+            Gaussians. 0: nothing is left out.
         margin: See ``tolerance``.
-        replay: Most photos that are kept, spread evenly over all that came, for a full fit when decoding. The colours
-            are solved batch by batch and need none.
+        replay: Most photos that are stored, spread evenly over all views, for a full fit when decoding. Colours are
+            fitted batch by batch and need none.
 
     Raises:
         ValueError: If a setting is out of range.
@@ -38,3 +42,22 @@ class OnlineOptions:
             raise ValueError(f"margin: expected at least 0, got {self.margin}")
         if self.replay < 0:
             raise ValueError(f"replay: expected at least 0, got {self.replay}")
+
+
+def merge_settings(
+    settings: Mapping[str, Any], state: StoredScene | None = None
+) -> tuple[CompactOptions, OnlineOptions]:
+    """All settings: as given, otherwise those that the state was made with, otherwise the defaults.
+
+    By default colours are fitted batch by batch; the full fit comes when decoding.
+
+    Raises:
+        ValueError: If a setting is unknown or out of range.
+    """
+    names = OnlineOptions.__dataclass_fields__.keys()
+    known = names | CompactOptions().to_dict().keys()
+    stored = {} if state is None else from_schema(state.about["options"])
+    before = {name: value for name, value in stored.items() if name in known}
+    merged = {"fit": "color"} | before | dict(settings)
+    online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})
+    return CompactOptions().with_settings(merged), online

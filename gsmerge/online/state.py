@@ -1,10 +1,8 @@
-"""What is kept between two batches of views, and what is decoded from it."""
+"""What is stored between two batches of views, and operations on its groups."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,17 +11,16 @@ from torch import Tensor
 from gsmerge import __version__
 from gsmerge.encoded.decode import children_of
 from gsmerge.encoded.divide import divide_all
-from gsmerge.encoded.encoded import Encoded, StoredSettings, without_members
+from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
-from gsmerge.stages.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
-POOLED: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by
-NO_FLOOR = 1e-3  # of the footprints of members that are children
+CHILD_RULE: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by
+CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,102 +45,102 @@ def no_photos(cameras: Cameras) -> Replay:
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class GroupSet:
     """Groups with the Gaussians that they divide into.
 
     Args:
         features: g Feature Gaussians, canonical, with gains and spreads of one and without latents: what gains,
             spreads and networks did to them is in their moments. Their members are rows of ``children``.
         children: The Gaussians of the finest division, group by group.
-        solved: ``[g,1,3]`` base colours (sh0) that fit the photos so far; those of the features are as they came, for a
-            fit to begin with that has not seen the photos yet.
-        held: ``[g]`` what earlier photos say of each solved colour: diagonal of their normal equations, the sum of the
-            squares of the group's blending weights over their pixels (of half-size photos).
+        fitted_sh0: ``[g,1,3]`` base colours (sh0) that fit the photos so far. ``features.sh0`` stays as exported, for
+            the full fit to start from.
+        color_precision: ``[g]`` how much earlier photos say about each fitted colour: the diagonal of their normal
+            equations, which is the sum of the squares of the group's blending weights over their half-size pixels.
     """
 
     features: FeatureGaussians
     children: Gaussians
-    solved: Tensor
-    held: Tensor
+    fitted_sh0: Tensor
+    color_precision: Tensor
 
     def __len__(self) -> int:
         return len(self.features)
 
 
-@dataclass(frozen=True, eq=False)
-class OnlineState:
-    """Everything that new views are added to. Its size follows the scene, not the number of views.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OnlineState(StoredScene):
+    """Everything that new views are added to. Its size depends on the scene, not on the number of views.
+
+    The frame is that of the first batch; the cameras are those of all views so far, at the size of the first batch's;
+    ``about`` also has the numbers of every batch.
 
     Args:
-        parts: The groups.
-        kept: Gaussians that no view sees, canonical; None without any.
-        frame: From canonical to world, that of the first batch.
-        cameras: All views so far, canonical, at the size of the first batch.
-        replay: Photos of some of them.
-        settings: As of an encoded scene.
-        about: Options, batches, version; plain JSON types.
+        groups: The groups.
+        replay: Photos of some of the views.
     """
 
-    parts: Parts
-    kept: Gaussians | None
-    frame: Frame
-    cameras: Cameras
+    groups: GroupSet
     replay: Replay
-    settings: StoredSettings
-    about: Mapping[str, Any]
 
     def __len__(self) -> int:
-        return len(self.parts)
+        return len(self.groups)
 
     @property
     def sh_degree(self) -> int:
         """Degree of the harmonics."""
-        return self.parts.children.sh_degree
+        return self.groups.children.sh_degree
 
 
-def baked(
-    features: FeatureGaussians, members: Members, learned: Learned | None, most: int, rule: Rule = "depth"
-) -> Parts:
-    """Groups as what they decode to: gains, spreads, latents and heads are in the result and needed no more.
+def bake(
+    features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int, rule: Rule = "depth"
+) -> GroupSet:
+    """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more.
 
     Args:
         features: g Feature Gaussians with their members.
         members: The Gaussians that they point to.
-        learned: Networks whose heads correct what is decoded; None: none do.
-        most: Most children that are kept of a group.
+        networks: Networks whose heads correct what is decoded; None: none do.
+        max_k: Most children that are stored of a group.
         rule: How children are pooled.
     """
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
-    if most > 1:
-        children, parents = divide(features, members, np.full(len(features), most), rule)
-    if learned is not None:
-        ones = decode_gaussians(ones, np.arange(len(features)), features, learned)
-        children = decode_gaussians(children, parents, features, learned)
-    return _parts(features, ones, children, parents)
+    if max_k > 1:
+        children, parents = divide(features, members, np.full(len(features), max_k), rule)
+    if networks is not None:
+        ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
+        children = decode_gaussians(children, parents, features, networks)
+    return _group_set(features, ones, children, parents)
 
 
-def _parts(features: FeatureGaussians, ones: Gaussians, children: Gaussians, parents: np.ndarray) -> Parts:
-    """Groups with the moments of what they decode to, and the children, of whom ``parents`` rising are the groups."""
+def _group_set(features: FeatureGaussians, ones: Gaussians, children: Gaussians, parents: np.ndarray) -> GroupSet:
+    """Groups with the moments of what they decode to (``ones``); ``parents``: the rising group of each child."""
     neutral, no_latents = torch.ones(len(features)), torch.zeros(len(features), 0)
     same = replace(features, gains=neutral, spreads=neutral, latents=no_latents, **moments_of(ones))
-    return Parts(owning(same, parents), children, ones.sh0, torch.zeros(len(features)))
+    return GroupSet(with_child_rows(same, parents), children, ones.sh0, torch.zeros(len(features)))
 
 
 def from_encoded(encoded: Encoded) -> OnlineState:
-    """The state that an encoded scene is: of one batch, without photos."""
-    most = encoded.settings.most
+    """An encoded scene as a state of one batch, without photos."""
     ones, _ = children_of(encoded, np.ones(len(encoded), np.int64))
-    children, parents = children_of(encoded, np.full(len(encoded), most))
-    parts = _parts(encoded.features, ones, children, parents)
+    children, parents = children_of(encoded, np.full(len(encoded), encoded.settings.max_k))
+    groups = _group_set(encoded.features, ones, children, parents)
     cameras = encoded.cameras
-    settings = replace(encoded.settings, wanted=None, places=None)
+    settings = replace(encoded.settings, target_count=None, num_slots=None)
     options = dict(encoded.about.get("options", {}))
-    options.pop("fit", None)  # none, for want of photos
+    options.pop("fit", None)  # there are no photos to fit to
     batch = {"num_views": len(cameras), "num_input": settings.num_input, "num_new": len(encoded)}
     batch |= {"num_covered": 0, "num_joined": 0, "num_hidden": 0, "num_groups": len(encoded)}
     about = {"gsmerge": __version__, "options": options, "batches": [batch]}
-    return OnlineState(parts, encoded.kept, encoded.frame, cameras, no_photos(cameras), settings, about)
+    return OnlineState(
+        groups=groups,
+        kept=encoded.kept,
+        frame=encoded.frame,
+        cameras=cameras,
+        replay=no_photos(cameras),
+        settings=settings,
+        about=about,
+    )
 
 
 def moments_of(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -159,79 +156,83 @@ def moments_of(gaussians: Gaussians) -> dict[str, Tensor]:
     }
 
 
-def owning(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
+def with_child_rows(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
     """Feature Gaussians whose members are the rows 0, 1, ... of their children; ``parents`` rising."""
     sizes = torch.bincount(torch.from_numpy(parents), minlength=len(features))
     starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
     return replace(features, starts=starts, members=torch.arange(int(starts[-1])))
 
 
-def part_members(parts: Parts) -> Members:
-    """The children as members of their groups, their least size already in them."""
-    sizes = parts.features.starts.diff()
-    footprints = NO_FLOOR * parts.features.footprints.repeat_interleave(sizes)
-    return gaussian_members(parts.children, footprints.numpy())
+def child_members(groups: GroupSet) -> Members:
+    """The children as members of their groups."""
+    sizes = groups.features.starts.diff()
+    footprints = CHILD_FOOTPRINT * groups.features.footprints.repeat_interleave(sizes)
+    return gaussian_members(groups.children, footprints.numpy())
 
 
-def pick(parts: Parts, rows: Tensor) -> Parts:
+def select_groups(groups: GroupSet, rows: Tensor) -> GroupSet:
     """Some of the groups, with their children."""
-    features = take(parts.features, rows)
-    children = parts.children[features.members]
+    features = take(groups.features, rows)
+    children = groups.children[features.members]
     members = torch.arange(len(children))
-    return Parts(replace(features, members=members), children, parts.solved[rows], parts.held[rows])
+    return GroupSet(replace(features, members=members), children, groups.fitted_sh0[rows], groups.color_precision[rows])
 
 
-def joined(parts: list[Parts]) -> Parts:
-    """All groups of all parts in order."""
-    features = FeatureGaussians.concat([p.features for p in parts])
-    children = Gaussians.concat([p.children for p in parts])
-    features = replace(features, members=torch.arange(len(children)))
-    solved, held = torch.cat([p.solved for p in parts]), torch.cat([p.held for p in parts])
-    return Parts(features, children, solved, held)
+def concat_groups(sets: list[GroupSet]) -> GroupSet:
+    """The groups of all sets, in order."""
+    features = FeatureGaussians.concat([groups.features for groups in sets])
+    children = Gaussians.concat([groups.children for groups in sets])
+    return GroupSet(
+        replace(features, members=torch.arange(len(children))),
+        children,
+        torch.cat([groups.fitted_sh0 for groups in sets]),
+        torch.cat([groups.color_precision for groups in sets]),
+    )
 
 
-def thinned(parts: Parts, most: int) -> Parts:
-    """Groups with at most ``most`` children each, those of larger ones pooled."""
-    crowded = torch.nonzero(parts.features.starts.diff() > most)[:, 0]
-    if len(crowded) == 0:
-        return parts
-    few = pick(parts, crowded)
-    children, parents = divide(few.features, part_members(few), np.full(len(few), most), POOLED)
-    return swapped(parts, crowded, replace(few, features=owning(few.features, parents), children=children))
+def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
+    """Groups with at most ``max_k`` children each, those of larger ones pooled."""
+    rows = torch.nonzero(groups.features.starts.diff() > max_k)[:, 0]
+    if len(rows) == 0:
+        return groups
+    large = select_groups(groups, rows)
+    children, parents = divide(large.features, child_members(large), np.full(len(large), max_k), CHILD_RULE)
+    pooled = replace(large, features=with_child_rows(large.features, parents), children=children)
+    return replace_groups(groups, rows, pooled)
 
 
-def swapped(parts: Parts, rows: Tensor, others: Parts) -> Parts:
+def replace_groups(groups: GroupSet, rows: Tensor, others: GroupSet) -> GroupSet:
     """The groups with some replaced by others, one for one and in place."""
-    index = torch.arange(len(parts))
-    index[rows] = len(parts) + torch.arange(len(rows))
-    return pick(joined([parts, others]), index)
+    index = torch.arange(len(groups))
+    index[rows] = len(groups) + torch.arange(len(rows))
+    return select_groups(concat_groups([groups, others]), index)
 
 
-def with_solved(parts: Parts) -> Parts:
+def with_fitted_colors(groups: GroupSet) -> GroupSet:
     """Groups and children in the colours that fit the photos."""
-    offsets = parts.solved - parts.features.sh0
-    sizes = parts.features.starts.diff()
-    features = replace(parts.features, sh0=parts.solved)
-    children = replace(parts.children, sh0=parts.children.sh0 + offsets.repeat_interleave(sizes, 0))
-    return replace(parts, features=features, children=children)
+    offsets = groups.fitted_sh0 - groups.features.sh0
+    sizes = groups.features.starts.diff()
+    features = replace(groups.features, sh0=groups.fitted_sh0)
+    children = replace(groups.children, sh0=groups.children.sh0 + offsets.repeat_interleave(sizes, 0))
+    return replace(groups, features=features, children=children)
 
 
-def as_encoded(state: OnlineState, *, solved: bool = True) -> Encoded:
+def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
     """The state as an encoded scene, which decodes at any K and budget.
 
     Args:
         state: Of one or more batches.
-        solved: Colours that fit the photos; otherwise as they came.
+        fitted_colors: Use the colours that fit the photos; otherwise those of the exports.
     """
-    parts = with_solved(state.parts) if solved else state.parts
-    features, members = parts.features, part_members(parts)
+    groups = with_fitted_colors(state.groups) if fitted_colors else state.groups
+    features = groups.features
     return Encoded(
         features=without_members(features),
-        division=divide_all(features, members, state.settings.most, POOLED),
+        division=divide_all(features, child_members(groups), state.settings.max_k, CHILD_RULE),
         kept=state.kept,
         frame=state.frame,
         cameras=state.cameras,
-        settings=replace(state.settings, knee=len(features)),
+        settings=replace(state.settings, knee_count=len(features)),
         heads=None,
         about=state.about,
     )

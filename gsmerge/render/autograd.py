@@ -86,8 +86,8 @@ class _Render(torch.autograd.Function):
             if pose is not None:
                 poses[view] = pose
         gradients = [
-            torch.from_numpy(total).to(tensor.device, tensor.dtype) if wanted else None
-            for total, tensor, wanted in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)
+            torch.from_numpy(total).to(tensor.device, tensor.dtype) if needed else None
+            for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)
         ]
         return None, None, None, None, *gradients
 
@@ -95,7 +95,7 @@ class _Render(torch.autograd.Function):
 def render_differentiable(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """:func:`gsmerge.render` with a backward pass; same arguments, but for the checked ``[3]`` background."""
+    """:func:`gsmerge.render` with a backward pass; same arguments, except for the checked ``[3]`` background."""
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)

@@ -40,14 +40,15 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_image: Tensor, _: Any) -> tuple[Any, ...]:
-        found = plan_gradients(ctx.plan, grad_image.numpy(), **ctx.drawn)
+        gradients = plan_gradients(ctx.plan, grad_image.numpy(), **ctx.drawn)
 
         def spread(rows: np.ndarray) -> Tensor:
             every = np.zeros((len(ctx.plan.splats), *rows.shape[1:]), np.float32)
-            every[found.ids] = rows
+            every[gradients.ids] = rows
             return torch.from_numpy(every)
 
-        rows = found.means, found.quats, found.scales, found.opacities, found.colors
+        g = gradients
+        rows = g.means, g.quats, g.scales, g.opacities, g.colors
         return None, None, *(spread(one) for one in rows)
 
 

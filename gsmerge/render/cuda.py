@@ -43,16 +43,16 @@ def cuda_problem() -> str | None:
     return None
 
 
-def usable_device(wanted: str) -> str:
+def usable_device(device: str) -> str:
     """The device that ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA where it can be used) means on this machine.
 
     Raises:
-        ValueError: If ``"cuda"`` is wanted and cannot be used.
+        ValueError: If ``"cuda"`` is asked for and cannot be used.
     """
-    problem = None if wanted == "cpu" else cuda_problem()
-    if wanted == "cuda" and problem:
+    problem = None if device == "cpu" else cuda_problem()
+    if device == "cuda" and problem:
         raise ValueError(f'device: expected "cpu" or a CUDA device that can be used, got "cuda", but {problem}')
-    return "cpu" if wanted == "cpu" or problem else "cuda"
+    return "cpu" if device == "cpu" or problem else "cuda"
 
 
 def _gsplat() -> Any:
@@ -91,8 +91,8 @@ def rasterize(
         with_depths: Also the mean depth.
 
     Returns:
-        Images, alphas and depths, on the device of the tensors; differentiable but for the depths. And ``[c,n]`` bool:
-        which Gaussians have a footprint in which view.
+        Images, alphas and depths, on the device of the tensors, the depths without gradients; and ``[c,n]`` bool: which
+        Gaussians have a footprint in which view.
 
     Raises:
         GsmergeError: If gsplat is not installed.
@@ -148,7 +148,7 @@ def render_cuda(
     far: float,
     with_depths: bool,
 ) -> Rendering:
-    """:func:`gsmerge.render` by gsplat; same arguments, but for the checked ``[3]`` background.
+    """:func:`gsmerge.render` by gsplat; same arguments, except for the checked ``[3]`` background.
 
     Positions are taken relative to the cameras' own centre in float64 first, so that scenes in geographic coordinates
     keep their detail.

@@ -11,22 +11,24 @@ from torch import Tensor
 
 Array = NDArray[Any]
 
-WINDOW = 7  # pixels per side of the windows of ssim
-C1, C2 = 0.01**2, 0.03**2  # stabilisers of ssim for a data range of 1
+WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
+C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
 
 
 def _as_array(image: Array | Tensor) -> Array:
     return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
 
 
-def _pair(image: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+def image_pair(image: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+    """Two images ``[h,w,c]`` of one shape as arrays; a ValueError otherwise."""
     first, second = _as_array(image), _as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
     return first, second
 
 
-def _mask(mask: Array | Tensor, image: Array) -> Array:
+def pixel_mask(mask: Array | Tensor, image: Array) -> Array:
+    """``[h,w]`` bool of an image ``[h,w,c]``, at least one pixel; a ValueError otherwise."""
     chosen = _as_array(mask).astype(bool)
     if chosen.ndim == 3 and chosen.shape[2] == 1:
         chosen = chosen[..., 0]
@@ -51,22 +53,24 @@ def psnr(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor 
     Raises:
         ValueError: If the shapes differ or no pixel counts.
     """
-    first, second = _pair(image, reference)
+    first, second = image_pair(image, reference)
     squares = np.subtract(first, second, dtype=np.float64) ** 2
-    error = float(squares.mean() if mask is None else squares[_mask(mask, first)].mean())
+    error = float(squares.mean() if mask is None else squares[pixel_mask(mask, first)].mean())
     return -10 * float(np.log10(error)) if error > 0 else float("inf")
 
 
 def ssim(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) with uniform 7 x 7 windows.
+    """Structural similarity as in the literature (Wang et al. 2004): Gaussian windows of 11 x 11 pixels.
 
-    The mean over the windows that lie wholly inside the image, as scikit-image's ``structural_similarity`` with
-    ``channel_axis=2, data_range=1`` computes it.
+    The mean over channels and over the windows that lie wholly inside the image, as scikit-image's
+    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1,
+    data_range=1)`` computes it. For measuring only; the loss of the full fit and of training has a definition of its
+    own, :func:`gsmerge.stages.fit.loss.loss_ssim`.
 
     Args:
-        image: ``[h,w,c]``, at least 7 x 7 pixels.
+        image: ``[h,w,c]``, at least 11 x 11 pixels, at most 4 channels.
         reference: ``[h,w,c]``.
-        mask: ``[h,w]`` centres of the windows that count; None: all. Windows still see the pixels around.
+        mask: ``[h,w]`` centres of the windows that count; None: all. Windows also contain the pixels around.
 
     Returns:
         At most 1.
@@ -74,22 +78,20 @@ def ssim(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor 
     Raises:
         ValueError: If the shapes differ, the image is too small or no window counts.
     """
-    first, second = _pair(image, reference)
+    first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:
         raise ValueError(f"expected at least {WINDOW} x {WINDOW} pixels, got {list(first.shape[:2])}")
     border = WINDOW // 2
     inner = slice(border, -border), slice(border, -border)
-    chosen = None if mask is None else _mask(_mask(mask, first)[inner], first[inner])
-    # In float64: variances are small differences of large numbers.
-    x, y = first.astype(np.float64), second.astype(np.float64)
+    chosen = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
+    # Variances are small differences of large numbers: float32 does when values are centred first.
+    x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
 
     def mean(values: Array) -> Array:
-        blurred = cv2.blur(values, (WINDOW, WINDOW), borderType=cv2.BORDER_REFLECT_101)
-        return blurred.reshape(values.shape)[inner]
+        return cv2.GaussianBlur(values, (WINDOW, WINDOW), SIGMA).reshape(values.shape)[inner]
 
     ux, uy = mean(x), mean(y)
-    unbiased = WINDOW**2 / (WINDOW**2 - 1)
-    vx, vy = unbiased * (mean(x * x) - ux * ux), unbiased * (mean(y * y) - uy * uy)
-    vxy = unbiased * (mean(x * y) - ux * uy)
-    scores = (2 * ux * uy + C1) * (2 * vxy + C2) / ((ux * ux + uy * uy + C1) * (vx + vy + C2))
-    return float(scores.mean() if chosen is None else scores[chosen].mean())
+    variances, covariance = mean(x * x + y * y) - ux * ux - uy * uy, mean(x * y) - ux * uy
+    ux, uy = ux + np.float32(0.5), uy + np.float32(0.5)
+    scores = (2 * ux * uy + C1) * (2 * covariance + C2) / ((ux * ux + uy * uy + C1) * (variances + C2))
+    return float((scores if chosen is None else scores[chosen]).mean(dtype=np.float64))

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from torch import Tensor
 
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.render.blend import composite
+from gsmerge.render.metrics import psnr
+from gsmerge.render.plan import Splats, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import SH_C0, Cameras, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
+Score = TypeVar("Score")
+
+NEAR = 0.01  # near plane of every render that is scored, in canonical units
+ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 
@@ -67,7 +76,7 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
     if isinstance(scene, UnalignedScene):
         raise ValueError("expected a scene with images")
     shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return (0.5 + SH_C0 * scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
+    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
 
 
 def scene_photos(scene: PixelScene | UnalignedScene, level: int = 1) -> Photos:
@@ -92,7 +101,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: int = 1) -> Photos:
 
 
 def blank_photos(cameras: Cameras, level: int = 1) -> Photos:
-    """Black photos, which take no memory, for what only looks at cameras; each side divided by ``level``."""
+    """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     w, h = cameras.width, cameras.height
     size = (w, h) if level == 1 else (max(1, round(w / level)), max(1, round(h / level)))
@@ -101,3 +110,53 @@ def blank_photos(cameras: Cameras, level: int = 1) -> Photos:
         return Photos(black, viewmats, Ks, EPS2D)
     sx, sy = size[0] / w, size[1] / h
     return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
+
+
+def photo_errors(
+    gaussians: Gaussians | Splats,
+    photos: Photos,
+    score: Callable[[int, np.ndarray, np.ndarray], Score],
+    views: Iterable[int] | None = None,
+    *,
+    near: float = NEAR,
+    colors: np.ndarray | None = None,
+    keep: Callable[[int], np.ndarray] | None = None,
+) -> list[Score]:
+    """Render some Gaussians into the photos' cameras and score every picture, several views at once.
+
+    Args:
+        gaussians: n Gaussians.
+        photos: V photos.
+        score: Called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
+        views: Of the photos, in the order of the result; None: all.
+        near: Near plane, in the Gaussians' unit.
+        colors: ``[n,3]`` in place of the Gaussians' harmonics.
+        keep: View -> ``[n]`` mask of the Gaussians that are drawn in it; None: all.
+
+    Returns:
+        The score of each view.
+    """
+    splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
+
+    def one_view(view: int) -> Score:
+        plan = plan_view(splats, **photos.camera(view), near=near, keep=None if keep is None else keep(view))
+        return score(view, *composite(plan, colors))
+
+    chosen = range(len(photos)) if views is None else views
+    if len(splats) > ONE_AT_A_TIME:
+        return [one_view(view) for view in chosen]
+    return parallel_map(one_view, chosen)
+
+
+def photo_psnr(gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], **settings: Any) -> float:
+    """Mean over some views of the PSNR (dB) of their photos; ``settings`` as of :func:`photo_errors`."""
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+        return psnr(np.clip(image, 0, 1), photos.images[view])
+
+    return float(np.mean(photo_errors(gaussians, photos, score, views, **settings)))
+
+
+def render_photos(gaussians: Gaussians | Splats, photos: Photos, **settings: Any) -> list[np.ndarray]:
+    """``[h,w,3]`` render of every photo, not clipped; ``settings`` as of :func:`photo_errors`."""
+    return photo_errors(gaussians, photos, lambda _, image, __: image, **settings)

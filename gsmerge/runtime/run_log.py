@@ -1,4 +1,4 @@
-"""What a run notes down: seconds by stage, choices, sentences for the user; and whom it tells."""
+"""The record of a run: seconds by stage, choices, notes for the user, and progress."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gsmerge.runtime.memory import release_memory
 Progress = Callable[[str, int, int], None]
 RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
 STAGES = (
-    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "cover", "decode",
-    "choose", "join", "fit", "score", "input",
+    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "close",
+    "cover", "decode", "choose", "join", "fit", "score", "input",
 )  # fmt: skip
 
 
 @dataclass
 class RunLog:
-    """Clock and notebook of one run.
+    """Clock and record of one run.
 
     Args:
         progress: Called with (stage, done, total).

@@ -1,4 +1,4 @@
-"""groups + gaussians in no order -> the pixel that each Gaussian belongs to.
+"""groups + unaligned gaussians -> members: the pixel that each Gaussian belongs to.
 
 A Gaussian belongs to the superpixel, of all views, that gets most of its blending weights (paper, supplement
 "Compaction of Non-Pixel-Aligned FF Backbones"). What no view sees is marked.
@@ -7,19 +7,30 @@ A Gaussian belongs to the superpixel, of all views, that gets most of its blendi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from gsmerge.budget import exact_count
+from gsmerge.errors import UsageError
+from gsmerge.geometry import morton_codes
 from gsmerge.kernels.raster.contribution import PAIR, add_row, settle_row
 from gsmerge.kernels.raster.project import TILE
+from gsmerge.moments import Members, pool_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
 from gsmerge.render.plan import MAX_SIZE
+from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Groups, UnalignedScene
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.encode import from_moments
+from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
+
+if TYPE_CHECKING:
+    from gsmerge.options import CompactOptions
 
 Unseen = Literal["drop", "keep"]
 
@@ -30,25 +41,83 @@ MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are 
 
 @dataclass(frozen=True)
 class ContributionOptions:
-    """What becomes of Gaussians that are in no order of pixels.
+    """What becomes of Gaussians that belong to no pixels.
 
     Args:
         unseen: ``"drop"``: Gaussians that no view sees are left out. ``"keep"``: they are merged among their neighbours
             in space, at the rate of the others, and added to the result.
-        min_contribution: Blending weight, in pixels of one view, below which a Gaussian counts as unseen.
+        min_owner_weight: Blending weight, in pixels of one view, below which a Gaussian counts as unseen.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
     """
 
     unseen: Unseen = "drop"
-    min_contribution: float = 0.0
+    min_owner_weight: float = 0.0
 
     def __post_init__(self) -> None:
         if self.unseen not in ("drop", "keep"):
             raise ValueError(f'unseen: expected "drop" or "keep", got {self.unseen!r}')
-        if not self.min_contribution >= 0:
-            raise ValueError(f"min_contribution: expected at least 0, got {self.min_contribution}")
+        if not self.min_owner_weight >= 0:
+            raise ValueError(f"min_owner_weight: expected at least 0, got {self.min_owner_weight}")
+
+
+def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: ContributionOptions) -> Members:
+    """An unaligned scene's Gaussians as arrays, each with a pixel of the superpixel that it adds most to.
+
+    Raises:
+        UsageError: If no view sees any Gaussian.
+    """
+    assert isinstance(scene, UnalignedScene)  # a scene with one Gaussian per pixel has its members
+    pixels = owner_pixels(find_owners(scene, groups), groups, options.min_owner_weight)
+    if not (pixels >= 0).any():
+        raise UsageError(
+            f"expected views that see the scene, found that none of {len(scene)} sees any of {len(pixels)} Gaussians: "
+            "give the cameras that belong to it"
+        )
+    return unaligned_members(scene, pixels)
+
+
+def split_unseen(
+    scene: UnalignedScene, options: CompactOptions, log: RunLog
+) -> tuple[UnalignedScene, CompactOptions, Gaussians | None]:
+    """With ``unseen="keep"``: the scene that some view sees, and the rest merged among neighbours at the same rate.
+
+    Args:
+        scene: The canonical scene.
+        options: All settings.
+        log: Takes a note of it.
+
+    Returns:
+        The seen scene, the options with the rest of the budget, the merged unseen Gaussians or None.
+    """
+    if options.contribution.unseen != "keep":
+        return scene, options, None
+    weights = seen_weights(scene)
+    seen = torch.from_numpy((weights > 0) & (weights >= options.contribution.min_owner_weight))
+    num_unseen = int((~seen).sum())
+    log.notes.append(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
+    if num_unseen in (0, len(seen)):
+        return scene, options, None
+    count = exact_count(options.target, len(seen), scene.gaussians.sh_degree)
+    rate = options.segment.density * options.decode.count if count is None else count / len(seen)
+    unseen = scene.gaussians[~seen & (scene.gaussians.opacities >= options.decode.min_opacity)]
+    num_kept = min(len(unseen), int(rate * num_unseen))
+    if count is not None:
+        target = replace(options.target, budget=max(1, count - num_kept), max_bytes=None)
+        options = replace(options, target=target)
+    kept = merge_neighbors(unseen, scene, num_kept, options) if num_kept else None
+    return replace(scene, gaussians=scene.gaussians[seen]), options, kept
+
+
+def merge_neighbors(gaussians: Gaussians, scene: UnalignedScene, count: int, options: CompactOptions) -> Gaussians:
+    """At most ``count`` Gaussians in place of n >= count: runs along a space-filling curve (Morton's) are merged."""
+    order = np.argsort(morton_codes(gaussians.means.double().numpy()), kind="stable")
+    members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
+    starts = np.linspace(0, len(order), count + 1).astype(np.int64)
+    moments = pool_members(members, starts, order, options.encode.rule)
+    features = from_moments(moments, starts, order, np.full(count, -1))
+    return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
 @dataclass(frozen=True)
@@ -147,7 +216,7 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
     """
     labels = np.ascontiguousarray(labels, np.int32)
     num, room = len(plan.ids), max(FIRST_PAIRS, count)
-    values, found = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
     stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
     heads, active = np.full(num, -1, np.int32), np.empty(num + 1, np.int32)
     pairs, num_pairs, num_active = np.empty((room, PAIR)), 0, 0
@@ -158,18 +227,18 @@ def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndar
         )  # fmt: skip
         bottom = (line + 1) * TILE if line < plan.lines - 1 else MAX_SIZE
         pairs, num_pairs, num_active = settle_row(
-            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, found
+            bottom, plan.footprints, heads, pairs, room, active, num_active, totals, seen, values, owners
         )
-    return values, found
+    return values, owners
 
 
-def owner_pixels(owners: Owners, groups: Groups, min_contribution: float = 0.0) -> np.ndarray:
+def owner_pixels(owners: Owners, groups: Groups, min_owner_weight: float = 0.0) -> np.ndarray:
     """The pixel in the middle of each Gaussian's superpixel, ``[n]`` int64 over all views; -1 for unseen ones.
 
     Args:
         owners: The dominant superpixels.
         groups: The superpixels.
-        min_contribution: Those with less are taken for unseen, too.
+        min_owner_weight: Those with less are taken for unseen, too.
     """
     counts = np.asarray(groups.counts)
     size, first = groups.labels[0].numel(), np.cumsum(counts) - counts
@@ -178,7 +247,7 @@ def owner_pixels(owners: Owners, groups: Groups, min_contribution: float = 0.0) 
         return middle_pixels(groups.labels[view].numpy(), groups.counts[view]) + view * size
 
     middles = np.concatenate(parallel_map(one_view, range(len(counts))))
-    seen = (owners.labels >= 0) & (owners.values >= min_contribution)
+    seen = (owners.labels >= 0) & (owners.values >= min_owner_weight)
     return np.where(seen, middles[first[owners.views] + owners.labels], -1)
 
 
@@ -190,7 +259,7 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
     order = np.lexsort((dx * dx + dy * dy, flat))
-    found, at = np.unique(flat[order], return_index=True)
+    present, at = np.unique(flat[order], return_index=True)
     middles = np.zeros(count, np.int64)
-    middles[found] = order[at]
+    middles[present] = order[at]
     return middles

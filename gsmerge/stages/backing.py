@@ -42,8 +42,12 @@ class BackingOptions:
 
 
 def encode_backing(
-    scene: PixelScene | UnalignedScene, members: Members, groups: Groups, options: BackingOptions
-) -> FeatureGaussians:
+    scene: PixelScene | UnalignedScene,
+    members: Members,
+    groups: Groups | None,
+    options: BackingOptions,
+    features: FeatureGaussians,
+) -> FeatureGaussians | None:
     """The coarse Feature Gaussians of every view.
 
     Depths of the members are drawn in to one footprint of the group about its median (no curtain survives), the
@@ -53,9 +57,12 @@ def encode_backing(
     Args:
         scene: The canonical scene.
         members: Its Gaussians as arrays.
-        groups: Coarse superpixels of every view.
+        groups: Coarse superpixels of every view; None: there is no such layer.
         options: Push and spread.
+        features: Those in front, whose latents it takes the width of.
     """
+    if groups is None:
+        return None
     starts, ids, views = member_rows(scene, members, groups)
     drawn = _draw_in_members(scene, members, starts, ids, views)
     layer = from_moments(pool_members(drawn, starts, ids), starts, ids, views)
@@ -68,6 +75,7 @@ def encode_backing(
         extinctions=torch.from_numpy(optical_depths * scales[:, 1] * scales[:, 2]).float(),
         spreads=layer.spreads * options.backing_spread * grow,
         backing=torch.ones(len(layer), dtype=torch.bool),
+        latents=torch.zeros(len(layer), features.latents.shape[1]),
     )
 
 

@@ -1,4 +1,4 @@
-"""feature gaussians -> feature gaussians: the merge that the photos themselves prefer.
+"""feature gaussians -> feature gaussians: the merge, and the start with or without networks, that the photos prefer.
 
 Where depth is wrong, merging opens holes and puts surfaces of one view in front of another's. A small family of
 merges differs in how depth uncertainty becomes geometry and opacity; each is scored by rendering every input view
@@ -7,20 +7,25 @@ from the Gaussians of the *other* views only, on half-size photos, and the best 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
-from gsmerge.moments import feature_to_gaussians
-from gsmerge.render import composite, plan_view, prepare, splat_adjoint
-from gsmerge.render.metrics import psnr
-from gsmerge.render.photos import Photos
-from gsmerge.runtime.threads import in_turn, parallel_map
-from gsmerge.types import SH_C0, FeatureGaussians
-from gsmerge.views import judged_views
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.moments import Rule, feature_to_gaussians
+from gsmerge.render import plan_view, prepare, splat_adjoint
+from gsmerge.render.photos import Photos, photo_errors, photo_psnr, scene_photos, scene_pictures
+from gsmerge.runtime.threads import in_turn
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.merge import MergedViews
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene
+from gsmerge.views import pick_views, scored_views
 
+MAX_VIEWS = 6  # that a start is judged by
 MIN_VIEWS = 3  # with two, leaving one out leaves nothing to compare
 
 
@@ -56,22 +61,32 @@ class RobustOptions:
             raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
 
 
-@dataclass(frozen=True)
-class RobustChoice:
-    """The merge that won and the PSNR (dB) of every candidate: of views left out, with one or two views of all."""
+@dataclass(frozen=True, eq=False)
+class RobustMerge:
+    """The merge that won.
 
-    name: str
-    scores: dict[str, float]
+    Args:
+        features: Its Feature Gaussians.
+        coarse: The coarse layer that candidates may have, see :mod:`gsmerge.stages.backing`; None: none has one.
+        photos: The input views at half size, which judge.
+        choices: The winners' names and the PSNR (dB) of every candidate, for the report: of views left out, with one
+            or two views of all.
+    """
+
+    features: FeatureGaussians
+    coarse: FeatureGaussians | None
+    photos: Photos
+    choices: dict[str, Any]
 
 
 def choose_merge(
     features: FeatureGaussians,
-    backing: FeatureGaussians | None,
+    coarse: FeatureGaussians | None,
     photos: Photos,
     options: RobustOptions,
     *,
-    left_out: bool = True,
-) -> tuple[FeatureGaussians, RobustChoice]:
+    leave_out: bool = True,
+) -> RobustMerge:
     """The candidate that shows the photos best.
 
     From three views up every photo is rendered from the other views' Gaussians only. One or two views leave nothing
@@ -79,55 +94,59 @@ def choose_merge(
 
     Args:
         features: Plain Feature Gaussians, unmerged across views.
-        backing: The coarse layer, see :mod:`gsmerge.stages.backing`; None: no candidate has one.
+        coarse: The coarse layer; None: no candidate has one.
         photos: The input views, usually at half size.
         options: The family.
-        left_out: False: the photos are always rendered from everything. For Gaussians that are in no order: what
-            several views show belongs to one of them, and would be missing with it.
+        leave_out: False: the photos are always rendered from everything. For unaligned scenes, in which what several
+            views show belongs to one of them, and would be missing with it.
     """
     many = len(photos) >= MIN_VIEWS
-    family = _family(features, backing, photos, options) if many else _spreads(features, options)
-    return _best(family, photos, left_out=many and left_out)
+    family = _family(features, coarse, photos, options) if many else _spreads(features, options)
+    name, best, scores = _best(family, photos, left_out=many and leave_out)
+    return RobustMerge(best, coarse, photos, {"merge": name, "merge_scores": scores})
 
 
-def close_holes(
-    merged: FeatureGaussians, backing: FeatureGaussians | None, photos: Photos, options: RobustOptions
-) -> tuple[FeatureGaussians, RobustChoice]:
-    """Wider Gaussians or a backing layer where merging across views has opened holes.
+def close_holes(merged: FeatureGaussians, chosen: RobustMerge, options: RobustOptions) -> RobustMerge:
+    """Wider Gaussians or a coarse layer where merging across views has opened holes.
 
     Several views' layers on one surface close each other's gaps; merged into one they may not. The photos, rendered
     from everything, decide.
 
     Args:
         merged: Feature Gaussians after merging across views.
-        backing: The coarse layer, for candidates without one; None: no candidate gets one.
-        photos: The input views, usually at half size.
+        chosen: What they were before.
         options: The family.
     """
-    family = [("as it is", merged)]
+    family, coarse = [("as it is", merged)], chosen.coarse
     wide = replace(merged, spreads=merged.spreads * options.widen)
     narrow = not bool(merged.backing.all()) and float(merged.spreads[~merged.backing].max()) <= 1
     if narrow:
         family.append(("wide", wide))
-    if backing is not None and not bool(merged.backing.any()):
-        family.append(("back", FeatureGaussians.concat([merged, backing])))
+    if coarse is not None and not bool(merged.backing.any()):
+        family.append(("back", FeatureGaussians.concat([merged, coarse])))
         if narrow:
-            family.append(("wide+back", FeatureGaussians.concat([wide, backing])))
-    return _best(family, photos, left_out=False)
+            family.append(("wide+back", FeatureGaussians.concat([wide, coarse])))
+    name, best, scores = _best(family, chosen.photos, left_out=False)
+    return replace(chosen, features=best, choices=chosen.choices | {"closed": name, "closed_scores": scores})
+
+
+def photos_choose(robust: bool | None, fit: str, effort: str) -> bool:
+    """Whether photos choose the merge where there are any: as asked, or unless a full fit follows or it is a draft."""
+    return fit != "full" and effort != "draft" if robust is None else robust
 
 
 def _best(
     family: Iterable[tuple[str, FeatureGaussians]], photos: Photos, *, left_out: bool
-) -> tuple[FeatureGaussians, RobustChoice]:
-    """The member of the family with the best score; the first of equals."""
+) -> tuple[str, FeatureGaussians, dict[str, float]]:
+    """The member of the family with the best score, the first of equals, its name, and all scores."""
     scores: dict[str, float] = {}
     best: tuple[str, FeatureGaussians] | None = None
     for name, candidate in family:
-        scores[name] = photo_psnr(candidate, photos, left_out=left_out)
+        scores[name] = merge_psnr(candidate, photos, left_out=left_out)
         if best is None or scores[name] > scores[best[0]]:
             best = name, candidate
     assert best is not None
-    return best[1], RobustChoice(best[0], scores)
+    return *best, scores
 
 
 def _family(
@@ -153,16 +172,11 @@ def _spreads(features: FeatureGaussians, options: RobustOptions) -> Iterator[tup
         yield name, replace(features, spreads=features.spreads * options.widen**power)
 
 
-def photo_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) -> float:
+def merge_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) -> float:
     """Mean PSNR (dB) of the photos, of many some, rendered from all Gaussians, or those of the other views only."""
-    splats, views = prepare(feature_to_gaussians(features)), features.views.numpy()
-
-    def score(view: int) -> float:
-        plan = plan_view(splats, **photos.camera(view), keep=views != view if left_out else None)
-        image, _ = composite(plan)
-        return psnr(np.clip(image, 0, 1), photos.images[view])
-
-    return float(np.mean(parallel_map(score, judged_views(len(photos)))))
+    views = features.views.numpy()
+    keep = (lambda view: views != view) if left_out else None
+    return photo_psnr(feature_to_gaussians(features), photos, scored_views(len(photos)), keep=keep)
 
 
 def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) -> torch.Tensor:
@@ -173,7 +187,7 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
     """
     gaussians, views = feature_to_gaussians(features), features.views.numpy()
     splats = prepare(gaussians)
-    colors = (0.5 + SH_C0 * gaussians.sh0[:, 0]).double().numpy()
+    colors = sh0_to_rgb(gaussians.sh0[:, 0]).double().numpy()
     boosted = -options.boost * np.log1p(-gaussians.opacities.double().numpy())
     trust = np.ones(len(features))
     for round_index in range(options.rounds):
@@ -195,3 +209,64 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
         fresh = seen / (1 + error / options.tolerance**2) + 1 - seen
         trust = np.maximum(fresh if round_index == 0 else np.sqrt(trust * fresh), 0.05)
     return torch.from_numpy(options.boost * trust).float()
+
+
+def choose_start(
+    starts: Sequence[MergedViews], scene: PixelScene | UnalignedScene, options: DecodeOptions, rule: Rule
+) -> MergedViews:
+    """With or without networks: the start whose Gaussians, one for each Feature Gaussian, show the views better.
+
+    The choice does not depend on K, so what is encoded once is what every K begins with. Networks learn what real
+    exports suffer from; a scene without those errors is better left as it is.
+
+    Args:
+        starts: The learned start, then the analytic one.
+        scene: The canonical scene.
+        options: Of decoding; K = 1 is taken.
+        rule: How children are pooled.
+
+    Returns:
+        The better start, of equal ones the analytic, with its Gaussians and the PSNR (dB) of both among its choices.
+    """
+    scores: dict[str, float] = {}
+    best = starts[0]
+    for start in starts:
+        name = "analytic" if start.networks is None else "learned"
+        ones = decode(start.features, start.members, replace(options, k=1), None, rule, start.networks)
+        scores[name] = views_psnr(ones, scene)
+        if scores[name] >= max(scores.values()):
+            best = replace(start, k1_gaussians=ones)
+    return replace(best, choices={**best.choices, "start_scores": scores})
+
+
+def views_psnr(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> float:
+    """PSNR (dB) of the views at half size, over the pixels that have a Gaussian of their own.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        scene: The canonical scene; without photos, the colours of its pixels stand in for them.
+    """
+    photos = _photos(scene)
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> tuple[float, float]:
+        error = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).sum(-1)
+        weight = _weight(scene, view, photos)
+        return float((error * weight).sum(dtype=np.float64)), float(weight.sum(dtype=np.float64))
+
+    error, count = np.sum(photo_errors(gaussians, photos, score, pick_views(len(photos), MAX_VIEWS)), axis=0)
+    return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+
+
+def _photos(scene: PixelScene | UnalignedScene) -> Photos:
+    """The photos at half size, or the pictures that stand in for them."""
+    if scene.images is None:
+        scene = replace(scene, images=scene_pictures(scene).contiguous())
+    return scene_photos(scene, 2)
+
+
+def _weight(scene: PixelScene | UnalignedScene, view: int, photos: Photos) -> np.ndarray:
+    """``[h,w]`` share of each half-size pixel that has Gaussians; ones where Gaussians belong to no pixels."""
+    size = photos.width, photos.height
+    if isinstance(scene, UnalignedScene):
+        return np.ones(size[::-1], np.float32)
+    return cv2.resize(scene.valid[view].numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)

@@ -8,14 +8,16 @@ from typing import Literal
 import numpy as np
 import torch
 
-from gsmerge.kernels.gaussians.bisect import bisect, gather_groups
+from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.networks import Learned, decode_gaussians
+from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.merge import MergedViews
 from gsmerge.types import FeatureGaussians, Gaussians
 
 MAX_CHILDREN = 8
 GROUPS_PER_TASK = 8192
+PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ def decode(
     options: DecodeOptions,
     counts: np.ndarray | None = None,
     rule: Rule = "depth",
-    learned: Learned | None = None,
+    networks: NetworkContext | None = None,
 ) -> Gaussians:
     """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
 
@@ -62,9 +64,9 @@ def decode(
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
-        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer are not looked at.
+        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter.
         rule: How children are pooled, the encoder's.
-        learned: Networks whose heads correct the children; None: none does.
+        networks: Networks whose heads correct the children; None: none does.
 
     Returns:
         The Gaussians, those of one group next to each other.
@@ -77,9 +79,54 @@ def decode(
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
-    if learned is not None:
-        gaussians = decode_gaussians(gaussians, parents, features, learned)
+    if networks is not None:
+        gaussians = decode_gaussians(gaussians, parents, features, networks)
     return gaussians[gaussians.opacities >= options.min_opacity]
+
+
+def decode_merged(merged: MergedViews, options: DecodeOptions, rule: Rule, *, grows: bool) -> Gaussians:
+    """The Gaussians of merged views: as many as were asked for exactly, or K for each Feature Gaussian.
+
+    Args:
+        merged: The Feature Gaussians.
+        options: K and the least opacity.
+        rule: How children are pooled, the encoder's.
+        grows: Whether the fit that follows adds Gaussians up to an exact count.
+    """
+    asked = merged.segmentation
+    gaussians = _decode_count(merged, merged_count(merged, options, grows=grows), options, rule)
+    if asked.exact and len(gaussians) > asked.count:  # K each would be more than the fit may grow to
+        gaussians = _decode_count(merged, asked.count, options, rule)
+    return gaussians
+
+
+def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions, rule: Rule) -> Gaussians:
+    """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
+    if count is None and options.count == 1 and merged.k1_gaussians is not None:
+        return merged.k1_gaussians
+    features, members = merged.features, merged.members
+    children = None if count is None else split_counts(features, members, max(0, count - len(features)))
+    return decode(features, members, options, children, rule, merged.networks)
+
+
+def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
+    """Gaussians that merged views become; None: K for each Feature Gaussian.
+
+    A number where one is to be met and no fit grows to it; and for unaligned scenes: what a near and a far view both
+    show belongs to the near one, so many superpixels of the far one stay empty, and their Gaussians are spent on the
+    others.
+    """
+    segmentation, members = merged.segmentation, merged.members
+    if segmentation.exact and not grows:
+        return segmentation.count
+    if members.pixels is None:
+        return None
+    groups = segmentation.groups
+    sizes = np.array(groups.counts)
+    seen = members.pixels[members.pixels >= 0]
+    labels = groups.labels.reshape(-1).numpy()[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].numel()]
+    num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
+    return min(segmentation.count, options.count * (len(merged.features) + len(groups) - num_filled))
 
 
 def divide(
@@ -128,8 +175,8 @@ def halve(
         )
         return np.diff(child_starts), child_ids, rows[parents]
 
-    found = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
-    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*found, strict=True))
+    parts = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
+    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*parts, strict=True))
     return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
 
 
@@ -141,3 +188,82 @@ def pool_children(
     gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
     means, sh = torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
     return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh)
+
+
+def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
+    """Children of every Feature Gaussian when ``extra`` more Gaussians are spent where they lower distortion most.
+
+    A step that only pays together with the next one is judged by the two together (the convex hull of the
+    group's distortion), so a larger ``extra`` never takes a child away. The backing layer stays at one.
+
+    Args:
+        features: g Feature Gaussians.
+        members: The scene's Gaussians that ``features.members`` points into.
+        extra: Gaussians to add, at least 0.
+        max_children: Most children of one group.
+
+    Returns:
+        ``[g]`` int64, 1 to ``max_children``; their sum is ``g + extra``, or the most that the members give.
+
+    Raises:
+        ValueError: If ``extra`` is negative or ``max_children`` below 1.
+    """
+    if extra < 0:
+        raise ValueError(f"extra: expected at least 0, got {extra}")
+    if max_children < 1:
+        raise ValueError(f"max_children: expected at least 1, got {max_children}")
+    if extra == 0:
+        return np.ones(len(features), np.int64)
+    return 1 + np.bincount(deal_order(features, members, max_children)[:extra], minlength=len(features))
+
+
+def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
+    """The Feature Gaussian ``[d]`` that each further Gaussian goes to, where it lowers distortion most first.
+
+    See :func:`split_counts`, which takes the first ones.
+    """
+    front = np.flatnonzero(~features.backing.numpy())
+    if max_children == 1 or len(front) == 0:
+        return np.zeros(0, np.int64)
+    gains = _hull_gains(_child_errors(features, members, front, max_children))
+    # Stable, group by group: of equal gains of one group the first step comes first.
+    order = np.argsort(-gains.reshape(-1), kind="stable")
+    return front[order[: int(np.isfinite(gains).sum())] // gains.shape[1]]
+
+
+def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarray, max_children: int) -> np.ndarray:
+    """``[f,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
+    starts, ids = features.starts.numpy(), features.members.numpy()
+    centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
+
+    def run(rows: np.ndarray) -> np.ndarray:
+        local, own = gather_groups(starts, ids, rows)
+        m = members
+        return split_errors(
+            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
+        )
+
+    tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
+    return np.concatenate(parallel_map(run, tasks))
+
+
+def _hull_gains(errors: np.ndarray) -> np.ndarray:
+    """``[f,c-1]`` gain of each further child along the lower convex hull of the errors; -inf where there is none.
+
+    Falls from child to child: the mean gain up to the farthest point of steepest descent, again and again.
+    """
+    num_groups, num_children = errors.shape
+    gains = np.full((num_groups, num_children - 1), -np.inf)
+    at, rows = np.zeros(num_groups, int), np.arange(num_groups)
+    for _ in range(num_children - 1):
+        steps = np.arange(num_children)[None] - at[:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slopes = np.where(steps > 0, (errors[rows, at][:, None] - errors) / steps, -np.inf)
+        slopes = np.where(np.isnan(slopes), -np.inf, slopes)
+        best = num_children - 1 - np.argmax(slopes[:, ::-1], axis=1)
+        slope = slopes[rows, best]
+        for child in range(1, num_children):
+            fill = np.isfinite(slope) & (child > at) & (child <= best)
+            gains[fill, child - 1] = slope[fill]
+        at = np.where(np.isfinite(slope), best, at)
+    return gains

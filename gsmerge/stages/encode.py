@@ -9,7 +9,7 @@ import torch
 
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
-from gsmerge.networks import Learned, encode_features
+from gsmerge.networks import NetworkContext, encode_features
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene
 
@@ -39,7 +39,7 @@ def encode(
     members: Members,
     groups: Groups,
     options: EncodeOptions,
-    learned: Learned | None = None,
+    networks: NetworkContext | None = None,
 ) -> FeatureGaussians:
     """One Feature Gaussian per superpixel, view by view.
 
@@ -48,14 +48,14 @@ def encode(
         members: Its Gaussians as arrays.
         groups: The superpixels of every view.
         options: The rule.
-        learned: Networks whose encoder looks at the members too; None: none does.
+        networks: Networks whose encoder corrects what is pooled; None: none does.
 
     Returns:
         The Feature Gaussians in order of view and label; superpixels without a valid member are left out.
     """
     starts, ids, views = member_rows(scene, members, groups)
     features = from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
-    return features if learned is None else encode_features(features, learned)
+    return features if networks is None else encode_features(features, networks)
 
 
 def member_rows(

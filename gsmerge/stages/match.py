@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
-from gsmerge.networks import Learned, match_geometry
+from gsmerge.networks import NetworkContext, match_geometry
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
@@ -30,7 +30,7 @@ class MatchOptions:
             that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
         overlap: Least overlap, 0 to 1.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
-        neighbors: Nearest neighbours in 3D that are looked at, the own view's included.
+        neighbors: Nearest neighbours in 3D that are compared, the own view's included.
         cluster_size: Most Feature Gaussians in a star cluster; None: as many as there are views (a cluster holds
             one of each view at most).
 
@@ -64,28 +64,28 @@ class MatchOptions:
         return self.match or ("none" if self.effort == "draft" else "overlap")
 
 
-def match(features: FeatureGaussians, options: MatchOptions, learned: Learned | None = None) -> Matches:
+def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
     """Clusters of Feature Gaussians of different views.
 
     The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
     are taken by weight, ties by position. What is fully transparent is left alone.
     """
-    if learned is not None and options.geometry == "decoded" and options.method != "none":
-        features = match_geometry(features, learned)
+    if networks is not None and options.geometry == "decoded" and options.method != "none":
+        features = match_geometry(features, networks)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
-    num_found = 0
+    num_clusters = 0
     if options.method != "none" and len(torch.unique(features.views)) > 1:
         solid = features.extinctions > 0
         for layer in (solid & ~features.backing, solid & features.backing):
             rows = torch.nonzero(layer)[:, 0].numpy()
             if len(rows) > 1:
-                found, num_layer = _clusters(features, rows, options)
-                clusters[rows] = num_found + found
-                num_found += num_layer
+                of_layer, num_layer = _clusters(features, rows, options)
+                clusters[rows] = num_clusters + of_layer
+                num_clusters += num_layer
     alone = np.flatnonzero(clusters < 0)
-    clusters[alone] = num_found + np.arange(len(alone))
-    return Matches(torch.from_numpy(clusters), num_found + len(alone))
+    clusters[alone] = num_clusters + np.arange(len(alone))
+    return Matches(torch.from_numpy(clusters), num_clusters + len(alone))
 
 
 def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
@@ -109,7 +109,7 @@ def _nearest(means: np.ndarray, count: int) -> np.ndarray:
 
     k = min(count + 1, len(means))
     with use_threads() as threads:
-        _, found = cKDTree(means).query(means, k=k, workers=threads)
-    found = found.astype(np.int64)
-    found[found == np.arange(len(means))[:, None]] = -1
-    return found
+        _, ids = cKDTree(means).query(means, k=k, workers=threads)
+    ids = ids.astype(np.int64)
+    ids[ids == np.arange(len(means))[:, None]] = -1
+    return ids

@@ -1,16 +1,42 @@
-"""feature gaussians + matches -> feature gaussians: pool every cluster into one."""
+"""feature gaussians + matches -> feature gaussians: every cluster pooled into one, then in line with its neighbours."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks import Learned, merge_features
-from gsmerge.types import FeatureGaussians, Matches
+from gsmerge.moments import Members
+from gsmerge.networks import NetworkContext, merge_features, refine_features
+from gsmerge.types import FeatureGaussians, Gaussians, Matches, Segmentation
 
 
-def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None = None) -> FeatureGaussians:
+@dataclass(frozen=True, eq=False)
+class MergedViews:
+    """Feature Gaussians merged across views, and what decoding them takes.
+
+    Args:
+        features: The Feature Gaussians.
+        members: The scene's Gaussians that ``features.members`` points into.
+        segmentation: The superpixels that they come from, and how many Gaussians they are to become.
+        networks: Networks that correct; None: those are not used.
+        choices: What the stages decided, for the report.
+        k1_gaussians: What they become at K = 1, where that had to be known to choose them; None elsewhere.
+    """
+
+    features: FeatureGaussians
+    members: Members
+    segmentation: Segmentation
+    networks: NetworkContext | None = None
+    choices: Mapping[str, Any] = field(default_factory=dict)
+    k1_gaussians: Gaussians | None = None
+
+
+def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:
     """One Feature Gaussian per cluster; those that are alone pass unchanged.
 
     Members are weighted with their opacities times what the photos say of them (gains); masses and integrated
@@ -20,7 +46,7 @@ def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None 
     Args:
         features: g Feature Gaussians.
         matches: A cluster for each.
-        learned: Networks whose merger corrects what is pooled; None: none does.
+        networks: Networks whose merger corrects what is pooled; None: none does.
 
     Returns:
         ``matches.count`` Feature Gaussians: first those that are alone in their old order, then the merged ones.
@@ -29,9 +55,19 @@ def merge(features: FeatureGaussians, matches: Matches, learned: Learned | None 
     if len(order) == 0:
         return features
     pooled = pool_runs(features, order, cuts)
-    if learned is not None:
-        pooled = merge_features(pooled, features, order.numpy(), cuts, learned)
+    if networks is not None:
+        pooled = merge_features(pooled, features, order.numpy(), cuts, networks)
     return FeatureGaussians.concat([take(features, alone), pooled])
+
+
+def refine(features: FeatureGaussians, networks: NetworkContext | None) -> FeatureGaussians:
+    """Feature Gaussians with the refiner's corrections (paper section 4.5); as they are without networks.
+
+    Args:
+        features: Merged Feature Gaussians of all views.
+        networks: Networks and the scene, or None.
+    """
+    return features if networks is None else refine_features(features, networks)
 
 
 def cluster_runs(matches: Matches) -> tuple[Tensor, Tensor, np.ndarray]:

@@ -1,18 +1,21 @@
-"""Views of a scene that came without cameras: placed around it and inside it, where they show most of it."""
+"""unaligned scene -> the same with views: cameras placed where they show most, pictures rendered from it."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render import contributions, plan_view, prepare, render
+from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, UnalignedScene
 
 NUM_VIEWS = 24
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
-AROUND = 40  # directions from which the scene is looked at
+AROUND = 40  # candidate cameras around the scene
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
 LOOKS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
@@ -20,6 +23,38 @@ PROBE = 96  # pixels per side of the pictures that candidates are judged by
 SMALLEST, LARGEST = 96, 640  # pixels per side
 CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
+
+
+def add_views(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
+    """The finite Gaussians, and cameras where there are none; ``log.notes`` says what was done.
+
+    Raises:
+        ValueError: If there is no finite Gaussian.
+    """
+    g = scene.gaussians
+    finite = torch.isfinite(g.opacities)
+    for tensor in (g.means, g.quats, g.scales, g.sh0, g.shN):
+        finite &= torch.isfinite(tensor).flatten(1).all(1)
+    count = int((~finite).sum())
+    if count == len(g):
+        raise ValueError("expected at least one finite Gaussian, got none")
+    if count:
+        log.notes.append(f"{count} Gaussians are not finite and were left out")
+        scene = replace(scene, gaussians=g[finite])
+    if len(scene) == 0:
+        cameras = place_cameras(scene.gaussians)
+        names = tuple(f"placed {view}" for view in range(len(cameras)))
+        scene = UnalignedScene(scene.gaussians, cameras, None, names)
+        log.notes.append(f"no cameras: {len(cameras)} placed around and inside the scene, where they show most of it")
+    return scene
+
+
+def add_pictures(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
+    """The canonical scene with renders of its own in place of photos where it has none."""
+    if scene.images is not None:
+        return scene
+    log.notes.append("no photos: views rendered from the scene itself stand in for them")
+    return replace(scene, images=render(scene.gaussians, scene.cameras).images.clamp(0, 1))
 
 
 def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:

@@ -1,28 +1,41 @@
-"""Bring a scene to the frame that all arithmetic runs in, and back.
+"""scene -> prepared scene: in the frame that all arithmetic runs in, with everything that the next stages need.
 
-Origin at the scene's middle and unit = its median depth, so that float32 keeps its precision far from the world's
-origin and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two: scaling there
-and back changes no bit.
+The canonical frame has its origin at the scene's middle and the median depth as its unit, so that float32 keeps its
+precision far from the world's origin and thresholds (near plane, floors) mean the same at every scale. The unit is a
+power of two: scaling there and back changes no bit.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
+from gsmerge.budget import exact_count
+from gsmerge.errors import UsageError
 from gsmerge.geometry import project
+from gsmerge.moments import Members, scene_members
+from gsmerge.networks import Checkpoint, NetworkContext, find_checkpoint
+from gsmerge.render.photos import scene_pictures
+from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.assign import ContributionOptions, split_unseen
+from gsmerge.stages.group import CountLimits, count_limits, with_tree
+from gsmerge.stages.place_cameras import add_pictures, add_views
+from gsmerge.stages.region_tree import RegionTree
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.views import distinct_views, scored_views, subset
+
+if TYPE_CHECKING:
+    from gsmerge.options import CompactOptions
 
 Scene = TypeVar("Scene", PixelScene, UnalignedScene)
-SAMPLES = 65536  # Gaussians that are looked at
-NEAR = 0.01  # near plane of every render that is scored, in canonical units
+SAMPLES = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
-MAX_VIEWS = 32  # of a scene in no order
+MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
 
 
 @dataclass(frozen=True)
@@ -83,7 +96,7 @@ def find_frame(scene: PixelScene) -> Frame:
 
 
 def find_unaligned_frame(scene: UnalignedScene) -> Frame:
-    """The canonical frame of a scene in no order: median mean, and median depth of what the views have before them.
+    """The canonical frame of an unaligned scene: median mean, and median depth of the Gaussians inside the views.
 
     Raises:
         ValueError: If there is no Gaussian or no view.
@@ -112,3 +125,107 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
     """The scene in its canonical frame, or in a given one, and the frame."""
     frame = frame or scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScene:
+    """A scene that the stages can work on.
+
+    Args:
+        given: The scene as it was given, in its own world frame.
+        scene: The canonical scene: every view once; an unaligned one has cameras, images and only finite Gaussians.
+        pictures: ``[v,h,w,3]`` what superpixels are cut from: the photos, or the Gaussians' own colours.
+        frame: The canonical frame.
+        settings: What was asked for.
+        options: The same, with any budget less what ``hidden`` takes of it.
+        limits: What is known of the number of Gaussians.
+        members: The Gaussians as members of groups; None where the superpixels decide who belongs to them.
+        checkpoint: Networks that correct the analytic stages; None: those alone.
+        tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
+        hidden: Gaussians in place of those that no view sees, canonical; None without any.
+    """
+
+    given: PixelScene | UnalignedScene
+    scene: PixelScene | UnalignedScene
+    pictures: Tensor
+    frame: Frame
+    settings: CompactOptions
+    options: CompactOptions
+    limits: CountLimits
+    members: Members | None
+    checkpoint: Checkpoint | None
+    tree: RegionTree | None
+    hidden: Gaussians | None
+
+    def candidates(self, members: Members) -> list[NetworkContext | None]:
+        """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
+        if self.checkpoint is None:
+            return [None]
+        options = self.options
+        networks = NetworkContext(self.checkpoint.networks, members, self.scene.cameras, options.seed)
+        return [networks, None] if options.checkpoint == "auto" else [networks]
+
+    def keeps_all(self, count: int | None) -> bool:
+        """Whether so many Gaussians are asked for that an unaligned scene need not be grouped."""
+        return count is not None and isinstance(self.scene, UnalignedScene) and count >= len(self.scene.gaussians)
+
+
+def prepare(
+    scene: PixelScene | UnalignedScene, settings: CompactOptions, log: RunLog, frame: Frame | None = None
+) -> PreparedScene:
+    """Everything that is known before superpixels are chosen.
+
+    Args:
+        scene: As given.
+        settings: Of all stages.
+        log: Takes the seconds, and notes on what was missing and what stands in for it.
+        frame: Canonical frame; None: the scene's own.
+
+    Raises:
+        ValueError: If there is no finite Gaussian, or there are images without cameras.
+        UsageError: If the settings ask for what the scene does not have.
+    """
+    if settings.method != "gsmerge":  # baselines set nothing aside and learn nothing
+        settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
+    if scene.images is None and settings.target.searches:
+        raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
+    with log.stage("prepare"):
+        own, options = drop_repeats(scene, settings, log)
+        canonical: PixelScene | UnalignedScene
+        members, hidden = None, None
+        if isinstance(own, PixelScene):
+            canonical, frame = canonicalise(own, frame)
+            members = scene_members(canonical)
+        else:
+            unaligned, frame = canonicalise(add_views(own, log), frame)
+            unaligned, options, hidden = split_unseen(unaligned, options, log)
+            canonical = add_pictures(unaligned, log)
+        photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
+        name = options.networks(photos=photos, aligned=aligned)
+        checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
+        scored = len(scored_views(len(scene))) if scene.images is not None else len(scene)
+        log.notes += [*notes, *([f"the input views are scored on {scored} of {len(scene)}"] * (scored < len(scene)))]
+        limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
+    prepared = PreparedScene(
+        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden
+    )
+    if settings.method != "gsmerge" or not (options.needs_tree or limits.count is not None):
+        return prepared
+    with log.stage("segment"):
+        return with_tree(prepared)
+
+
+def drop_repeats(
+    scene: PixelScene | UnalignedScene, options: CompactOptions, log: RunLog
+) -> tuple[PixelScene | UnalignedScene, CompactOptions]:
+    """The scene with every view once, and the options with budgets that stay shares of the whole."""
+    views = distinct_views(scene)
+    if len(views) == len(scene):
+        return scene, options
+    few = subset(scene, views)
+    count = exact_count(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
+    if count is not None:
+        target = replace(options.target, budget=min(count, few.num_gaussians), max_bytes=None)
+        options = replace(options, target=target)
+    log.notes.append(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
+    return few, options

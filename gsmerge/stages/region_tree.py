@@ -13,17 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.kernels.gaussians.bisect import gather_groups, split_errors
 from gsmerge.kernels.superpixels.region_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
-from gsmerge.moments import Members
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Groups, PixelScene
+from gsmerge.types import Groups, PixelScene
 
-DEPTH_RANGE = 1e3  # depths are held within this factor of the view's median
-GROUPS_PER_TASK = 8192
-PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
+DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
 
 
@@ -68,7 +64,7 @@ class RegionTree:
         order: ``[m]`` int64, all merges, cheapest first; those of view v are numbered from ``first[v]`` on.
         first: ``[v+1]`` int64, merges in the views before.
         distortions: ``[m+1]`` float64, mean squared error per pixel and colour channel after the first i merges.
-        least: Fewest regions before any is larger than ``max_extent``.
+        min_regions: Fewest regions before any is larger than ``max_extent``.
     """
 
     groups: Groups
@@ -76,7 +72,7 @@ class RegionTree:
     order: np.ndarray
     first: np.ndarray
     distortions: np.ndarray
-    least: int
+    min_regions: int
 
     def __len__(self) -> int:
         """Superpixels at the start."""
@@ -107,7 +103,7 @@ def region_tree(
 
     Args:
         images: ``[v,h,w,3]`` float, sRGB in [0, 1].
-        depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 are taken as very near.
+        depths: ``[v,h,w]`` float, depth of each pixel; those of at most 0 count as very near.
         groups: The superpixels to start from, 4-connected, none empty.
         valid: ``[v,h,w]`` bool; pixels that do not count. Superpixels without a valid pixel merge first.
         options: Weights.
@@ -135,8 +131,8 @@ def region_tree(
     order = np.argsort(heights, kind="stable")
     added = np.concatenate([[sum(starts)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
-    least = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
-    return RegionTree(groups, parents, order, first, distortions, least)
+    min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
+    return RegionTree(groups, parents, order, first, distortions, min_regions)
 
 
 def _check_pictures(images: Tensor, depths: Tensor, groups: Groups, valid: Tensor) -> None:
@@ -154,8 +150,8 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """Depths in units of their median, float32; 0 for pixels that do not count."""
     usable = valid & np.isfinite(depths)
     middle = float(np.median(depths[usable & (depths > 0)])) if (usable & (depths > 0)).any() else 1.0
-    held = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
-    return np.where(usable, held, 0).astype(np.float32)
+    clipped = np.clip(depths / middle, 1 / DEPTH_RANGE, DEPTH_RANGE)
+    return np.where(usable, clipped, 0).astype(np.float32)
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:
@@ -184,7 +180,7 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 
 def auto_count(tree: RegionTree, options: AllocateOptions | None = None) -> int:
     """The :func:`knee` of a scene, among the counts that need no region larger than ``max_extent``."""
-    usable = tree.counts >= tree.least
+    usable = tree.counts >= tree.min_regions
     return knee(tree.counts[usable], tree.distortions[usable], options)
 
 
@@ -212,98 +208,3 @@ def knee(counts: np.ndarray, distortions: np.ndarray, options: AllocateOptions |
     before = np.interp(scale - np.log(KNEE_STEP), scale, quality)
     steep = (quality - before) / np.log(KNEE_STEP) >= max(options.knee_slope, 1e-12)
     return int(counts[order][np.flatnonzero(steep)[-1] if steep.any() else 0])
-
-
-def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
-    """Children of every Feature Gaussian when ``extra`` more Gaussians are spent where they lower distortion most.
-
-    A step that only pays together with the next one is judged by the two together (the convex hull of the
-    group's distortion), so a larger ``extra`` never takes a child away. The backing layer stays at one.
-
-    Args:
-        features: g Feature Gaussians.
-        members: The scene's Gaussians that ``features.members`` points into.
-        extra: Gaussians to add, at least 0.
-        max_children: Most children of one group.
-
-    Returns:
-        ``[g]`` int64, 1 to ``max_children``; their sum is ``g + extra``, or the most that the members give.
-
-    Raises:
-        ValueError: If ``extra`` is negative or ``max_children`` below 1.
-    """
-    if extra < 0:
-        raise ValueError(f"extra: expected at least 0, got {extra}")
-    if max_children < 1:
-        raise ValueError(f"max_children: expected at least 1, got {max_children}")
-    if extra == 0:
-        return np.ones(len(features), np.int64)
-    return 1 + np.bincount(deal_order(features, members, max_children)[:extra], minlength=len(features))
-
-
-def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """The Feature Gaussian ``[d]`` that each further Gaussian goes to, where it lowers distortion most first.
-
-    See :func:`split_counts`, which takes the first ones.
-    """
-    front = np.flatnonzero(~features.backing.numpy())
-    if max_children == 1 or len(front) == 0:
-        return np.zeros(0, np.int64)
-    gains = _hull_gains(_child_errors(features, members, front, max_children))
-    # Stable, group by group: of equal gains of one group the first step comes first.
-    order = np.argsort(-gains.reshape(-1), kind="stable")
-    return front[order[: int(np.isfinite(gains).sum())] // gains.shape[1]]
-
-
-def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarray, max_children: int) -> np.ndarray:
-    """``[f,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
-    starts, ids = features.starts.numpy(), features.members.numpy()
-    centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
-
-    def run(rows: np.ndarray) -> np.ndarray:
-        local, own = gather_groups(starts, ids, rows)
-        m = members
-        return split_errors(
-            local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
-        )
-
-    tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
-    return np.concatenate(parallel_map(run, tasks))
-
-
-def _hull_gains(errors: np.ndarray) -> np.ndarray:
-    """``[f,c-1]`` gain of each further child along the lower convex hull of the errors; -inf where there is none.
-
-    Falls from child to child: the mean gain up to the farthest point of steepest descent, again and again.
-    """
-    num_groups, num_children = errors.shape
-    gains = np.full((num_groups, num_children - 1), -np.inf)
-    at, rows = np.zeros(num_groups, int), np.arange(num_groups)
-    for _ in range(num_children - 1):
-        steps = np.arange(num_children)[None] - at[:, None]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            slopes = np.where(steps > 0, (errors[rows, at][:, None] - errors) / steps, -np.inf)
-        slopes = np.where(np.isnan(slopes), -np.inf, slopes)
-        best = num_children - 1 - np.argmax(slopes[:, ::-1], axis=1)
-        slope = slopes[rows, best]
-        for child in range(1, num_children):
-            fill = np.isfinite(slope) & (child > at) & (child <= best)
-            gains[fill, child - 1] = slope[fill]
-        at = np.where(np.isfinite(slope), best, at)
-    return gains
-
-
-def trim(importance: Tensor | np.ndarray, count: int) -> Tensor:
-    """Indices, rising, of the ``count`` most important Gaussians; of equal ones the first are kept.
-
-    Args:
-        importance: ``[n]``, for instance the summed blending weight over all photos.
-        count: How many to keep; all if there are fewer.
-
-    Raises:
-        ValueError: If ``count`` is negative.
-    """
-    if count < 0:
-        raise ValueError(f"count: expected at least 0, got {count}")
-    values = torch.as_tensor(importance).double().nan_to_num(nan=-torch.inf, neginf=-torch.inf)
-    return torch.sort(torch.argsort(values, descending=True, stable=True)[:count]).values

@@ -1,11 +1,11 @@
 """Partition each view into superpixels of similar colour and regular shape (paper section 4.1).
 
 The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
-first (more than wanted), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
+first (more than asked for), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
 is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
-Shi-Tomasi response, as in the paper, ``slic`` the common baseline, and ``grid`` rectangles that no colour has a say
-in: where they are a few pixels large and no fit follows, they are as good and cost nothing. Whichever it is, there are
-exactly as many superpixels as asked for, none is empty, each is 4-connected, and a run repeats bit for bit.
+Shi-Tomasi response, as in the paper, ``slic`` the common baseline, and ``grid`` plain rectangles: where they are a
+few pixels large and no fit follows, they are as good and cost nothing. Whichever it is, there are exactly as many
+superpixels as asked for, none is empty, each is 4-connected, and a run repeats bit for bit.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.errors import UsageError
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.sweeps import refine
@@ -73,8 +74,15 @@ def _check(segmentation: str, effort: str, compactness: float) -> None:
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Superpixels that ``options`` ask for in a view of this size."""
+    """Superpixels that ``options`` ask for in a view of this size.
+
+    Raises:
+        UsageError: If there are more than pixels.
+    """
     if options.superpixels is not None:
+        if options.superpixels > height * width:
+            limit = f"{height * width}, one per pixel of {width} x {height}"
+            raise UsageError(f"superpixels: expected at most {limit}, got {options.superpixels}")
         return options.superpixels
     return max(1, int(options.density * height * width))
 
@@ -93,14 +101,14 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
     num_views, height, width, _ = images.shape
-    wanted = count_for(options, height, width) if count is None else count
+    count = count_for(options, height, width) if count is None else count
 
     def one_view(image: Tensor) -> Tensor:
-        return superpixels(image, wanted, options.segmentation, effort=options.effort, compactness=options.compactness)
+        return superpixels(image, count, options.segmentation, effort=options.effort, compactness=options.compactness)
 
     labels = parallel_map(one_view, images.unbind(0))
     stacked = torch.stack(labels) if labels else torch.empty((0, height, width), dtype=torch.int32)
-    return Groups(stacked, (wanted,) * num_views)
+    return Groups(stacked, (count,) * num_views)
 
 
 def superpixels(
@@ -115,7 +123,7 @@ def superpixels(
 
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
-        count: Superpixels wanted, 1 to h·w.
+        count: Superpixels, 1 to h·w.
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the two BASS methods).
@@ -158,8 +166,8 @@ def grid_labels(height: int, width: int, count: int) -> np.ndarray:
         width: Columns of pixels.
         count: Rectangles, 1 to height x width.
     """
-    least = -(-count // width)  # rows of blocks that can hold them all
-    lines = min(height, count, max(least, round((count * height / width) ** 0.5)))
+    min_rows = -(-count // width)  # rows of blocks that can hold them all
+    lines = min(height, count, max(min_rows, round((count * height / width) ** 0.5)))
     first = np.arange(lines + 1) * count // lines  # first label of each row of blocks
     line = np.arange(height) * lines // height
     blocks = np.diff(first)[line]
@@ -211,11 +219,11 @@ def _rdseg(pixels: np.ndarray, count: int, effort: str, compactness: float) -> n
     rectangles_each, num_first_sweeps = EFFORTS[effort]
     height, width, _ = pixels.shape
     spread = np.float32(compactness**0.5)
-    wanted = int(rectangles_each * count)
-    if wanted > PIXEL_START * height * width:
+    num_rectangles = int(rectangles_each * count)
+    if num_rectangles > PIXEL_START * height * width:
         labels, num_regions = _every_pixel(height, width), height * width
     else:
-        labels, num_regions = split_rectangles(pixels, wanted, BLOCK, float(compactness))
+        labels, num_regions = split_rectangles(pixels, num_rectangles, BLOCK, float(compactness))
         labels = refine(labels, pixels, num_regions, num_first_sweeps, spread)
     labels = merge_regions(labels, pixels, num_regions, count, spread)
     return refine(labels, pixels, count, NUM_SWEEPS, spread)

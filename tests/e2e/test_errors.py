@@ -62,7 +62,7 @@ def test_failures_while_writing_leave_nothing(
         assert run("encode", scene_copy, "-o", given, *quick).code == 0
     for place in ("gsmerge.compact_file", "gsmerge.io"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
-    monkeypatch.setattr("gsmerge.encoded.file.save_encoded", half)
+    monkeypatch.setattr("gsmerge.encoded.gsm_file.save_encoded", half)
     before = listing(scene_copy)
     more = {"compact": (*quick, "--fit", "none"), "encode": quick, "decode": ()}[command]
     outcome = run(command, given, "--quiet", *more)

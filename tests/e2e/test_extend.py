@@ -18,7 +18,8 @@ from safetensors.torch import load_file, save_file
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.online.file import FORMAT, load_state
+from gsmerge.encoded.gsm_file import STATE
+from gsmerge.online.file import load_state
 
 from .conftest import Outcome, Run, listing
 
@@ -288,8 +289,8 @@ def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: P
 def newer(path: Path) -> None:
     """A state of a version to come."""
     size = int.from_bytes(path.read_bytes()[:8], "little")
-    told = json.loads(json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"][FORMAT])
-    save_file(load_file(path), path, {FORMAT: json.dumps(told | {"schema": 9, "gsmerge": "9.9"})})
+    told = json.loads(json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"][STATE])
+    save_file(load_file(path), path, {STATE: json.dumps(told | {"schema": 9, "gsmerge": "9.9"})})
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -370,7 +371,7 @@ def test_a_state_that_another_process_changes_meanwhile(
     state: Path, states: list[Path], walks: list[Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is left as the other one made it."""
-    import gsmerge.online.files as files
+    import gsmerge.online.file as files
 
     extended = files.extend
 
@@ -389,7 +390,7 @@ def test_a_state_that_another_process_changes_meanwhile(
 def test_a_state_that_another_process_makes_meanwhile(
     states: list[Path], walks: list[Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import gsmerge.online.files as files
+    import gsmerge.online.file as files
 
     extended, state = files.extend, tmp_path / "state.gsm"
 
@@ -436,7 +437,7 @@ def test_killed_in_the_middle(state: Path, states: list[Path], walks: list[Path]
     assert state.read_bytes() == states[0].read_bytes()
     code = (
         "import os, signal, sys\n"
-        "import gsmerge.online.files as files\n"
+        "import gsmerge.online.file as files\n"
         "from gsmerge.cli import main\n"
         "saved = files.save_state\n"
         "def save(path, state, **named):\n"

@@ -89,7 +89,7 @@ def test_a_missing_program_is_told(
     ("text", "words"),
     [
         ("#!{python}\nraise SystemExit('out of\\nmemory')\n", "it ended with code 1: out of memory"),
-        ("#!{python}\n", "it ended with code 0: without a word"),
+        ("#!{python}\n", "it ended with code 0: without output"),
     ],
 )
 def test_a_failing_program_is_told(

@@ -35,25 +35,25 @@ def similarity(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
     return (2 * mx * my + c1) * (2 * xy + c2) / ((mx * mx + my * my + c1) * (xx + yy + c2))
 
 
-def loss(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor, dssim: float) -> torch.Tensor:
-    each = (1 - dssim) * (image - photo).abs() + dssim * (1 - similarity(image, photo))
+def loss(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor, ssim_lambda: float) -> torch.Tensor:
+    each = (1 - ssim_lambda) * (image - photo).abs() + ssim_lambda * (1 - similarity(image, photo))
     return (weight[..., None] * each).sum() / (image.shape[0] * image.shape[1])
 
 
-def autograd(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dssim: float) -> np.ndarray:
+def autograd(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float) -> np.ndarray:
     variable = torch.from_numpy(image).double().requires_grad_()
-    loss(variable, torch.from_numpy(photo).double(), torch.from_numpy(weight).double(), dssim).backward()
+    loss(variable, torch.from_numpy(photo).double(), torch.from_numpy(weight).double(), ssim_lambda).backward()
     assert variable.grad is not None
     return variable.grad.numpy()
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("dssim", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("weighted", [True, False])
-def test_gradient_matches_autograd(size: tuple[int, int], dssim: float, weighted: bool) -> None:
+def test_gradient_matches_autograd(size: tuple[int, int], ssim_lambda: float, weighted: bool) -> None:
     image, photo, weight = pictures(size)
     weight = weight if weighted else np.ones_like(weight)
-    found, wanted = image_gradient(image, photo, weight, dssim), autograd(image, photo, weight, dssim)
+    found, wanted = image_gradient(image, photo, weight, ssim_lambda), autograd(image, photo, weight, ssim_lambda)
     assert found.dtype == np.float32
     assert np.linalg.norm(found - wanted) <= 1e-3 * np.linalg.norm(wanted)
 
@@ -93,10 +93,10 @@ def test_terms_match_finite_differences() -> None:
         np.testing.assert_allclose(term, (ends[0] - ends[1]) / 2e-6, rtol=5e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("dssim", [0.0, 0.2, 1.0])
-def test_no_gradient_at_the_photo(dssim: float) -> None:
+@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
+def test_no_gradient_at_the_photo(ssim_lambda: float) -> None:
     _, photo, weight = pictures((16, 16))
-    assert np.abs(image_gradient(photo, photo, weight, dssim)).max() < 1e-5
+    assert np.abs(image_gradient(photo, photo, weight, ssim_lambda)).max() < 1e-5
 
 
 def test_pixels_without_weight_teach_nothing() -> None:

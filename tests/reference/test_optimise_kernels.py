@@ -24,7 +24,7 @@ class Run:
     m: np.ndarray
     v: np.ndarray
     units: np.ndarray
-    shares: np.ndarray
+    box_shares: np.ndarray
     means: np.ndarray
     quats: np.ndarray
     scales: np.ndarray
@@ -55,10 +55,10 @@ def make_run(count: int, seed: int = 0) -> Run:
     x[:, COLOR:] = rng.uniform(0, 1, (count, 3))
     zeros = np.zeros_like(x)
     units = rng.uniform(0.02, 0.2, count).astype(np.float32)
-    shares = rng.uniform(0.2, 1, count).astype(np.float32)
+    box_shares = rng.uniform(0.2, 1, count).astype(np.float32)
     opacities = 1 / (1 + np.exp(-x[:, LOGIT]))
     return Run(
-        x, x.copy(), zeros, zeros.copy(), units, shares, x[:, MEAN].copy(), x[:, TURN].copy(),
+        x, x.copy(), zeros, zeros.copy(), units, box_shares, x[:, MEAN].copy(), x[:, TURN].copy(),
         np.exp(x[:, SIZE:QUAT]), opacities, x[:, COLOR:].copy(),
     )  # fmt: skip
 
@@ -78,7 +78,7 @@ def step_kernel(run: Run, g: Wanted, step: int, pieces: list[int] | None = None,
     edges = pieces or [0, len(run.x)]
     for first, last in pairwise(edges):
         adam(
-            run.x, run.x0, run.m, run.v, run.units, run.shares,
+            run.x, run.x0, run.m, run.v, run.units, run.box_shares,
             g.ids, g.means, g.quats, g.scales, g.opacities, g.colors,
             rates.astype(np.float32), LIMITS.astype(np.float32), BETAS.astype(np.float32), step, first, last,
             run.means, run.quats, run.scales, run.opacities, run.colors,
@@ -106,8 +106,10 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
         move[MEAN] *= run.units[i]
         x, x0 = run.x[i] - move, run.x0[i]
         way = x[MEAN] - x0[MEAN]
-        x[MEAN] = x0[MEAN] + way * min(1, run.shares[i] * LIMITS[0] * run.units[i] / max(np.linalg.norm(way), 1e-30))
-        reach = run.shares[i] * LIMITS[1]
+        x[MEAN] = x0[MEAN] + way * min(
+            1, run.box_shares[i] * LIMITS[0] * run.units[i] / max(np.linalg.norm(way), 1e-30)
+        )
+        reach = run.box_shares[i] * LIMITS[1]
         x[SIZE:QUAT] = np.clip(x[SIZE:QUAT], x0[SIZE:QUAT] - reach, x0[SIZE:QUAT] + reach)
         logit = np.clip(x[LOGIT], x0[LOGIT] - LIMITS[2], x0[LOGIT] + LIMITS[2])
         x[LOGIT] = np.clip(logit, MIN_LOGIT, MAX_LOGIT)
@@ -191,9 +193,9 @@ def test_box_holds() -> None:
     for step in range(1, 101):
         step_kernel(run, g, step)
     far = np.linalg.norm(run.x[:, MEAN] - run.x0[:, MEAN], axis=1)
-    np.testing.assert_allclose(far, 2 * run.shares * run.units, rtol=1e-3)
+    np.testing.assert_allclose(far, 2 * run.box_shares * run.units, rtol=1e-3)
     grown = np.abs(run.x - run.x0)[:, SIZE:QUAT]
-    np.testing.assert_allclose(grown, np.tile(2.5 * run.shares[:, None], 3), rtol=1e-4)
+    np.testing.assert_allclose(grown, np.tile(2.5 * run.box_shares[:, None], 3), rtol=1e-4)
     assert np.abs(run.x[:, LOGIT] - run.x0[:, LOGIT]).max() <= 4.0001
     assert run.x[:, LOGIT].min() >= MIN_LOGIT
     assert run.x[:, LOGIT].max() <= MAX_LOGIT

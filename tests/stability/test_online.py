@@ -13,7 +13,7 @@ from arriving import fed, parts_of, state_of
 from safetensors.torch import load_file, save_file
 
 from gsmerge import Compactor, PixelScene, SceneError
-from gsmerge.encoded.parts import SCHEMA
+from gsmerge.encoded.gsm_file import SCHEMA
 
 SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
 FULL = {"fit": "full", "fit_steps": 30}

@@ -6,6 +6,7 @@ from dataclasses import FrozenInstanceError, fields, is_dataclass
 import pytest
 
 from gsmerge import CompactOptions
+from gsmerge.options import from_schema, to_schema
 
 STAGES = [f.name for f in fields(CompactOptions) if is_dataclass(getattr(CompactOptions(), f.name))]
 
@@ -28,7 +29,7 @@ def test_a_shared_name_reaches_every_stage_that_has_it() -> None:
 def test_a_draft_merges_no_views_and_takes_few_steps_on_small_photos() -> None:
     draft = CompactOptions().with_settings({"effort": "draft"})
     assert draft.match.method == "none"
-    assert (draft.fit.steps, draft.fit.coarse_share, draft.fit.grows) == (12, 1.0, False)
+    assert (draft.fit.steps, draft.fit.half_res_part, draft.fit.grows) == (12, 1.0, False)
     assert CompactOptions().match.method == "overlap"
     assert draft.with_settings({"match": "aabb"}).match.method == "aabb"
 
@@ -79,7 +80,7 @@ def test_every_setting_is_documented(stage: str) -> None:
         {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5},
         {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
-        {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0},
+        {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"prior_weight": -1.0},
         {"min_opacity": -1.0}, {"rounds": -1}, {"tolerance": 0.0}, {"overlap": float("nan")}, {"boost": 0.0},
         {"widen": 0.0}, {"backing": 1.5}, {"push": -0.1}, {"backing_spread": 0.0}, {"compactness": 2.0},
     ],
@@ -89,3 +90,14 @@ def test_values_out_of_range_are_refused_before_any_work(setting: dict) -> None:
     (name,) = setting
     with pytest.raises(ValueError, match=name):
         CompactOptions().with_settings(setting)
+
+
+def test_schema_names_come_back() -> None:
+    """Reports and files keep the names of their first versions; one of them now names another setting."""
+    settings = CompactOptions().to_dict()
+    stored = to_schema(settings)
+    assert {"prune", "pull", "dssim", "min_contribution"} <= stored.keys()
+    assert (stored["prune"], stored["min_contribution"]) == (settings["min_contribution"], settings["min_owner_weight"])
+    assert {"mean", "reach_alone"} <= stored["rates"].keys()
+    assert from_schema(stored) == settings
+    assert list(from_schema(stored)) == list(settings)

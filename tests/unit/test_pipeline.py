@@ -45,7 +45,7 @@ def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
 
 def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of both the same ones, and it is said."""
-    monkeypatch.setattr("gsmerge.views.MOST_JUDGED", 2)
+    monkeypatch.setattr("gsmerge.views.MAX_SCORED_VIEWS", 2)
     result = scenes.compacted(scene, fit="none")
     some = scenes.take_views(scene, [0, 2])
     assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)
@@ -57,8 +57,8 @@ def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.Mo
 def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     """Unless it is asked for."""
     full = scenes.compacted(scene).report
-    assert set(USUAL) - set(full.seconds) == {"robust"}
-    assert not {"merge", "merge_scores", "closed"} & set(full.choices)
+    assert set(USUAL) - set(full.seconds) == {"robust", "close"}
+    assert not {"merge", "merge_scores", "closed", "closed_scores"} & set(full.choices)
     assert full.choices["fit"]["method"] == "full"
     asked = scenes.compacted(scene, robust=True).report
     assert list(asked.seconds) == USUAL
@@ -83,7 +83,7 @@ def test_progress_tells_every_step_of_the_full_fit(scene: PixelScene) -> None:
     assert [call[1:] for call in steps] == [(step, 12) for step in range(1, 13)]
     assert all("photos" in name and "held out" in name for name, _, _ in steps)
     assert [name for name, _, _ in calls if not name.startswith("fit:")] == [
-        *(stage for stage in USUAL if stage != "robust"), "done",
+        *(stage for stage in USUAL if stage not in ("robust", "close")), "done",
     ]  # fmt: skip
 
 
@@ -217,11 +217,11 @@ def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -
         for settings in ({"fit": "none"}, {"fit_steps": 12}):
             found = scenes.compacted(one, **settings)
             scores = found.report.choices["start_scores"]
-            learned = scores["learned"] > scores["analytic"]
-            assert ("networks" in found.report.choices) == learned
-            alone = scenes.compacted(one, **settings, checkpoint="shipped" if learned else "none")
+            networks = scores["learned"] > scores["analytic"]
+            assert ("networks" in found.report.choices) == networks
+            alone = scenes.compacted(one, **settings, checkpoint="shipped" if networks else "none")
             assert scenes.identical(found.gaussians, alone.gaussians)
-            starts.add(learned)
+            starts.add(networks)
     assert starts == {False, True}
 
 

@@ -14,7 +14,7 @@ C1, C2 = f4(1e-4), f4(9e-4)  # SSIM's constants for a data range of 1
 
 
 @kernel
-def _gather(row, row_x, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scale, opacity):
+def _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scale, opacity):
     """Gradient row of a Gaussian in the optimiser's parameters: means in units of its size, log, logit."""
     for c in range(3):
         row[MEAN + c] = g_means[k, c] * unit
@@ -48,7 +48,7 @@ def _confine(x, x0, unit, share, limits):
 
 @kernel
 def adam(
-    x, x0, m, v, units, shares, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
+    x, x0, m, v, units, box_shares, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
     first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
     """Adam on the rows ``first`` to ``last`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
@@ -57,7 +57,7 @@ def adam(
     scene. Dense: Gaussians without a gradient (``ids`` rising holds those that have one) coast on their momentum.
 
     Args:
-        shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
+        box_shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
         limits: Of the mean (in sizes), log scale, logit.
         betas: Decay of the first and second moment.
@@ -73,7 +73,7 @@ def adam(
     for i in range(first, last):
         unit = units[i]
         if k < ids.shape[0] and ids[k] == i:
-            _gather(row, x[i], unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
+            _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
             k += 1
         else:
             row[:] = f4(0.0)
@@ -88,7 +88,7 @@ def adam(
             v[i, c] = b2 * v[i, c] + (f4(1.0) - b2) * energy[c]
             move = rates[c] * m[i, c] * c1 / (np.sqrt(v[i, c] * c2) + f4(1e-15))
             x[i, c] -= move * unit if c < SIZE else move
-        _confine(x[i], x0[i], unit, shares[i], limits)
+        _confine(x[i], x0[i], unit, box_shares[i], limits)
         for c in range(3):
             means[i, c], colors[i, c] = x[i, c], x[i, COLOR + c]
             scales[i, c] = np.exp(x[i, SIZE + c])

@@ -1,4 +1,4 @@
-"""Depth order and tile lists: every Gaussian is sorted once, then dealt out to its tiles in that order."""
+"""Depth order and tile lists: every Gaussian is sorted once, then put into the lists of its tiles in that order."""
 
 from __future__ import annotations
 

@@ -23,11 +23,11 @@ def _addresses(context: Any, builder: Any, signature: Any, arguments: Any, array
     made = context.make_array(kind)(context, builder, arguments[array])
     index = context.cast(builder, arguments[at], signature.args[at], types.intp)
     steps = context.get_constant(types.intp, step) if isinstance(step, int) else step
-    found = []
+    pointers = []
     for _ in range(LANES):
-        found.append(cgutils.get_item_pointer(context, builder, kind, made, [index], wraparound=False))
+        pointers.append(cgutils.get_item_pointer(context, builder, kind, made, [index], wraparound=False))
         index = builder.add(index, steps)
-    return found
+    return pointers
 
 
 def _picked(vectors: Sequence[Lanes], lanes: Sequence[int]) -> Lanes:

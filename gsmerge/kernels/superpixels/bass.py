@@ -98,16 +98,16 @@ def label_pass(labels, colours, rows, table, foreign, precision):
                 c0, c1, c2 = colours[y - 1, x - 1, 0], colours[y - 1, x - 1, 1], colours[y - 1, x - 1, 2]
                 across, down, label = np.float32(x - 1), np.float32(y - 1), own
                 best = log_posterior(rows, own, c0, c1, c2, across, down, foreign[mask], precision)
-                for rival in (north, east, south, west):
-                    if rival < 0 or rival == own or rival == label:  # noqa: SIM109 - faster
+                for other in (north, east, south, west):
+                    if other < 0 or other == own or other == label:  # noqa: SIM109 - faster
                         continue
-                    mask = ring_mask(labels, y, x, rival)
+                    mask = ring_mask(labels, y, x, other)
                     if table[mask] == 0:
                         label = own
                         break
-                    score = log_posterior(rows, rival, c0, c1, c2, across, down, foreign[mask], precision)
+                    score = log_posterior(rows, other, c0, c1, c2, across, down, foreign[mask], precision)
                     if score > best:
-                        best, label = score, rival
+                        best, label = score, other
                 if label != own:
                     labels[y, x] = label
                     num_changed += 1

@@ -11,9 +11,9 @@ import numpy as np
 
 from gsmerge.kernels.jit import kernel
 
-# Columns: 0-2 mean colour, 3-4 mean y and x (pixels), then
+# Columns: 0-2 mean colour, 3-4 mean y and x (pixels), then these; nine from PLANE on are sums over the pixels of z²,
+# z²x, z²y, z²xx, z²xy, z²yy, z, zx, zy
 NUM_PIXELS, PLANE, PLANE_ERROR, BOX, ROW = 5, 6, 15, 16, 20
-NUM_SUMS = 9  # sums over the pixels of z², z²x, z²y, z²xx, z²xy, z²yy, z, zx, zy from column PLANE on
 SLOPE_RIDGE = 1e-3  # square pixels; holds the slopes of planes through fewer than three points
 NEVER = 1e18  # box of a region without pixels; sums of two of them still have finite squares
 OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent: these come last, in their own order

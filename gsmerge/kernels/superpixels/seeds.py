@@ -52,9 +52,9 @@ def dither(density):
             x = step if ahead == 1 else width - 1 - step
             noise = np.uint32(noise * np.uint32(1664525) + np.uint32(1013904223))
             threshold = 0.5 + JITTER * ((noise >> np.uint32(8)) / 16777216.0 - 0.5)
-            wanted = density[y, x] + here[x + 1]
-            seeds[y, x] = wanted > threshold
-            error = wanted - (1.0 if seeds[y, x] else 0.0)
+            share = density[y, x] + here[x + 1]
+            seeds[y, x] = share > threshold
+            error = share - (1.0 if seeds[y, x] else 0.0)
             here[x + 1 + ahead] += error * 0.4375
             below[x + 1 - ahead] += error * 0.1875
             below[x + 1] += error * 0.3125

@@ -1,7 +1,7 @@
 """gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
 
-from gsmerge.stages.fit.options import Fit, FitOptions, Rates
+from gsmerge.stages.fit.options import Fit, FitOptions, LearningRates
 from gsmerge.stages.fit.report import FitReport
-from gsmerge.stages.fit.stage import fit, shown, start_share
+from gsmerge.stages.fit.stage import fit, fit_scene, start_share, visible_mask
 
-__all__ = ["Fit", "FitOptions", "FitReport", "Rates", "fit", "shown", "start_share"]
+__all__ = ["Fit", "FitOptions", "FitReport", "LearningRates", "fit", "fit_scene", "start_share", "visible_mask"]

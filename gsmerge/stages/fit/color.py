@@ -44,14 +44,14 @@ class Drawn:
 class _System:
     """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``.
 
-    ``held [n,1]`` is the diagonal of the normal equations of photos that are gone, which the colours solve as they are.
+    ``color_precision [n,1]`` is the diagonal of earlier photos' normal equations, which the present colours solve.
     """
 
     drawn: Drawn
     photos: np.ndarray
     weights: list[np.ndarray]
     gains: np.ndarray
-    held: np.ndarray
+    color_precision: np.ndarray
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
@@ -72,7 +72,7 @@ def fit_colors(
     photos: Photos,
     options: FitOptions,
     seed: int = 0,
-    held: np.ndarray | None = None,
+    color_precision: np.ndarray | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
 
@@ -82,54 +82,59 @@ def fit_colors(
         photos: The input views.
         options: The solver's settings.
         seed: Chooses the held-out blocks.
-        held: ``[n]`` pixels of photos that are gone which each colour was fitted to; None: of none.
+        color_precision: ``[n]`` pixels of photos that are gone which each colour was fitted to; None: of none.
 
     Returns:
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
-    before_these = np.zeros((drawn.count, 1)) if held is None else held[:, None].astype(np.float64)
+    before_these = (
+        np.zeros((drawn.count, 1)) if color_precision is None else color_precision[:, None].astype(np.float64)
+    )
     plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)), before_these)
     before = holdout_psnr(drawn.images, photos, train, options.min_gain)
-    pull = options.pull
+    prior_weight = options.prior_weight
     for _ in range(1 + MAX_RETRIES):
-        system, offsets = _solve(plain, options, pull)
+        system, offsets = _solve(plain, options, prior_weight)
         fitted = parallel_map(partial(_image, plain, offsets=offsets), range(len(photos)))
         after = holdout_psnr(fitted, photos, train, options.min_gain)
         if after > before:
-            offsets = _finish(system, offsets, options, pull)
-            report = FitReport("color", True, options.iterations, before, after, f"solved with a pull of {pull:g}")
+            offsets = _finish(system, offsets, options, prior_weight)
+            report = FitReport("color", True, options.iterations, before, after, f"prior weight {prior_weight:g}")
             return replace(gaussians, sh0=_clamped(gaussians, offsets)), report
-        pull *= 8
+        prior_weight *= 8
     report = FitReport("none", False, options.iterations, before, after, "held-out parts of the photos did not improve")
     return gaussians, report
 
 
-def _solve(plain: _System, options: FitOptions, pull: float) -> tuple[_System, np.ndarray]:
+def _solve(plain: _System, options: FitOptions, prior_weight: float) -> tuple[_System, np.ndarray]:
     """Offsets ``[n,3]`` of the base colours that fit the training pixels, and the system with its final weights.
 
     A third of the steps with plain weights; then pixels that still fit badly count less, exposure is compensated,
     and another third follows.
     """
     steps = max(1, options.iterations // 3)
-    offsets = _conjugate_gradients(plain, np.zeros((plain.drawn.count, 3)), steps, pull)
+    offsets = _conjugate_gradients(plain, np.zeros((plain.drawn.count, 3)), steps, prior_weight)
     system = _reweighed(plain, plain.weights, offsets, options)
-    return system, _conjugate_gradients(system, offsets, steps, pull)
+    return system, _conjugate_gradients(system, offsets, steps, prior_weight)
 
 
-def _finish(system: _System, offsets: np.ndarray, options: FitOptions, pull: float) -> np.ndarray:
+def _finish(system: _System, offsets: np.ndarray, options: FitOptions, prior_weight: float) -> np.ndarray:
     """The last steps, on all pixels."""
     everywhere = [np.ones_like(weight) for weight in system.weights]
     steps = max(1, options.iterations - 2 * (options.iterations // 3))
-    return _conjugate_gradients(_reweighed(system, everywhere, offsets, options), offsets, steps, pull)
+    return _conjugate_gradients(_reweighed(system, everywhere, offsets, options), offsets, steps, prior_weight)
 
 
-def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, pull: float) -> np.ndarray:
-    """Jacobi-preconditioned CG on sum |gain (prior + W x) - photo|^2 + (pull mass + held) |x|^2, from ``x`` on."""
+def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, prior_weight: float) -> np.ndarray:
+    """Jacobi-preconditioned conjugate gradients from ``x`` on.
+
+    They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + color_precision) |x|^2.
+    """
     mass, r = _residual(system, x)
-    back = pull * mass + system.held
+    back = prior_weight * mass + system.color_precision
     r -= back * x
-    inverse = 1 / (mass * (1 + pull) + system.held + 1e-6)
+    inverse = 1 / (mass * (1 + prior_weight) + system.color_precision + 1e-6)
     z = inverse * r
     p, rz = z, (r * z).sum(0)
     for _ in range(iterations):

@@ -13,26 +13,25 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from gsmerge.kernels.gaussians.optimise import C1, C2, COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
+from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
 from gsmerge.render.colored import draw_colored, seen_colors
 from gsmerge.stages.fit.full import KERNELS, Engine, Plan, step_sizes
-from gsmerge.stages.fit.loss import WINDOW
-from gsmerge.stages.fit.options import FitOptions, Rates
+from gsmerge.stages.fit.loss import loss_ssim
+from gsmerge.stages.fit.options import FitOptions, LearningRates
 from gsmerge.stages.fit.state import State, state_of
 from gsmerge.types import SH_C0
 
 
 @dataclass(eq=False)
-class Held:
+class DeviceState:
     """A state's arrays as tensors, which run ahead of it until they are settled.
 
     Args:
         state: The state that they came from.
         x: ``[n,14]`` parameters, see :class:`gsmerge.stages.fit.state.State`, as are the following.
         x0: Where each began.
-        shares: ``[n,1]`` share of the box.
+        box_shares: ``[n,1]`` share of the box.
         m: First moment.
         v: Second moment.
         units: ``[n,1]`` size of each Gaussian.
@@ -42,7 +41,7 @@ class Held:
     state: State
     x: Tensor
     x0: Tensor
-    shares: Tensor
+    box_shares: Tensor
     m: Tensor
     v: Tensor
     units: Tensor
@@ -69,68 +68,70 @@ def start_gpu(device: torch.device) -> None:
 
 def torch_engine(device: torch.device) -> Engine:
     """Steps in torch on a device, for one run."""
-    held: list[Held] = []
+    tensors: list[DeviceState] = []
 
     def step_view(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
-        if not held or held[0].state is not state:  # the first step, or the first after growth
-            held[:] = [upload(state, device)]
-        return torch_step(held[0], plan, view, step, progress, rng)
+        if not tensors or tensors[0].state is not state:  # the first step, or the first after growth
+            tensors[:] = [upload(state, device)]
+        return torch_step(tensors[0], plan, view, step, progress, rng)
 
-    def settle(state: State) -> None:
-        if held and held[0].state is state:
-            download(held[0])
+    def sync(state: State) -> None:
+        if tensors and tensors[0].state is state:
+            download(tensors[0])
 
-    return Engine(step_view, settle)
+    return Engine(step_view, sync)
 
 
-def upload(state: State, device: torch.device) -> Held:
+def upload(state: State, device: torch.device) -> DeviceState:
     """The arrays of a state on a device."""
 
     def tensor(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(device, copy=True)
 
-    arrays = (state.x, state.x0, state.shares[:, None], state.m, state.v, state.units[:, None], state.splats.shN)
-    return Held(state, *(tensor(array) for array in arrays))
+    arrays = (state.x, state.x0, state.box_shares[:, None], state.m, state.v, state.units[:, None], state.splats.shN)
+    return DeviceState(state, *(tensor(array) for array in arrays))
 
 
-def download(held: Held) -> None:
+def download(tensors: DeviceState) -> None:
     """Bring the state's arrays up to date with the tensors."""
-    state = held.state
+    state = tensors.state
     for name in ("x", "m", "v"):
-        getattr(state, name)[...] = getattr(held, name).cpu().numpy()
+        getattr(state, name)[...] = getattr(tensors, name).cpu().numpy()
     fresh = state_of(state.x, state.splats.shN)
     for name in ("means", "quats", "scales", "opacities"):
         getattr(state.splats, name)[...] = getattr(fresh.splats, name)
     state.colors[...] = fresh.colors
 
 
-def torch_step(held: Held, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
+def torch_step(
+    tensors: DeviceState, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator
+) -> float:
     """:func:`gsmerge.stages.fit.full.fit_step` on tensors -> mean squared error of the view's training pixels."""
-    level = 1 if progress < plan.options.coarse_share else 0
+    level = 1 if progress < plan.options.half_res_part else 0
     photos = plan.photos[level]
-    photo = torch.from_numpy(photos.images[view]).to(held.x)
-    weight = torch.from_numpy(plan.step_weights[level][view]).to(held.x)
+    photo = torch.from_numpy(photos.images[view]).to(tensors.x)
+    weight = torch.from_numpy(plan.step_weights[level][view]).to(tensors.x)
     background = rng.random(3, dtype=np.float32)
-    means, quats, scales, opacities = shape_of(held.x)
+    means, quats, scales, opacities = shape_of(tensors.x)
     drawn = opacities
     if plan.dropout > 0:
-        kept = torch.from_numpy(rng.random(len(held.x), dtype=np.float32) >= plan.dropout).to(held.x.device)
+        kept = torch.from_numpy(rng.random(len(tensors.x), dtype=np.float32) >= plan.dropout).to(tensors.x.device)
         drawn = kept * (opacities / (1 - plan.dropout)).clamp_max(0.99)
     camera = photos.camera(view)
     with torch.enable_grad():
         leaves = [
             tensor.detach().contiguous().requires_grad_()
-            for tensor in (means, quats, scales, drawn, view_colors(held, means, camera["viewmat"]))
+            for tensor in (means, quats, scales, drawn, view_colors(tensors, means, camera["viewmat"]))
         ]
         image, reached = draw_colored((leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], camera, background)
-        loss = image_loss(image, photo, weight, plan.options.dssim)
-        wanted = torch.autograd.grad(loss, leaves)
+        loss = image_loss(image, photo, weight, plan.options.ssim_lambda)
+        gradients = torch.autograd.grad(loss, leaves)
     with torch.no_grad():
-        slope, each = (opacities * (1 - opacities))[:, None], reached[:, None] / max(len(held.x), 1)
-        fade = wanted[3][:, None] + plan.options.opacity_pull * each
-        shrink = wanted[2] + plan.options.size_pull * each / held.units
-        rows = (wanted[0] * held.units, shrink * scales, wanted[1], fade * slope, wanted[4])
-        adam_step(held, torch.cat(rows, 1), plan.options, progress, step)
+        slope, each = (opacities * (1 - opacities))[:, None], reached[:, None] / max(len(tensors.x), 1)
+        fade = gradients[3][:, None] + plan.options.opacity_reg * each
+        shrink = gradients[2] + plan.options.scale_reg * each / tensors.units
+        rows = (gradients[0] * tensors.units, shrink * scales, gradients[1], fade * slope, gradients[4])
+        adam_step(tensors, torch.cat(rows, 1), plan.options, progress, step)
         return mean_error(image, photo, weight)
 
 
@@ -139,29 +140,24 @@ def shape_of(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid()
 
 
-def view_colors(held: Held, means: Tensor, viewmat: np.ndarray) -> Tensor:
+def view_colors(tensors: DeviceState, means: Tensor, viewmat: np.ndarray) -> Tensor:
     """``[n,3]`` colours in a view: as they are, or through the harmonics."""
-    colors = held.x[:, COLOR:]
-    if held.shN.shape[1] == 0:
+    colors = tensors.x[:, COLOR:]
+    if tensors.shN.shape[1] == 0:
         return colors
-    return seen_colors(means, ((colors - 0.5) / SH_C0)[:, None], held.shN, viewmat)
+    return seen_colors(means, ((colors - 0.5) / SH_C0)[:, None], tensors.shN, viewmat)
 
 
-def image_loss(image: Tensor, photo: Tensor, weight: Tensor, dssim: float) -> Tensor:
+def image_loss(image: Tensor, photo: Tensor, weight: Tensor, ssim_lambda: float) -> Tensor:
     """The loss whose gradient :func:`gsmerge.stages.fit.loss.image_gradient` is: L1 and structural similarity.
 
     Args:
         image: ``[h,w,3]``.
         photo: ``[h,w,3]``.
         weight: ``[h,w]`` weights of the pixels.
-        dssim: Share of structural similarity, over windows of 7 x 7, zero beyond the border.
+        ssim_lambda: Share of structural similarity, see :func:`gsmerge.stages.fit.loss.loss_ssim`.
     """
-    stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
-    mx, my, xx, yy, xy = avg_pool2d(stacked, WINDOW, 1, WINDOW[0] // 2).permute(0, 2, 3, 1)
-    c1, c2 = float(C1), float(C2)
-    above = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
-    similarity = above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
-    each = (1 - dssim) * (image - photo).abs() + dssim * (1 - similarity)
+    each = (1 - ssim_lambda) * (image - photo).abs() + ssim_lambda * (1 - loss_ssim(image, photo))
     return (weight[..., None] * each).sum() / weight.numel()
 
 
@@ -171,31 +167,31 @@ def mean_error(image: Tensor, photo: Tensor, weight: Tensor) -> float:
     return float(error / (3 * weight.sum(dtype=torch.float64)).clamp_min(1))
 
 
-def adam_step(held: Held, gradient: Tensor, options: FitOptions, progress: float, step: int) -> None:
+def adam_step(tensors: DeviceState, gradient: Tensor, options: FitOptions, progress: float, step: int) -> None:
     """Adam on a gradient ``[n,14]``, then the box: :func:`gsmerge.kernels.gaussians.optimise.adam` on tensors."""
     rates, energy = options.rates, gradient * gradient
     for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
         energy[:, shared] = energy[:, shared].sum(1, keepdim=True) / 3  # degrees of freedom, of a rotation too
-    held.m.lerp_(gradient, 1 - rates.beta1)
-    held.v.lerp_(energy, 1 - rates.beta2)
-    first, second = held.m / (1 - rates.beta1**step), held.v / (1 - rates.beta2**step)
-    move = torch.from_numpy(step_sizes(rates, progress, options.steps)).to(held.x) * first / (second.sqrt() + 1e-15)
-    move[:, :SIZE] *= held.units
-    confine(held, held.x - move, rates)
+    tensors.m.lerp_(gradient, 1 - rates.beta1)
+    tensors.v.lerp_(energy, 1 - rates.beta2)
+    first, second = tensors.m / (1 - rates.beta1**step), tensors.v / (1 - rates.beta2**step)
+    move = torch.from_numpy(step_sizes(rates, progress, options.steps)).to(tensors.x) * first / (second.sqrt() + 1e-15)
+    move[:, :SIZE] *= tensors.units
+    confine(tensors, tensors.x - move, rates)
 
 
-def confine(held: Held, x: Tensor, rates: Rates) -> None:
+def confine(tensors: DeviceState, x: Tensor, rates: LearningRates) -> None:
     """New parameters, brought into the box about the start."""
-    x0 = held.x0
+    x0 = tensors.x0
     offset = x[:, :SIZE] - x0[:, :SIZE]
-    far, reach = offset.norm(dim=1, keepdim=True), held.shares * rates.reach_mean * held.units
+    far, reach = offset.norm(dim=1, keepdim=True), tensors.box_shares * rates.max_mean_shift * tensors.units
     x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])
     sizes, logits, colors = x0[:, SIZE:QUAT], x0[:, LOGIT], x0[:, COLOR:]
-    grown = held.shares * rates.reach_size
+    grown = tensors.box_shares * rates.max_scale_change
     x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown)
-    logit = x[:, LOGIT].clamp(logits - rates.reach_logit, logits + rates.reach_logit)
+    logit = x[:, LOGIT].clamp(logits - rates.max_opacity_change, logits + rates.max_opacity_change)
     x[:, LOGIT] = logit.clamp(float(MIN_LOGIT), float(MAX_LOGIT))
     x[:, COLOR:] = x[:, COLOR:].clamp(colors.clamp_max(-0.05), colors.clamp_min(1.05))
     norm = x[:, QUAT:LOGIT].norm(dim=1, keepdim=True)
     x[:, QUAT:LOGIT] = torch.where(norm > 0, x[:, QUAT:LOGIT] / norm, 0)
-    held.x = x
+    tensors.x = x

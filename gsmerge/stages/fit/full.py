@@ -16,20 +16,23 @@ import numpy as np
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.gradient import plan_gradients
-from gsmerge.render.photos import Photos
+from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import LONG_STEPS, FitOptions, Rates
+from gsmerge.stages.fit.options import LONG_STEPS, FitOptions, LearningRates
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
 from gsmerge.types import Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
 GROWTH = 0.5  # part of the run after which Gaussians are added
-FEW_VIEWS, MANY_STEPS, DROPOUT, LONG_DROPOUT = 5, 150, 0.1, 0.05
-PROBE = 6  # steps that are timed to spend a time budget
+FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
+MANY_STEPS = 150
+DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
+LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS, whatever the views
+PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 
@@ -45,8 +48,8 @@ class Plan:
     Args:
         photos: At full and at half size.
         weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
-            neither steps nor scores look at, 1 elsewhere.
-        step_weights: The same as a step looks at them: 0 on hidden pixels, and full size looks at held-out blocks, too.
+            neither steps nor scores use, 1 elsewhere.
+        step_weights: The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too.
         options: What a step does.
         dropout: Share of the Gaussians that a step leaves out.
     """
@@ -59,11 +62,11 @@ class Plan:
 
 
 def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
-    """Held-out blocks, pixels that are not looked at, and dropout where there are few views."""
+    """Held-out blocks, hidden pixels, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
-    usual = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
-    dropout = usual if options.dropout is None else options.dropout
+    default = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0
+    dropout = default if options.dropout is None else options.dropout
     weights = full, reduced(full, photos[1])
     if masks is not None:
         weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
@@ -79,7 +82,7 @@ def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
 
 def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """One Adam step on one view -> mean squared error of its training pixels."""
-    level = 1 if progress < plan.options.coarse_share else 0
+    level = 1 if progress < plan.options.half_res_part else 0
     photos = plan.photos[level]
     weight = plan.step_weights[level][view]
     background, opacities = rng.random(3, dtype=np.float32), None
@@ -89,19 +92,19 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     drawn = plan_view(state.splats, **photos.camera(view), opacities=opacities)
     colors = state.view_colors()
     image, transmittance = composite(drawn, colors, background)
-    gradient = image_gradient(image, photos.images[view], weight, plan.options.dssim)
+    gradient = image_gradient(image, photos.images[view], weight, plan.options.ssim_lambda)
     g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
     rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
-    g.opacities[:] += np.float32(plan.options.opacity_pull / count)
-    g.scales[:] += np.float32(plan.options.size_pull / count) / state.units[g.ids, None]
+    g.opacities[:] += np.float32(plan.options.opacity_reg / count)
+    g.scales[:] += np.float32(plan.options.scale_reg / count) / state.units[g.ids, None]
     steps = step_sizes(rates, progress, plan.options.steps)
-    limits = np.array([rates.reach_mean, rates.reach_size, rates.reach_logit], np.float32)
+    limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
     betas = np.array([rates.beta1, rates.beta2], np.float32)
 
     def update(first: int) -> None:
         last = min(first + ROWS, len(state.x))
         kernels.adam(
-            state.x, state.x0, state.m, state.v, state.units, state.shares, g.ids,
+            state.x, state.x0, state.m, state.v, state.units, state.box_shares, g.ids,
             g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, step,
             first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
         )  # fmt: skip
@@ -117,27 +120,27 @@ class Engine:
 
     Args:
         step: One step on one view, as :func:`fit_step`, which may leave the state's arrays behind.
-        settle: Brings the state's arrays up to date, before anything else looks at them.
+        sync: Brings the state's arrays up to date, before anything else reads them.
     """
 
     step: Callable[[State, Plan, int, int, float, np.random.Generator], float]
-    settle: Callable[[State], None]
+    sync: Callable[[State], None]
 
 
 KERNELS = Engine(fit_step, lambda state: None)
 
 
-def step_sizes(rates: Rates, progress: float, steps: int) -> np.ndarray:
+def step_sizes(rates: LearningRates, progress: float, steps: int) -> np.ndarray:
     """Step of each of the fourteen columns at a point of the run, decaying geometrically; farther in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
-    columns = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
-    return (np.array(columns) * decay**progress).astype(np.float32)
+    each = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
+    return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)
 
 
-def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
+def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray]:
     """PSNR (dB) of the half-size held-out blocks, and ``[n]`` float32 the share of its box that each Gaussian may use.
 
-    The share is ``reach_alone`` to 1, by how many photos show a Gaussian: the effective number of them,
+    The share is ``single_view_share`` to 1, by how many photos show a Gaussian: the effective number of them,
     (sum w)^2 / sum w^2 of its blending weights w in them.
     """
     photos, colors = plan.photos[1], state.view_colors()
@@ -154,29 +157,23 @@ def first_look(state: State, plan: Plan) -> tuple[float, np.ndarray]:
         sums += weights
         squares += weights**2
     photos_each = sums**2 / np.maximum(squares, 1e-12)
-    shares = np.clip(photos_each - 1, plan.options.rates.reach_alone, 1).astype(np.float32)
-    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), shares
+    box_shares = np.clip(photos_each - 1, plan.options.rates.single_view_share, 1).astype(np.float32)
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), box_shares
 
 
 def holdout_score(state: State, plan: Plan) -> float:
     """PSNR (dB) of the half-size held-out blocks."""
-    photos, colors = plan.photos[1], state.view_colors()
-
-    def one_view(view: int) -> np.ndarray:
-        drawn = plan_view(state.splats, **photos.camera(view))
-        return composite(drawn, colors)[0]
-
-    images = parallel_map(one_view, range(len(photos)))
-    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain)
+    images = render_photos(state.splats, plan.photos[1], colors=state.view_colors())
+    return holdout_psnr(images, plan.photos[1], plan.weights[1], plan.options.min_gain)
 
 
-def score_to_beat(own: float, rival: Gaussians | None, plan: Plan) -> float:
-    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a rival that shows them worse.
+def score_to_beat(own: float, baseline_start: Gaussians | None, plan: Plan) -> float:
+    """PSNR (dB) of the held-out blocks that a fit has to beat: of its start, or of a worse baseline start.
 
-    Networks have learnt to show the photos whole. A fit of the rest takes from the blocks of what they made, and yet
-    helps new views; the start without networks is then what it is compared with.
+    Networks learn to show whole photos. A fit to the other blocks then makes the held-out ones worse and new views
+    better, so it is compared with the start without networks.
     """
-    return own if rival is None else min(own, holdout_score(start_state(rival), plan))
+    return own if baseline_start is None else min(own, holdout_score(start_state(baseline_start), plan))
 
 
 def fit_full(
@@ -188,12 +185,12 @@ def fit_full(
     progress: Progress | None = None,
     engine: Engine = KERNELS,
     masks: Masks | None = None,
-    rival: Gaussians | None = None,
+    baseline_start: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos.
 
-    Two states can be returned, judged by blocks of the photos that the half-size steps do not look at: the start, or
-    the end if the blocks were better after those steps. The full-size steps then look at everything.
+    Two states can be returned, judged by blocks of the photos that the half-size steps leave out: the start, or
+    the end if the blocks were better after those steps. The full-size steps then use every block.
 
     Args:
         gaussians: Canonical Gaussians.
@@ -201,24 +198,24 @@ def fit_full(
         options: Steps, rates, limits.
         count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
         seed: Order of the views, backgrounds, dropout, held-out blocks.
-        progress: Told after every step.
-        engine: What it steps with.
-        masks: Pixels that are looked at; None: all. Where no Gaussian is, none should be drawn to.
-        rival: Another start that the fit may beat instead, see :func:`score_to_beat`.
+        progress: Called after every step.
+        engine: What takes the steps.
+        masks: Pixels that count; None: all. Where no Gaussian is, none should be drawn to.
+        baseline_start: Another start that the fit may beat instead, see :func:`score_to_beat`.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
-    own, state.shares[:] = first_look(state, plan)
-    after = before = score_to_beat(own, rival, plan)
+    own, state.box_shares[:] = initial_scores(state, plan)
+    after = before = score_to_beat(own, baseline_start, plan)
     queue: list[int] = []
     grows = options.grows
     step, steps, started, error, judged = 0, options.steps, time.perf_counter(), 0.0, False
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
-            engine.settle(state)
+            engine.sync(state)
             state = grow_to(state, photos[1], count)
-        if part >= options.coarse_share and not judged:
-            engine.settle(state)
+        if part >= options.half_res_part and not judged:
+            engine.sync(state)
             after, judged = holdout_score(state, plan), True
             if after <= before:
                 break
@@ -230,7 +227,7 @@ def fit_full(
             steps = affordable_steps(time.perf_counter() - started, plan)
         if progress:
             progress(step, steps, -10 * np.log10(max(error, 1e-12)), after)
-    engine.settle(state)
+    engine.sync(state)
     after = after if judged else holdout_score(state, plan)
     if after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
@@ -246,7 +243,7 @@ def affordable_steps(seconds: float, plan: Plan) -> int:
 
     A step at full size costs up to three times as much.
     """
-    budget, coarse = plan.options.time_budget, plan.options.coarse_share
+    budget, coarse = plan.options.time_budget, plan.options.half_res_part
     assert budget is not None
     mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse))
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

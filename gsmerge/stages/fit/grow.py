@@ -73,5 +73,5 @@ def grow(state: State, photos: Photos, count: int) -> State:
     old = np.ones(len(x), bool)
     old[picked] = old[len(state.x) :] = False
     grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
-    grown.m[:], grown.v[:], grown.shares[:] = state.m[source], state.v[source], state.shares[source]
+    grown.m[:], grown.v[:], grown.box_shares[:] = state.m[source], state.v[source], state.box_shares[source]
     return grown

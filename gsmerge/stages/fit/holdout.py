@@ -1,4 +1,4 @@
-"""Blocks of the photos that a fit does not look at, to judge it by."""
+"""Blocks of the photos that a fit leaves out, to judge it by."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray
     def one_view(view: int) -> np.ndarray:
         rows, columns = -(-photos.height // size), -(-photos.width // size)
         random = np.random.default_rng([seed, view])
-        held = random.random((rows, columns)) < share
-        if not held.any():
-            held[random.integers(rows), random.integers(columns)] = rows * columns > 1
-        full = np.repeat(np.repeat(~held, size, 0), size, 1)[: photos.height, : photos.width]
+        blocks = random.random((rows, columns)) < share
+        if not blocks.any():
+            blocks[random.integers(rows), random.integers(columns)] = rows * columns > 1
+        full = np.repeat(np.repeat(~blocks, size, 0), size, 1)[: photos.height, : photos.width]
         return full.astype(np.float32)
 
     return [one_view(view) for view in range(len(photos))]
@@ -43,13 +43,13 @@ def holdout_psnr(images: list[np.ndarray], photos: Photos, weights: list[np.ndar
         min_gain: Exposure against the mean, as a factor, from which on it is set aside.
     """
     views = range(len(photos))
-    shown = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
-    gains = exposure_gains(shown, photos.images, weights, min_gain)
+    clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
+    gains = exposure_gains(clipped, photos.images, weights, min_gain)
 
     def one_view(view: int) -> tuple[float, float]:
-        error = ((shown[view] * gains[view] - photos.images[view]) ** 2).sum(-1)
-        held = weights[view] == 0
-        return float(error[held].sum(dtype=np.float64)), float(held.sum())
+        error = ((clipped[view] * gains[view] - photos.images[view]) ** 2).sum(-1)
+        mask = weights[view] == 0
+        return float(error[mask].sum(dtype=np.float64)), float(mask.sum())
 
     error, count = np.sum(parallel_map(one_view, views), axis=0)
     return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))

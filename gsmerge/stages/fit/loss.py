@@ -1,29 +1,48 @@
-"""The image loss of the full fit: L1 and structural similarity."""
+"""The image loss of the full fit: L1 and structural similarity.
+
+The structural similarity of the loss, :func:`loss_ssim`, is that of training too. It has uniform windows, which are
+quick to differentiate, so its values differ from the measured ones of :func:`gsmerge.render.metrics.ssim`.
+"""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from gsmerge.kernels.gaussians.optimise import similarity_terms
+from gsmerge.kernels.gaussians.optimise import C1, C2, similarity_terms
 from gsmerge.runtime.threads import parallel_map
 
-WINDOW = (7, 7)
+LOSS_WINDOW = 7  # pixels per side of the windows of loss_ssim
 
 
 def _box(array: np.ndarray) -> np.ndarray:
     """Window means; zero beyond the border, so that the operator is its own transpose."""
-    return cv2.blur(array, WINDOW, borderType=cv2.BORDER_CONSTANT)
+    return cv2.blur(array, (LOSS_WINDOW, LOSS_WINDOW), borderType=cv2.BORDER_CONSTANT)
 
 
-def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dssim: float) -> np.ndarray:
+def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
+    """``[h,w,3]`` structural similarity of the loss about every pixel of images ``[h,w,3]``, differentiable.
+
+    Uniform windows of 7 x 7 pixels, zero beyond the border, population covariances, K1 = .01, K2 = .03.
+    """
+    stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
+    mx, my, xx, yy, xy = avg_pool2d(stacked, LOSS_WINDOW, 1, LOSS_WINDOW // 2).permute(0, 2, 3, 1)
+    c1, c2 = float(C1), float(C2)
+    above = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
+    return above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
+
+
+def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float) -> np.ndarray:
     """Gradient of the loss (1 - dssim) |image - photo| + dssim (1 - SSIM), per pixel of the image.
 
     Args:
         image: ``[h,w,3]`` float32.
         photo: ``[h,w,3]`` float32.
         weight: ``[h,w]`` float32 weights of the pixels.
-        dssim: Share of structural similarity (windows of 7 x 7).
+        ssim_lambda: Share of structural similarity, see :func:`loss_ssim`.
 
     Returns:
         ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size.
@@ -36,7 +55,7 @@ def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, dss
     from_square *= image
     from_cross *= photo
     similarity = from_mean + 2 * from_square + from_cross
-    gradient = np.float32(1 - dssim) * channels * np.sign(image - photo) - np.float32(dssim) * similarity
+    gradient = np.float32(1 - ssim_lambda) * channels * np.sign(image - photo) - np.float32(ssim_lambda) * similarity
     gradient /= np.float32(image.shape[0] * image.shape[1])
     return gradient
 

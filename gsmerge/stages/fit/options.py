@@ -14,37 +14,37 @@ GROW_STEPS = 150  # shorter runs do better when they begin with all that they ma
 
 
 @dataclass(frozen=True)
-class Rates:
+class LearningRates:
     """How far a step of the full fit may go, and how far all of them together.
 
     Args:
-        mean: Step of a mean, in units of the Gaussian's size.
-        size: Step of a log scale.
-        quat: Step of a quaternion.
-        logit: Step of an opacity's logit.
-        color: Step of a colour, sRGB in [0, 1].
+        means_lr: Step of a mean, in units of the Gaussian's size.
+        scales_lr: Step of a log scale.
+        quats_lr: Step of a quaternion.
+        opacities_lr: Step of an opacity's logit.
+        colors_lr: Step of a colour, sRGB in [0, 1].
         decay: Factor on all steps at the end of the run; runs of more than 300 steps end lower in proportion.
         beta1: Decay of Adam's first moment.
         beta2: Decay of its second moment.
-        reach_mean: Farthest that a mean may go from its start, in units of the Gaussian's size.
-        reach_size: Largest change of a log scale.
-        reach_logit: Largest change of an opacity's logit.
-        reach_alone: Share of the reach of mean and size that a Gaussian has which one photo alone shows: that photo
-            says what it looks like, not where it is. From two photos on the reach is whole.
+        max_mean_shift: Farthest that a mean may go from its start, in units of the Gaussian's size.
+        max_scale_change: Largest change of a log scale.
+        max_opacity_change: Largest change of an opacity's logit.
+        single_view_share: Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
+            says what it looks like, not where it is. From two photos on the limits are whole.
     """
 
-    mean: float = 0.1
-    size: float = 0.2
-    quat: float = 0.03
-    logit: float = 0.3
-    color: float = 0.03
+    means_lr: float = 0.1
+    scales_lr: float = 0.2
+    quats_lr: float = 0.03
+    opacities_lr: float = 0.3
+    colors_lr: float = 0.03
     decay: float = 0.2
     beta1: float = 0.7
     beta2: float = 0.99
-    reach_mean: float = 2.0
-    reach_size: float = 2.5
-    reach_logit: float = 4.0
-    reach_alone: float = 0.3
+    max_mean_shift: float = 2.0
+    max_scale_change: float = 2.5
+    max_opacity_change: float = 4.0
+    single_view_share: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -58,22 +58,23 @@ class FitOptions:
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
-            more, where the photos alone would be learnt by heart, otherwise 0.05 from 600 steps on and 0 below.
-        coarse: Share of the steps that look at half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all.
-        dssim: Share of structural similarity in the loss, the rest is L1.
-        opacity_pull: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
+            more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
+        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all.
+        ssim_lambda: Share of structural similarity in the loss, the rest is L1.
+        opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
             the photos do not need fades, instead of standing in front of other views.
-        size_pull: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
+        scale_reg: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
             a step takes a third less time.
         rates: Steps and limits of the full fit.
         iterations: Conjugate-gradient steps of the colour fit.
-        pull: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
+        prior_weight: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
         huber: Colour error beyond which a pixel counts less (moving things, reflections).
         min_gain: Exposure of a view against the mean, as a factor, from which on the colour fit compensates it;
             smaller differences come from holes and highlights as often as from the camera.
         max_gain: Largest exposure factor that is believed.
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
-        prune: Leave out Gaussians that contribute less than this to every pixel of every photo that they lie in.
+        min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
+            lie in are left out.
         device: Where the full fit's steps run: ``"cpu"``; ``"cuda"``, through gsplat, whose sums have no fixed order,
             so that runs differ in the last bits; ``"auto"``: CUDA where it can be used, resolved at once.
 
@@ -86,18 +87,18 @@ class FitOptions:
     fit_steps: int | None = None
     time_budget: float | None = None
     dropout: float | None = None
-    coarse: float | None = None
-    dssim: float = 0.2
-    opacity_pull: float = 0.03
-    size_pull: float = 0.01
-    rates: Rates = field(default_factory=Rates)
+    half_res_share: float | None = None
+    ssim_lambda: float = 0.2
+    opacity_reg: float = 0.03
+    scale_reg: float = 0.01
+    rates: LearningRates = field(default_factory=LearningRates)
     iterations: int = 6
-    pull: float = 0.03
+    prior_weight: float = 0.03
     huber: float = 0.2
     min_gain: float = 1.15
     max_gain: float = 2.0
     holdout: float = 0.05
-    prune: float = 1 / 255
+    min_contribution: float = 1 / 255
     device: Device = "cpu"
 
     @property
@@ -106,16 +107,16 @@ class FitOptions:
         return STEPS[self.effort] if self.fit_steps is None else self.fit_steps
 
     @property
-    def coarse_share(self) -> float:
-        """Share of the steps that look at half-size photos."""
-        if self.coarse is not None:
-            return self.coarse
+    def half_res_part(self) -> float:
+        """Share of the steps on half-size photos."""
+        if self.half_res_share is not None:
+            return self.half_res_share
         return 1.0 if self.steps < HASTY_STEPS else 0.5 if self.steps >= LONG_STEPS else 0.7
 
     @property
-    def looks(self) -> bool:
-        """Whether the photos are looked at: to fit, or to leave out what none of them shows."""
-        return self.fit != "none" or (self.prune > 0 and self.effort != "draft")
+    def needs_photos(self) -> bool:
+        """Whether the photos are needed: to fit, or to leave out what none of them shows."""
+        return self.fit != "none" or (self.min_contribution > 0 and self.effort != "draft")
 
     @property
     def grows(self) -> bool:
@@ -124,7 +125,7 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         if isinstance(self.rates, dict):  # as CompactOptions.to_dict() and JSON have it
-            object.__setattr__(self, "rates", Rates(**self.rates))
+            object.__setattr__(self, "rates", LearningRates(**self.rates))
         if self.fit not in ("none", "color", "full"):
             raise ValueError(f'fit: expected "none", "color" or "full", got "{self.fit}"')
         if self.effort not in STEPS:
@@ -133,12 +134,12 @@ class FitOptions:
             raise ValueError(f"fit_steps: expected at least 1, got {self.steps}")
         if self.iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
-        for name in ("pull", "opacity_pull", "size_pull"):
+        for name in ("prior_weight", "opacity_reg", "scale_reg"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
-        for name in ("coarse", "dssim", "prune"):
+        for name in ("half_res_share", "ssim_lambda", "min_contribution"):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise ValueError(f"{name}: expected a number from 0 to 1, got {value}")

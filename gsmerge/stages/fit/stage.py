@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import torch
 
-from gsmerge.render import composite, contributions, plan_view, prepare
-from gsmerge.render.photos import Photos
-from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render.photos import Photos, photo_errors, scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.device import engine_for
 from gsmerge.stages.fit.full import Progress, fit_full
@@ -17,11 +18,49 @@ from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import gaussians_of, start_state
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
-CLOSE = 1.0  # dB of the held-out blocks: less is looked at twice
+CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
+
+
+def fit_scene(
+    gaussians: Gaussians,
+    scene: PixelScene | UnalignedScene,
+    options: FitOptions,
+    count: int,
+    *,
+    exact: bool = False,
+    seed: int = 0,
+    log: RunLog,
+    baseline_start: Gaussians | None = None,
+) -> Gaussians:
+    """Leave out what no photo of a scene shows, and fit the rest to the photos; nothing without photos.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        scene: The canonical scene.
+        options: What to fit.
+        count: Number of Gaussians that the full fit may grow to.
+        exact: Whether that number is to be met.
+        seed: Everything random.
+        log: Takes seconds, progress, what was done, and a note where the fit was not accepted.
+        baseline_start: See :func:`fit`.
+    """
+    if scene.images is None or not options.needs_photos:
+        return gaussians
+    if exact and not options.grows:  # nothing grows to the number asked for, so nothing may fall below it either
+        options = replace(options, min_contribution=0.0)
+    log.choices["begun_with"] = len(gaussians)
+    with log.stage("fit"):
+        photos = scene_photos(scene), scene_photos(scene, 2)
+        gaussians, report = fit(gaussians, photos, options, count, seed, log.fit_progress, baseline_start)
+    if report:
+        log.choices["fit"] = asdict(report)
+        if not report.accepted:
+            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
+    return gaussians
 
 
 def fit(
@@ -31,7 +70,7 @@ def fit(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
-    rival: Gaussians | None = None,
+    baseline_start: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
@@ -44,19 +83,22 @@ def fit(
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
         progress: Told after every step of the full fit.
-        rival: Another start that the full fit has to beat instead, see :func:`gsmerge.stages.fit.full.score_to_beat`.
+        baseline_start: Another start that the full fit may beat instead, see
+            :func:`gsmerge.stages.fit.full.score_to_beat`.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    if not options.looks:  # it costs as much as all that was done before
+    if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
-    keep = shown(gaussians, photos[1], options.prune)
+    keep = visible_mask(gaussians, photos[1], options.min_contribution)
     if options.fit == "none":
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, count, seed, progress, engine_for(options.device), None, rival)
+        fitted, report = fit_full(
+            kept, photos, options, count, seed, progress, engine_for(options.device), None, baseline_start
+        )
         fitted, report = _better_of(kept, fitted, report, photos[0])
         if report.accepted:
             return fitted, report
@@ -69,13 +111,13 @@ def fit(
     return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
 
 
-def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> torch.Tensor:
     """``[n]`` mask of the Gaussians worth keeping.
 
     Args:
         gaussians: n Gaussians.
         photos: The views that they may show in.
-        least: Largest blending weight at a pixel that is too little. What lies in no photo's frustum stays.
+        min_weight: Least blending weight at some pixel. What lies in no photo's frustum stays.
     """
     splats = prepare(gaussians)
 
@@ -87,16 +129,16 @@ def shown(gaussians: Gaussians, photos: Photos, least: float) -> torch.Tensor:
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
-    return torch.from_numpy(~inside | (peak >= least))
+    return torch.from_numpy(~inside | (peak >= min_weight))
 
 
 def _better_of(
     before: Gaussians, after: Gaussians, report: FitReport, photos: Photos, close: float = CLOSE
 ) -> tuple[Gaussians, FitReport]:
-    """The fitted Gaussians, but where they began if the held-out blocks hardly gained and the photos as a whole lost.
+    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
 
-    Gaussians that were fitted already are where steps of the usual size only stir. A gain of ``close`` dB or more is
-    not looked at twice.
+    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
+    more the photos are not compared.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report
@@ -107,13 +149,11 @@ def _better_of(
 
 def _photos_error(gaussians: Gaussians, photos: Photos) -> float:
     """Mean squared error of all photos."""
-    splats = prepare(gaussians)
 
-    def one_view(view: int) -> float:
-        image, _ = composite(plan_view(splats, **photos.camera(view)))
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
 
-    return float(np.mean(parallel_map(one_view, range(len(photos)))))
+    return float(np.mean(photo_errors(gaussians, photos, score)))
 
 
 def start_share(options: FitOptions) -> float:

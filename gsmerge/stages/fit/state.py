@@ -22,7 +22,7 @@ class State:
         m: First moment.
         v: Second moment.
         units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales when it began.
-        shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
+        box_shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
         splats: Means, quaternions, scales and opacities as the rasterizer takes them.
         colors: ``[n,3]`` base colours.
     """
@@ -32,7 +32,7 @@ class State:
     m: np.ndarray
     v: np.ndarray
     units: np.ndarray
-    shares: np.ndarray
+    box_shares: np.ndarray
     splats: Splats
     colors: np.ndarray
 

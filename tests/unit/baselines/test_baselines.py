@@ -1,4 +1,4 @@
-"""Every rival method: its count, its order, and what defines it."""
+"""Every baseline: its count, its order, and what defines it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 
 from gsmerge import CompactOptions, Gaussians, PixelScene, compact
 from gsmerge.baselines import BASELINES
-from gsmerge.baselines.contribution import summed_weights
+from gsmerge.baselines.simple import summed_weights
 from gsmerge.cli.options import Method
 from gsmerge.errors import UsageError
 from gsmerge.options import METHODS
@@ -79,7 +79,9 @@ def test_a_run_repeats_on_any_number_of_threads(scene: PixelScene, method: str) 
 @pytest.mark.parametrize("method", OWN)
 def test_scenes_without_an_order(scene: PixelScene, method: str) -> None:
     if method == "blocks":
-        with pytest.raises(UsageError, match="method blocks: expected one Gaussian per pixel, found them in no order"):
+        with pytest.raises(
+            UsageError, match="method blocks: expected one Gaussian per pixel, found an unaligned scene"
+        ):
             compact(loose.shuffled(scene), method=method)
         return
     result = compact(loose.shuffled(scene), method=method, budget=COUNT, fit_steps=4)
@@ -136,11 +138,9 @@ def test_unknown_methods_are_refused() -> None:
 
 def test_settings_without_effect_are_told(scene: PixelScene) -> None:
     assert made(scene, "voxel", seed=3, threads=1).report.notes == []
-    assert made(scene, "voxel", effort="best", match="none").report.notes == [
-        "method voxel does not look at effort, match"
-    ]
+    assert made(scene, "voxel", effort="best", match="none").report.notes == ["method voxel does not use effort, match"]
     assert made(scene, "unmerged-fit", budget=None, effort="fast").report.notes == []
-    assert made(scene, "unmerged").report.notes == ["method unmerged does not look at budget"]
+    assert made(scene, "unmerged").report.notes == ["method unmerged does not use budget"]
 
 
 def test_only_its_stages_are_timed(scene: PixelScene) -> None:
@@ -171,7 +171,7 @@ def test_the_same_fit_for_the_input(scene: PixelScene) -> None:
     """By steps, or by time; whatever ``fit`` says."""
     found = made(scene, "unmerged-fit", fit_steps=20, fit="color")
     assert (found.report.choices["fit"]["method"], found.report.choices["fit"]["steps"]) == ("full", 20)
-    assert "method unmerged-fit does not look at fit, budget" in found.report.notes
+    assert "method unmerged-fit does not use fit, budget" in found.report.notes
     limited = made(scene, "unmerged-fit", fit_steps=20, time_budget=1e-3).report.choices["fit"]
     assert limited["steps"] < 20
 

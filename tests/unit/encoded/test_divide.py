@@ -13,8 +13,7 @@ from learned import Made, made
 from gsmerge.encoded.divide import divide_all, pick_children
 from gsmerge.encoded.encoded import Division
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.stages.decode import divide
-from gsmerge.stages.region_tree import split_counts
+from gsmerge.stages.decode import divide, split_counts
 from gsmerge.types import FeatureGaussians, Gaussians
 
 MOST = 8
@@ -56,22 +55,23 @@ def test_any_counts_give_the_stage_s_children(seed: int, scene: Made, division: 
 
 @pytest.mark.parametrize("extra", [0, 1, 17, 10_000])
 def test_deals_are_those_of_a_budget(extra: int, scene: Made, division: Division) -> None:
-    dealt = np.bincount(division.deals.numpy()[:extra], minlength=len(scene.features))
+    dealt = np.bincount(division.growth_order.numpy()[:extra], minlength=len(scene.features))
     np.testing.assert_array_equal(1 + dealt, split_counts(scene.features, scene.members, extra))
 
 
 def test_groups_that_cannot_be_divided_are_whole(scene: Made, division: Division) -> None:
     single = np.flatnonzero((np.diff(scene.features.starts.numpy()) == 1) & ~scene.features.backing.numpy())
     assert len(single) > 3
-    assert set(single) <= set(division.whole.tolist())
-    assert not division.splits[division.whole].any()
+    assert set(single) <= set(division.uniform.tolist())
+    assert not division.splits[division.uniform].any()
     assert not division.splits[scene.features.backing].any()
-    assert len(division.children) == 2 * len(division.slots) + len(division.whole)
+    assert len(division.children) == 2 * len(division.slots) + len(division.uniform)
 
 
 def test_one_child_keeps_nothing(scene: Made) -> None:
     division = divide_all(scene.features, scene.members, 1, "depth")
-    assert [len(part) for part in (division.slots, division.whole, division.children, division.deals)] == [0, 0, 0, 0]
+    sizes = [len(part) for part in (division.slots, division.uniform, division.children, division.growth_order)]
+    assert sizes == [0, 0, 0, 0]
     assert not division.splits.any()
 
 

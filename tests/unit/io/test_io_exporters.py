@@ -296,7 +296,7 @@ def test_wrong_arguments(tmp_path: Path, smooth: Tiny, name: str, value: object)
 
 
 def test_the_documented_dialects(root: Path) -> None:
-    text = (root / "docs" / "exporters.md").read_text()
+    text = (root / "docs" / "reference" / "exporters.md").read_text()
     assert [name for name in EXPORTERS if f"| `{name}` |" not in text] == []
 
 

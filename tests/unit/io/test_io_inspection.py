@@ -14,7 +14,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
 from gsmerge.measure.extents import extents
 from gsmerge.measure.inspect import inspect
-from gsmerge.report import inspection_lines
+from gsmerge.measure.inspection_lines import inspection_lines
 
 
 def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:

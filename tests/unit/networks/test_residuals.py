@@ -15,15 +15,15 @@ from gsmerge.networks.residuals import (
     LOGIT,
     MEAN,
     RESIDUAL,
+    ROTATION,
     SIZE,
-    TURN,
-    bounded,
-    limits,
+    bound_residuals,
+    gaussian_sizes,
     move_features,
     move_gaussians,
-    sizes_of,
-    turn_matrices,
-    turn_quats,
+    residual_limits,
+    rotate_quats,
+    rotation_matrices,
 )
 from gsmerge.types import SH_C0, FeatureGaussians
 
@@ -58,7 +58,7 @@ def test_gaussians_move_as_told() -> None:
     residuals[:, MEAN], residuals[:, SIZE] = torch.tensor([1.0, 0, 0]), torch.tensor([0.1, 0.2, -0.3])
     residuals[:, LOGIT], residuals[:, COLOR] = 0.7, torch.tensor([0.1, -0.1, 0.2])
     moved = move_gaussians(base, residuals, frames())
-    torch.testing.assert_close(moved.means, base.means + frames()[:, :, 0] * sizes_of(base.scales)[:, None])
+    torch.testing.assert_close(moved.means, base.means + frames()[:, :, 0] * gaussian_sizes(base.scales)[:, None])
     torch.testing.assert_close(moved.scales.log() - base.scales.log(), residuals[:, SIZE], atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.logit(moved.opacities) - torch.logit(base.opacities), residuals[:, LOGIT])
     torch.testing.assert_close(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR], atol=1e-6, rtol=0)
@@ -77,9 +77,9 @@ def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
 def test_rotations_agree_with_each_other() -> None:
     vectors = torch.randn(20, 3, generator=torch.Generator().manual_seed(3))
     quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=torch.Generator().manual_seed(4)), dim=1)
-    turned = quat_to_rotmat(turn_quats(vectors, quats))
-    torch.testing.assert_close(turned, turn_matrices(vectors) @ quat_to_rotmat(quats), atol=1e-5, rtol=0)
-    quarter = turn_matrices(torch.tensor([[0, 0, torch.pi / 2]]))[0]
+    turned = quat_to_rotmat(rotate_quats(vectors, quats))
+    torch.testing.assert_close(turned, rotation_matrices(vectors) @ quat_to_rotmat(quats), atol=1e-5, rtol=0)
+    quarter = rotation_matrices(torch.tensor([[0, 0, torch.pi / 2]]))[0]
     torch.testing.assert_close(quarter @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
 
 
@@ -103,10 +103,10 @@ def test_feature_gaussians_move_like_gaussians() -> None:
 
 @pytest.mark.parametrize("raw", [1e30, -1e30, float("inf"), float("-inf"), float("nan")])
 def test_whatever_comes_out_is_bounded(raw: float) -> None:
-    found = bounded(torch.full((2, RESIDUAL), raw), Bounds(mean=0.5), 0.5)
-    assert bool((found.abs() <= 0.5 * limits(Bounds(mean=0.5))).all())
+    found = bound_residuals(torch.full((2, RESIDUAL), raw), Bounds(mean=0.5), 0.5)
+    assert bool((found.abs() <= 0.5 * residual_limits(Bounds(mean=0.5))).all())
     assert bool(torch.isfinite(found).all())
-    assert float(limits(Bounds(turn=0.2))[TURN].max()) == pytest.approx(0.2)
+    assert float(residual_limits(Bounds(turn=0.2))[ROTATION].max()) == pytest.approx(0.2)
 
 
 def test_bounds_are_checked() -> None:

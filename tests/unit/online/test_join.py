@@ -11,26 +11,26 @@ import torch
 from arriving import FAST, fed, group, parts_of, room, same_group, state_of
 
 from gsmerge.encoded.divide import divide_all
-from gsmerge.online.join import absorb, partners
-from gsmerge.online.state import Parts, part_members, pick, thinned
+from gsmerge.online.extend import find_partners, merge_into
+from gsmerge.online.state import GroupSet, child_members, limit_children, select_groups
 from gsmerge.stages.decode import DecodeOptions
 from gsmerge.stages.match import MatchOptions
 
 
 @pytest.fixture(scope="module")
-def sides() -> tuple[Parts, Parts]:
+def sides() -> tuple[GroupSet, GroupSet]:
     """The groups of two views each, with photos that held the first."""
     first, second = parts_of(room(4), 2)
-    return state_of(fed([first])).parts, state_of(fed([second], fit="none")).parts
+    return state_of(fed([first])).groups, state_of(fed([second], fit="none")).groups
 
 
 @pytest.fixture(scope="module")
-def found(sides: tuple[Parts, Parts]) -> torch.Tensor:
+def found(sides: tuple[GroupSet, GroupSet]) -> torch.Tensor:
     old, new = sides
-    return partners(old.features, new.features, MatchOptions())
+    return find_partners(old.features, new.features, MatchOptions())
 
 
-def test_partners_show_the_same_surface(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_partners_show_the_same_surface(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     old, new = sides
     joins = torch.nonzero(found >= 0)[:, 0]
     assert 10 < len(joins) < len(new)
@@ -45,37 +45,37 @@ def test_groups_of_one_side_are_never_partners() -> None:
     """All in one place: each new one gets one, and what is left over none."""
     same = scenes.make_features(np.tile([[0.0, 0, 3]], (3, 1)), sizes=0.1)
     many = scenes.make_features(np.tile([[0.0, 0, 3]], (5, 1)), sizes=0.1)
-    found = partners(same, many, MatchOptions())
-    joined = found[found >= 0].tolist()
-    assert len(joined) == len(set(joined)) <= 3
-    assert len(joined) >= 1
+    found = find_partners(same, many, MatchOptions())
+    concat_groups = found[found >= 0].tolist()
+    assert len(concat_groups) == len(set(concat_groups)) <= 3
+    assert len(concat_groups) >= 1
 
 
-def test_no_partners_without_anything_there(sides: tuple[Parts, Parts]) -> None:
+def test_no_partners_without_anything_there(sides: tuple[GroupSet, GroupSet]) -> None:
     old, new = sides
-    none = pick(old, torch.zeros(0, dtype=torch.int64))
-    assert (partners(none.features, new.features, MatchOptions()) == -1).all()
-    assert len(partners(old.features, none.features, MatchOptions())) == 0
-    assert (partners(old.features, new.features, MatchOptions(match="none")) == -1).all()
+    none = select_groups(old, torch.zeros(0, dtype=torch.int64))
+    assert (find_partners(none.features, new.features, MatchOptions()) == -1).all()
+    assert len(find_partners(old.features, none.features, MatchOptions())) == 0
+    assert (find_partners(old.features, new.features, MatchOptions(match="none")) == -1).all()
 
 
-def joined_pairs(sides: tuple[Parts, Parts], found: torch.Tensor) -> tuple[Parts, torch.Tensor]:
+def joined_pairs(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> tuple[GroupSet, torch.Tensor]:
     """The new groups that join, and where."""
     joins = torch.nonzero(found >= 0)[:, 0]
-    return pick(sides[1], joins), found[joins]
+    return select_groups(sides[1], joins), found[joins]
 
 
-def test_what_adds_up_adds_up(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_what_adds_up_adds_up(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     new, rows = joined_pairs(sides, found)
-    after = absorb(sides[0], new, rows, 4)
+    after = merge_into(sides[0], new, rows, 4)
     for name in ("weights", "masses", "extinctions"):
         before, fresh = getattr(sides[0].features, name), getattr(new.features, name)
         np.testing.assert_allclose(getattr(after.features, name)[rows], before[rows] + fresh, rtol=1e-5)
 
 
-def test_moments_are_pooled_by_weight(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_moments_are_pooled_by_weight(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     new, rows = joined_pairs(sides, found)
-    old, after = pick(sides[0], rows).features, absorb(sides[0], new, rows, 4).features
+    old, after = select_groups(sides[0], rows).features, merge_into(sides[0], new, rows, 4).features
     share = (old.weights / (old.weights + new.features.weights)).double()[:, None]
     means = share * old.means + (1 - share) * new.features.means
     np.testing.assert_allclose(after.means[rows], means, atol=1e-5)
@@ -87,9 +87,9 @@ def test_moments_are_pooled_by_weight(sides: tuple[Parts, Parts], found: torch.T
     np.testing.assert_allclose(after.covars[rows], covars, atol=1e-6)
 
 
-def test_other_groups_keep_their_bytes(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_other_groups_keep_their_bytes(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     new, rows = joined_pairs(sides, found)
-    after = absorb(sides[0], new, rows, 4)
+    after = merge_into(sides[0], new, rows, 4)
     assert len(after) == len(sides[0])
     touched = set(rows.tolist())
     assert len(touched) < len(after)
@@ -98,42 +98,42 @@ def test_other_groups_keep_their_bytes(sides: tuple[Parts, Parts], found: torch.
     assert torch.equal(after.features.members, torch.arange(len(after.children)))
 
 
-def test_children_of_both_are_kept_up_to_the_most(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_children_of_both_are_kept_up_to_the_most(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     new, rows = joined_pairs(sides, found)
-    roomy, tight = absorb(sides[0], new, rows, 8), absorb(sides[0], new, rows, 4)
+    roomy, tight = merge_into(sides[0], new, rows, 8), merge_into(sides[0], new, rows, 4)
     sizes = roomy.features.starts.diff()[rows]
     both = sides[0].features.starts.diff()[rows] + new.features.starts.diff()
     assert torch.equal(sizes, both.clamp(max=8))
     assert int(tight.features.starts.diff().max()) == 4
     row = int(rows[int(sizes.argmax())])
     _, children = group(roomy, row)
-    few = thinned(pick(roomy, torch.tensor([row])), 4)
+    few = limit_children(select_groups(roomy, torch.tensor([row])), 4)
     assert len(few.children) == 4
     depth = -torch.log1p(-children.opacities) * children.scales.sort(1).values[:, 1:].prod(1)
     pooled = -torch.log1p(-few.children.opacities) * few.children.scales.sort(1).values[:, 1:].prod(1)
     assert float(pooled.sum()) == pytest.approx(float(depth.sum()), rel=0.1)
 
 
-def test_colours_that_photos_held_stay(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_colours_that_photos_held_stay(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     new, rows = joined_pairs(sides, found)
-    held = torch.zeros(len(sides[0]))
-    held[rows[::2]] = 5.0
-    before = replace(sides[0], solved=sides[0].solved + 0.3, held=held)
-    after = absorb(before, new, rows, 4)
-    assert torch.equal(after.held, held)
-    assert torch.equal(after.solved[rows[::2]], before.solved[rows[::2]])
-    assert torch.equal(after.solved[rows[1::2]], after.features.sh0[rows[1::2]])
+    color_precision = torch.zeros(len(sides[0]))
+    color_precision[rows[::2]] = 5.0
+    before = replace(sides[0], fitted_sh0=sides[0].fitted_sh0 + 0.3, color_precision=color_precision)
+    after = merge_into(before, new, rows, 4)
+    assert torch.equal(after.color_precision, color_precision)
+    assert torch.equal(after.fitted_sh0[rows[::2]], before.fitted_sh0[rows[::2]])
+    assert torch.equal(after.fitted_sh0[rows[1::2]], after.features.sh0[rows[1::2]])
 
 
-def test_nothing_to_absorb_changes_nothing(sides: tuple[Parts, Parts]) -> None:
+def test_nothing_to_absorb_changes_nothing(sides: tuple[GroupSet, GroupSet]) -> None:
     none = torch.zeros(0, dtype=torch.int64)
-    assert absorb(sides[0], pick(sides[1], none), none, 4) is sides[0]
+    assert merge_into(sides[0], select_groups(sides[1], none), none, 4) is sides[0]
 
 
-def test_all_groups_can_be_divided_afterwards(sides: tuple[Parts, Parts], found: torch.Tensor) -> None:
+def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
     new, rows = joined_pairs(sides, found)
-    after = absorb(sides[0], new, rows, 4)
-    division = divide_all(after.features, part_members(after), 4, "depth")
+    after = merge_into(sides[0], new, rows, 4)
+    division = divide_all(after.features, child_members(after), 4, "depth")
     assert division.children.sh0.isfinite().all()
     assert DecodeOptions().count == 1
     assert FAST["density"] == 0.1

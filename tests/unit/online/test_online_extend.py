@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from arriving import FAST, counts, fed, parts_of, room, same_parts, same_state, state_of
+from arriving import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
 from learned import noisy, written
 from loose import NO_CAMERAS, far_behind, loosened, shuffled
 
 from gsmerge import Compactor, Gaussians, PixelScene, UnalignedScene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
+from gsmerge.online.decode import decode_stored
 from gsmerge.online.extend import extend
-from gsmerge.online.fitted import decode_stored
 from gsmerge.online.state import OnlineState, from_encoded
 from gsmerge.options import CompactOptions
 from gsmerge.stages.fit import FitOptions, FitReport
@@ -127,7 +127,7 @@ def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
     assert abs(one - other) < 0.2
 
 
-@pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=["loosened", "shuffled"])
+@pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=str)
 def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
     states, found = [], []
     for threads in (1, 2, 8):
@@ -155,7 +155,7 @@ def test_the_settings_of_each_batch_are_its_own(pairs: list[PixelScene], first: 
 # what batches may be
 
 
-def test_pictures_of_another_size(scene: PixelScene, first: OnlineState) -> None:
+def test_pictures_of_another_size(scene: PixelScene, first: OnlineState, floor: Callable[..., None]) -> None:
     large = room(6, 54, 36)
     state, report = extend(first, scenes.take_views(large, [2, 3]), options())
     assert report.num_input == 2 * 54 * 36
@@ -163,7 +163,7 @@ def test_pictures_of_another_size(scene: PixelScene, first: OnlineState) -> None
     assert state.replay.images.shape == (4, 24, 36, 3)
     assert report.num_covered + report.num_joined > 0.3 * report.num_new
     gaussians = decode_stored(state, options=options().fit).gaussians
-    assert scenes.psnr_of(gaussians, scenes.take_views(scene, [2, 3])) > 18
+    floor(scenes.psnr_of(gaussians, scenes.take_views(scene, [2, 3])))
     single, _ = extend(first, scenes.take_views(scene, [2, 3]), options())
     np.testing.assert_allclose(state.cameras.Ks, single.cameras.Ks, rtol=1e-9)
 
@@ -174,7 +174,7 @@ def test_without_photos(pairs: list[PixelScene]) -> None:
     compactor = fed(bare)
     state = state_of(compactor)
     assert len(state.replay) == 0
-    assert not state.parts.held.any()
+    assert not state.groups.color_precision.any()
     assert len(compactor) < sum(len(fed([pair])) for pair in bare)
     plain = compactor.decode()
     assert scenes.identical(plain, compactor.decode(fit="none"))
@@ -193,12 +193,13 @@ def test_photos_of_some_batches(bare: int, pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("change", [loosened, shuffled], ids=["loosened", "shuffled"])
-def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene]) -> None:
-    for batches in ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]]):
+def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene], floor: Callable[..., None]) -> None:
+    choices = ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]])
+    for number, batches in enumerate(choices):
         compactor = fed(batches)  # type: ignore[arg-type]
         assert compactor.batches[1]["num_covered"] + compactor.batches[1]["num_joined"] > 0
         both = scenes.take_views(room(), range(4))
-        assert scenes.psnr_of(compactor.decode(fit="color"), both) > 17
+        floor(scenes.psnr_of(compactor.decode(fit="color"), both), str(number))
 
 
 def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
@@ -210,13 +211,13 @@ def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene]) -> None:
+def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene], floor: Callable[..., None]) -> None:
     """Views are placed for them."""
     bare = UnalignedScene(pairs[0].gaussians, NO_CAMERAS, None, ())
     compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
     assert compactor.batches[1]["num_covered"] > 0
     assert len(state_of(compactor).replay) == 2
-    assert scenes.psnr_of(compactor.decode(fit="color"), pairs[1]) > 17
+    floor(scenes.psnr_of(compactor.decode(fit="color"), pairs[1]))
 
 
 def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
@@ -242,11 +243,11 @@ def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
     state, report = extend(first, away, options())
     assert (report.num_covered, report.num_joined) == (0, 0)
     assert len(state) == len(first) + report.num_new - report.num_hidden
-    before = replace(state, parts=first.parts)
-    pick = torch.arange(len(first))
-    from gsmerge.online.state import pick as picked
+    before = replace(state, groups=first.groups)
+    select_groups = torch.arange(len(first))
+    from gsmerge.online.state import select_groups as picked
 
-    same_parts(picked(state.parts, pick), picked(before.parts, pick))
+    same_groups(picked(state.groups, select_groups), picked(before.groups, select_groups))
 
 
 def test_a_batch_without_a_valid_gaussian(pairs: list[PixelScene], first: OnlineState) -> None:
@@ -255,7 +256,7 @@ def test_a_batch_without_a_valid_gaussian(pairs: list[PixelScene], first: Online
     state, report = extend(first, nothing, options())
     assert (report.num_new, len(state)) == (0, len(first))
     assert len(state.replay) == 4
-    assert scenes.identical(state.parts.children, first.parts.children)
+    assert scenes.identical(state.groups.children, first.groups.children)
     with pytest.raises(ValueError, match="expected at least one valid Gaussian"):
         Compactor(**FAST).extend(nothing)
 
@@ -330,12 +331,12 @@ def test_a_full_fit_shows_more(scene: PixelScene, pairs: list[PixelScene]) -> No
 
 
 def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsmerge.online import fitted
+    from gsmerge.online import decode as decode_module
 
     def refused(gaussians: Gaussians, *_: object) -> tuple[Gaussians, FitReport]:
         return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")
 
-    monkeypatch.setattr(fitted, "fit", refused)
+    monkeypatch.setattr(decode_module, "fit", refused)
     compactor = fed(pairs)
     found = decode_stored(state_of(compactor), k=1, options=FitOptions(fit="color"))
     assert found.fit is not None
@@ -344,7 +345,7 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkey
     assert scenes.identical(found.gaussians, compactor.decode(k=1, fit="none"))
 
 
-@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"max_bytes": "20KB"}], ids=["loosened", "shuffled"])
+@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"max_bytes": "20KB"}], ids=str)
 def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
     compactor = fed(pairs[:2], **settings)
     own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))
@@ -358,12 +359,12 @@ def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
     same_state(state_of(compactor), state_of(fed(pairs)))
 
 
-def test_results_are_in_the_world(scene: PixelScene) -> None:
+def test_results_are_in_the_world(scene: PixelScene, floor: Callable[..., None]) -> None:
     turn, shift = scenes.random_rotation(0), np.array([30.0, -20.0, 10.0])
     moved = scenes.move(scene, turn, 4.0, shift)
     compactor = fed(parts_of(moved, 3))
     for fit in ("none", "color"):
-        assert scenes.psnr_of(compactor.decode(fit=fit), moved) > 17
+        floor(scenes.psnr_of(compactor.decode(fit=fit), moved), fit)
 
 
 # what is refused

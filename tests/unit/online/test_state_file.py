@@ -16,8 +16,9 @@ from safetensors.torch import load_file, save_file
 from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
 
 from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
+from gsmerge.encoded.gsm_file import STATE
 from gsmerge.errors import SceneError
-from gsmerge.online.file import FORMAT, load_state, load_stored, save_state
+from gsmerge.online.file import load_state, load_stored, save_state
 from gsmerge.online.state import OnlineState
 
 
@@ -147,7 +148,7 @@ def test_what_is_not_known_is_not_looked_at(path: Path, state: OnlineState) -> N
     tensors["features.moods"], tensors["division.slots"] = torch.full((7,), float("nan")), torch.zeros(3)
     told |= {"minor": 7, "moods": ["good"]}
     told["settings"]["mood"] = "better"
-    save_file(tensors, path, {FORMAT: json.dumps(told), "mood": "best"})
+    save_file(tensors, path, {STATE: json.dumps(told), "mood": "best"})
     same_state(load_state(path), state)
 
 

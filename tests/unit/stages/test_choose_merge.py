@@ -12,7 +12,7 @@ from gsmerge.moments import Members, feature_to_gaussians, principal_axes, scene
 from gsmerge.render.metrics import psnr
 from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.stages.backing import BackingOptions, encode_backing
-from gsmerge.stages.choose_merge import RobustOptions, choose_merge, close_holes, photo_psnr, weigh
+from gsmerge.stages.choose_merge import RobustMerge, RobustOptions, choose_merge, close_holes, merge_psnr, weigh
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.merge import take
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -43,18 +43,22 @@ def features(scene: PixelScene, members: Members) -> FeatureGaussians:
 
 
 @pytest.fixture(scope="module")
-def backing(scene: PixelScene, members: Members) -> FeatureGaussians:
+def backing(scene: PixelScene, members: Members, features: FeatureGaussians) -> FeatureGaussians:
     assert scene.images is not None
-    return encode_backing(scene, members, segment(scene.images, SegmentOptions(), 12), BackingOptions())
+    groups = segment(scene.images, SegmentOptions(), 12)
+    layer = encode_backing(scene, members, groups, BackingOptions(), features)
+    assert layer is not None
+    return layer
 
 
 def test_best_score_wins(features: FeatureGaussians, backing: FeatureGaussians, photos: Photos) -> None:
-    found, choice = choose_merge(features, backing, photos, RobustOptions())
-    assert sorted(choice.scores) == sorted(NAMES)
-    assert choice.scores[choice.name] == max(choice.scores.values())
-    assert photo_psnr(found, photos, left_out=True) == pytest.approx(choice.scores[choice.name], abs=1e-9)
-    assert choice.scores["plain"] == pytest.approx(photo_psnr(features, photos, left_out=True), abs=1e-9)
-    assert bool(found.backing.any()) == choice.name.endswith("back")
+    chosen = choose_merge(features, backing, photos, RobustOptions())
+    name, scores = chosen.choices["merge"], chosen.choices["merge_scores"]
+    assert sorted(scores) == sorted(NAMES)
+    assert scores[name] == max(scores.values())
+    assert merge_psnr(chosen.features, photos, left_out=True) == pytest.approx(scores[name], abs=1e-9)
+    assert scores["plain"] == pytest.approx(merge_psnr(features, photos, left_out=True), abs=1e-9)
+    assert bool(chosen.features.backing.any()) == name.endswith("back")
 
 
 def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos: Photos, scene: PixelScene) -> None:
@@ -63,18 +67,18 @@ def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos:
     for view in range(3):
         image = scenes.images_of(gaussians[features.views != view], scene.cameras[view : view + 1])[0][0]
         scores.append(psnr(np.clip(image, 0, 1), photos.images[view]))
-    assert photo_psnr(features, photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
+    assert merge_psnr(features, photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
 
 
 def test_many_views_are_judged_by_some(
     features: FeatureGaussians, photos: Photos, scene: PixelScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each still without its own Gaussians."""
-    monkeypatch.setattr("gsmerge.views.MOST_JUDGED", 1)
+    monkeypatch.setattr("gsmerge.views.MAX_SCORED_VIEWS", 1)
     others = feature_to_gaussians(features)[features.views != 1]
     image = scenes.images_of(others, scene.cameras[1:2])[0][0]
     expected = psnr(np.clip(image, 0, 1), photos.images[1])
-    assert photo_psnr(features, photos, left_out=True) == pytest.approx(expected, abs=0.01)
+    assert merge_psnr(features, photos, left_out=True) == pytest.approx(expected, abs=0.01)
 
 
 def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
@@ -117,7 +121,10 @@ def test_backing_draws_no_curtain() -> None:
     edge = scenes.make_scene(surfaces, scenes.arc(1))
     assert edge.images is not None
     groups = segment(edge.images, SegmentOptions(), 6)
-    layer = encode_backing(edge, scene_members(edge), groups, BackingOptions(push=0.0))
+    members = scene_members(edge)
+    front = encode(edge, members, groups, EncodeOptions())
+    layer = encode_backing(edge, members, groups, BackingOptions(push=0.0), front)
+    assert layer is not None
     thickness = principal_axes(layer.covars.double().numpy())[0][:, 0]
     depths = layer.means[:, 2].double().numpy()
     assert (thickness < 0.3 * depths).all()
@@ -133,32 +140,43 @@ def test_few_views_differ_in_spread_alone(scene: PixelScene, members: Members, v
     assert own.images is not None
     features = encode(own, scene_members(own), segment(own.images, SegmentOptions(), 150), EncodeOptions())
     photos = scene_photos(own)
-    found, choice = choose_merge(features, None, photos, RobustOptions())
-    assert list(choice.scores) == ["plain", "wide", "wider"]
-    assert choice.scores[choice.name] == max(choice.scores.values())
-    power = list(choice.scores).index(choice.name)
-    torch.testing.assert_close(found.spreads, torch.full((len(features),), 1.2**power))
+    chosen = choose_merge(features, None, photos, RobustOptions())
+    name, scores = chosen.choices["merge"], chosen.choices["merge_scores"]
+    assert list(scores) == ["plain", "wide", "wider"]
+    assert scores[name] == max(scores.values())
+    power = list(scores).index(name)
+    torch.testing.assert_close(chosen.features.spreads, torch.full((len(features),), 1.2**power))
     for name in ("means", "covars", "gains", "extinctions"):
-        assert torch.equal(getattr(found, name), getattr(features, name))
-    assert choice.scores["plain"] == pytest.approx(photo_psnr(features, photos, left_out=False), abs=1e-9)
+        assert torch.equal(getattr(chosen.features, name), getattr(features, name))
+    assert scores["plain"] == pytest.approx(merge_psnr(features, photos, left_out=False), abs=1e-9)
 
 
 def test_without_a_backing_layer_no_candidate_has_one(features: FeatureGaussians, photos: Photos) -> None:
-    found, choice = choose_merge(features, None, photos, RobustOptions())
-    assert sorted(choice.scores) == sorted(name for name in NAMES if not name.endswith("back"))
-    assert not found.backing.any()
+    chosen = choose_merge(features, None, photos, RobustOptions())
+    scores = chosen.choices["merge_scores"]
+    assert sorted(scores) == sorted(name for name in NAMES if not name.endswith("back"))
+    assert not chosen.features.backing.any()
 
 
 def test_rendering_everything_shows_more(features: FeatureGaussians, photos: Photos, scene: PixelScene) -> None:
     gaussians = feature_to_gaussians(features)
     images = scenes.images_of(gaussians, scene.cameras)[0]
-    wanted = np.mean([psnr(np.clip(i, 0, 1), p) for i, p in zip(images, photos.images, strict=True)])
-    found = photo_psnr(features, photos, left_out=False)
-    assert found == pytest.approx(wanted, abs=0.01)
-    assert found > photo_psnr(features, photos, left_out=True)
+    expected = np.mean([psnr(np.clip(i, 0, 1), p) for i, p in zip(images, photos.images, strict=True)])
+    everything = merge_psnr(features, photos, left_out=False)
+    assert everything == pytest.approx(expected, abs=0.01)
+    assert everything > merge_psnr(features, photos, left_out=True)
 
 
 # holes after merging
+
+
+def before(coarse: FeatureGaussians | None, photos: Photos) -> RobustMerge:
+    """A choice whose features do not matter any more."""
+    return RobustMerge(take_none(), coarse, photos, {})
+
+
+def take_none() -> FeatureGaussians:
+    return scenes.make_features(np.zeros((0, 3)))
 
 
 def test_holes_are_closed_by_what_shows_the_photos_best(
@@ -166,20 +184,22 @@ def test_holes_are_closed_by_what_shows_the_photos_best(
 ) -> None:
     """A thinned layer: every candidate is tried, and the best is taken."""
     thin = take(features, torch.arange(0, len(features), 2))
-    found, choice = close_holes(thin, backing, photos, RobustOptions())
-    assert list(choice.scores) == ["as it is", "wide", "back", "wide+back"]
-    assert choice.scores[choice.name] == max(choice.scores.values())
-    assert choice.name != "as it is"
-    assert photo_psnr(found, photos, left_out=False) == pytest.approx(choice.scores[choice.name], abs=1e-9)
-    assert bool(found.backing.any()) == choice.name.endswith("back")
+    chosen = close_holes(thin, before(backing, photos), RobustOptions())
+    name, scores = chosen.choices["closed"], chosen.choices["closed_scores"]
+    assert list(scores) == ["as it is", "wide", "back", "wide+back"]
+    assert scores[name] == max(scores.values())
+    assert name != "as it is"
+    assert merge_psnr(chosen.features, photos, left_out=False) == pytest.approx(scores[name], abs=1e-9)
+    assert bool(chosen.features.backing.any()) == name.endswith("back")
 
 
 def test_closed_layers_stay_as_they_are(features: FeatureGaussians, photos: Photos) -> None:
     """Where nothing may be added, the very same Feature Gaussians come back."""
     wide = replace(features, spreads=1.2 * features.spreads)
-    found, choice = close_holes(wide, None, photos, RobustOptions())
-    assert list(choice.scores) == ["as it is"]
-    assert found is wide
+    chosen = close_holes(wide, before(None, photos), RobustOptions())
+    scores = chosen.choices["closed_scores"]
+    assert list(scores) == ["as it is"]
+    assert chosen.features is wide
 
 
 def test_candidates_are_not_widened_or_backed_twice(
@@ -188,8 +208,8 @@ def test_candidates_are_not_widened_or_backed_twice(
     options = RobustOptions()
     wide = replace(features, spreads=1.2 * features.spreads)
     backed = FeatureGaussians.concat([features, backing])
-    assert list(close_holes(wide, backing, photos, options)[1].scores) == ["as it is", "back"]
-    assert list(close_holes(backed, backing, photos, options)[1].scores) == ["as it is", "wide"]
+    assert list(close_holes(wide, before(backing, photos), options).choices["closed_scores"]) == ["as it is", "back"]
+    assert list(close_holes(backed, before(backing, photos), options).choices["closed_scores"]) == ["as it is", "wide"]
     both = FeatureGaussians.concat([wide, backing])
-    assert list(close_holes(both, backing, photos, options)[1].scores) == ["as it is"]
-    assert list(close_holes(backing, None, photos, options)[1].scores) == ["as it is"]
+    assert list(close_holes(both, before(backing, photos), options).choices["closed_scores"]) == ["as it is"]
+    assert list(close_holes(backing, before(None, photos), options).choices["closed_scores"]) == ["as it is"]

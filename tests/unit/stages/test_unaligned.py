@@ -11,19 +11,21 @@ import torch
 from gsmerge import CompactOptions, PixelScene, UnalignedScene, compact
 from gsmerge.errors import UsageError
 from gsmerge.moments import scene_members, unaligned_members
+from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.assign import (
     ContributionOptions,
     Owners,
     find_owners,
+    merge_neighbors,
     middle_pixels,
     owner_pixels,
     seen_depths,
 )
 from gsmerge.stages.encode import EncodeOptions, encode, group_rows, member_rows
-from gsmerge.stages.group import asked_per_view
-from gsmerge.stages.prepare import canonicalise, find_frame
+from gsmerge.stages.group import superpixels_per_view
+from gsmerge.stages.place_cameras import add_views
+from gsmerge.stages.prepare import canonicalise, find_frame, prepare
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.stages.unaligned import make_ready, members_of, merge_neighbours, with_cameras
 from gsmerge.types import Groups
 
 
@@ -47,7 +49,7 @@ def test_sizes_must_fit(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("unseen", "hide"), ("min_contribution", -1.0), ("min_contribution", np.nan)]
+    ("name", "value"), [("unseen", "hide"), ("min_owner_weight", -1.0), ("min_owner_weight", np.nan)]
 )
 def test_options_are_checked(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected"):
@@ -120,27 +122,29 @@ def test_depths_are_those_of_the_surfaces(room: PixelScene) -> None:
 def test_density_is_of_the_gaussians_where_those_are_fewer(room: PixelScene) -> None:
     options = CompactOptions().with_settings({"density": 0.1})
     whole = loose.loosened(room)
-    assert asked_per_view(whole, options) == asked_per_view(room, options) == 76
-    assert asked_per_view(replace(whole, gaussians=room.gaussians[::2]), options) == 38
-    assert asked_per_view(replace(whole, gaussians=room.gaussians[:1]), options) == 1
-    assert asked_per_view(whole, options.with_settings({"superpixels": 50})) == 50
+    assert superpixels_per_view(whole, options) == superpixels_per_view(room, options) == 76
+    assert superpixels_per_view(replace(whole, gaussians=room.gaussians[::2]), options) == 38
+    assert superpixels_per_view(replace(whole, gaussians=room.gaussians[:1]), options) == 1
+    assert superpixels_per_view(whole, options.with_settings({"superpixels": 50})) == 50
 
 
 def test_unknown_cameras_are_placed(room: PixelScene) -> None:
     blind = UnalignedScene(room.gaussians, loose.NO_CAMERAS, None, ())
-    whole, notes = with_cameras(blind)
+    log = RunLog()
+    whole = add_views(blind, log)
     assert len(whole) == len(whole.names) >= 1
-    assert len(notes) == 1
-    assert "no cameras" in notes[0]
-    ready = make_ready(blind, CompactOptions())
-    assert ready.scene.images is not None
-    assert ready.scene.images.min() >= 0
-    assert ready.scene.images.max() <= 1
-    assert "no photos" in ready.notes[-1]
+    assert len(log.notes) == 1
+    assert "no cameras" in log.notes[0]
+    log = RunLog()
+    prepared = prepare(blind, CompactOptions(), log)
+    assert prepared.scene.images is not None
+    assert prepared.scene.images.min() >= 0
+    assert prepared.scene.images.max() <= 1
+    assert "no photos" in log.notes[-1]
 
 
 def test_placed_cameras_see_most(room: PixelScene) -> None:
-    blind, _ = with_cameras(UnalignedScene(room.gaussians, loose.NO_CAMERAS, None, ()))
+    blind = add_views(UnalignedScene(room.gaussians, loose.NO_CAMERAS, None, ()), RunLog())
     groups = Groups(
         torch.zeros(len(blind), blind.cameras.height, blind.cameras.width, dtype=torch.int32), (1,) * len(blind)
     )
@@ -149,11 +153,11 @@ def test_placed_cameras_see_most(room: PixelScene) -> None:
 
 
 def test_neighbours_are_merged(room: PixelScene) -> None:
-    merged = merge_neighbours(room.gaussians, loose.loosened(room), 50, CompactOptions())
+    merged = merge_neighbors(room.gaussians, loose.loosened(room), 50, CompactOptions())
     assert len(merged) == 50
     low, high = room.gaussians.means.amin(0), room.gaussians.means.amax(0)
     assert ((merged.means >= low - 1e-5) & (merged.means <= high + 1e-5)).all()
-    all_of_them = merge_neighbours(room.gaussians[:20], loose.loosened(room), 20, CompactOptions())
+    all_of_them = merge_neighbors(room.gaussians[:20], loose.loosened(room), 20, CompactOptions())
     assert torch.allclose(all_of_them.means.sum(0).double(), room.gaussians.means[:20].sum(0).double(), atol=1e-4)
 
 
@@ -179,5 +183,7 @@ def test_nothing_seen_at_all(room: PixelScene) -> None:
             compact(scene, unseen=unseen)
 
 
-def test_members_of_a_grid_are_untouched(room: PixelScene, groups: Groups) -> None:
-    assert members_of(room, groups, CompactOptions()).pixels is None
+def test_members_of_a_grid_need_no_pixels(room: PixelScene) -> None:
+    members = prepare(room, CompactOptions(), RunLog()).members
+    assert members is not None
+    assert members.pixels is None

@@ -136,7 +136,10 @@ def test_fixed_settings_are_names_and_values(text: str) -> None:
         grid_settings(Grid(fixed=(text,)))
 
 
-@pytest.mark.parametrize("text", ["method=voxel", "seed=3", "threads=1", "prune=[1]", "prune={}", "prune=NaN"])
+@pytest.mark.parametrize(
+    "text",
+    ["method=voxel", "seed=3", "threads=1", "min_contribution=[1]", "min_contribution={}", "min_contribution=NaN"],
+)
 def test_what_cannot_be_fixed(text: str) -> None:
     with pytest.raises(UsageError, match="fixed: expected"):
         grid_settings(Grid(fixed=(text,)))

@@ -46,7 +46,7 @@ def test_wrong_colours_come_back(gaussians: Gaussians, photos: Photos) -> None:
     noise = 0.1 * torch.randn(gaussians.sh0.shape, generator=rng)
     spoilt = replace(gaussians, sh0=gaussians.sh0 + noise / SH_C0)
     # one block in twenty is held out
-    result, report = fitted(spoilt, photos, replace(FEW, pull=0.01, iterations=18, holdout=0.0125))
+    result, report = fitted(spoilt, photos, replace(FEW, prior_weight=0.01, iterations=18, holdout=0.0125))
     assert report.accepted
     assert report.holdout_after > report.holdout_before + 6
     error = SH_C0 * (result.sh0 - gaussians.sh0)
@@ -71,7 +71,7 @@ def test_fit_that_makes_it_worse_is_refused(gaussians: Gaussians, photos: Photos
     rng = np.random.default_rng(0)
     noise = replace(photos, images=rng.choice([0.0, 1.0], photos.images.shape).astype(np.float32))
     grey = replace(gaussians, sh0=torch.zeros_like(gaussians.sh0))
-    result, report = fitted(grey, noise, replace(FEW, pull=1e-6, iterations=60, huber=10.0))
+    result, report = fitted(grey, noise, replace(FEW, prior_weight=1e-6, iterations=60, huber=10.0))
     assert not report.accepted
     assert report.method == "none"
     assert report.holdout_after <= report.holdout_before
@@ -107,8 +107,8 @@ def test_exposure_of_one_view_does_not_bake_in(gaussians: Gaussians, photos: Pho
 def test_pull_holds_the_colours(gaussians: Gaussians, photos: Photos) -> None:
     start = recolored(gaussians, 0.1)
     moves = []
-    for pull in (0.01, 1.0, 100.0):
-        result, _ = fitted(start, photos, replace(FEW, pull=pull))
+    for prior_weight in (0.01, 1.0, 100.0):
+        result, _ = fitted(start, photos, replace(FEW, prior_weight=prior_weight))
         moves.append(float((SH_C0 * (result.sh0 - start.sh0)).abs().mean()))
     assert moves[0] > moves[1] > moves[2]
     assert moves[2] < 0.005

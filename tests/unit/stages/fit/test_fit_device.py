@@ -20,7 +20,7 @@ from gsmerge.stages.fit.device import engine_for, image_loss, start_gpu, torch_e
 from gsmerge.stages.fit.full import KERNELS, Engine, fit_full, plan_run
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import Rates
+from gsmerge.stages.fit.options import LearningRates
 from gsmerge.stages.fit.state import State, start_state
 
 Pair = tuple[Photos, Photos]
@@ -30,7 +30,7 @@ gpu = pytest.mark.skipif(
 )
 PULLS = FitOptions(fit_steps=8, holdout=0.2)
 # Without the pulls: where they are the whole gradient, Adam turns its last bit into a full step.
-QUICK = replace(PULLS, opacity_pull=0.0, size_pull=0.0)
+QUICK = replace(PULLS, opacity_reg=0.0, scale_reg=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -54,88 +54,100 @@ def run(gaussians: Gaussians, photos: Pair, options: FitOptions, engine: Engine,
     errors = []
     for step in range(options.fit_steps):
         if grown and step == options.fit_steps // 2:
-            engine.settle(state)
+            engine.sync(state)
             state = grow_to(state, photos[1], len(state.x) + grown)
         part = step / options.fit_steps
         errors.append(engine.step(state, plan, step % len(photos[0]), step + 1, part, rng))
-    engine.settle(state)
+    engine.sync(state)
     return state, errors
 
 
-def assert_same_state(found: State, wanted: State) -> None:
+def assert_same_state(ours: State, expected: State) -> None:
     """Parameters to 1e-3, most of them far closer; what they mean to the rasterizer is up to date."""
-    assert found.x.shape == wanted.x.shape
-    moved = np.abs(wanted.x - wanted.x0).max(0)
+    assert ours.x.shape == expected.x.shape
+    moved = np.abs(expected.x - expected.x0).max(0)
     assert (moved > 0.01).all()
-    np.testing.assert_allclose(found.x, wanted.x, atol=1e-3)
-    assert np.median(np.abs(found.x - wanted.x)) < 1e-5
-    assert np.linalg.norm(found.m - wanted.m) <= 1e-3 * np.linalg.norm(wanted.m)
-    assert np.linalg.norm(found.v - wanted.v) <= 1e-3 * np.linalg.norm(wanted.v)
+    np.testing.assert_allclose(ours.x, expected.x, atol=1e-3)
+    assert np.median(np.abs(ours.x - expected.x)) < 1e-5
+    assert np.linalg.norm(ours.m - expected.m) <= 1e-3 * np.linalg.norm(expected.m)
+    assert np.linalg.norm(ours.v - expected.v) <= 1e-3 * np.linalg.norm(expected.v)
     for name in ("means", "quats", "scales", "opacities"):
-        np.testing.assert_allclose(getattr(found.splats, name), getattr(wanted.splats, name), rtol=1e-3, atol=1e-3)
-    np.testing.assert_array_equal(found.colors, found.x[:, 11:])
+        np.testing.assert_allclose(getattr(ours.splats, name), getattr(expected.splats, name), rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(ours.colors, ours.x[:, 11:])
 
 
-@pytest.mark.parametrize("settings", [{}, {"dropout": 0.2}, {"dssim": 0.0}, {"coarse": 0.0}, {"coarse": 1.0}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"dropout": 0.2}, {"ssim_lambda": 0.0}, {"half_res_share": 0.0}, {"half_res_share": 1.0}], ids=str
+)
 def test_steps_are_the_kernels(start: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
     options = replace(QUICK, **settings)
-    (found, errors), (wanted, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
-    assert_same_state(found, wanted)
+    (ours, errors), (expected, others) = (run(start, photos, options, e) for e in (torch_engine(CPU), KERNELS))
+    assert_same_state(ours, expected)
     assert errors == pytest.approx(others, rel=1e-4)
 
 
-@pytest.mark.parametrize("pulls", [{"opacity_pull": 3.0}, {"size_pull": 3.0}, {}], ids=str)
+@pytest.mark.parametrize("pulls", [{"opacity_reg": 3.0}, {"scale_reg": 3.0}, {}], ids=str)
 def test_pulls_are_the_kernels(start: Gaussians, photos: Pair, pulls: dict[str, float]) -> None:
     """By the moments of one step, which are its gradient."""
     one = replace(PULLS if not pulls else QUICK, fit_steps=1, **pulls)
-    (found, _), (wanted, _), (without, _) = (
+    (ours, _), (expected, _), (without, _) = (
         run(start, photos, options, engine)
         for options, engine in ((one, torch_engine(CPU)), (one, KERNELS), (replace(QUICK, fit_steps=1), KERNELS))
     )
-    assert np.linalg.norm(found.m - wanted.m) <= 1e-4 * np.linalg.norm(wanted.m)
-    assert np.linalg.norm(without.m - wanted.m) > 1e-3 * np.linalg.norm(wanted.m)
+    assert np.linalg.norm(ours.m - expected.m) <= 1e-4 * np.linalg.norm(expected.m)
+    assert np.linalg.norm(without.m - expected.m) > 1e-3 * np.linalg.norm(expected.m)
 
 
 @pytest.mark.parametrize("degree", [1, 3])
 def test_steps_are_the_kernels_with_harmonics(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
-    found, wanted = (run(scenes.spoil(truth), scenes.pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS))
-    assert_same_state(found, wanted)
-    np.testing.assert_array_equal(found.splats.shN, wanted.splats.shN)
+    ours, expected = (
+        run(scenes.spoil(truth), scenes.pair_of(scene), QUICK, e)[0] for e in (torch_engine(CPU), KERNELS)
+    )
+    assert_same_state(ours, expected)
+    np.testing.assert_array_equal(ours.splats.shN, expected.splats.shN)
 
 
 def test_growth_goes_on_from_the_tensors(start: Gaussians, photos: Pair) -> None:
-    found, wanted = (run(start, photos, QUICK, e, grown=30)[0] for e in (torch_engine(CPU), KERNELS))
-    assert len(found.x) == len(start) + 30
-    assert_same_state(found, wanted)
+    ours, expected = (run(start, photos, QUICK, e, grown=30)[0] for e in (torch_engine(CPU), KERNELS))
+    assert len(ours.x) == len(start) + 30
+    assert_same_state(ours, expected)
 
 
 def test_box_is_the_kernels(start: Gaussians, photos: Pair) -> None:
     """Everything at its border, colours beyond the range, a quaternion of length zero."""
-    rates = Rates(mean=3.0, size=3.0, logit=5.0, color=1.0, reach_mean=0.2, reach_size=0.1, reach_logit=0.3)
+    rates = LearningRates(
+        means_lr=3.0,
+        scales_lr=3.0,
+        opacities_lr=5.0,
+        colors_lr=1.0,
+        max_mean_shift=0.2,
+        max_scale_change=0.1,
+        max_opacity_change=0.3,
+    )
     options = replace(QUICK, fit_steps=3, rates=rates)
     odd = replace(start, sh0=start.sh0.clone(), quats=start.quats.clone())
     odd.sh0[:9], odd.quats[9:12] = 4.0, 0.0
-    found, wanted = (run(odd, photos, options, e)[0] for e in (torch_engine(CPU), KERNELS))
-    np.testing.assert_allclose(found.x, wanted.x, atol=1e-3)
-    reached = np.abs(found.x - found.x0)[:, 3:6].max(1)
+    ours, expected = (run(odd, photos, options, e)[0] for e in (torch_engine(CPU), KERNELS))
+    np.testing.assert_allclose(ours.x, expected.x, atol=1e-3)
+    reached = np.abs(ours.x - ours.x0)[:, 3:6].max(1)
     assert np.isclose(reached, 0.1, atol=1e-5).mean() > 0.5
-    assert found.x[:, 11:].max() > 1.05
-    assert np.isfinite(found.x).all()
+    assert ours.x[:, 11:].max() > 1.05
+    assert np.isfinite(ours.x).all()
 
 
 def test_run_reaches_the_same(scene: PixelScene, start: Gaussians, photos: Pair) -> None:
     """The median of three, since a weight on the other side of 1/255 may tell two runs apart."""
     options, gaps = replace(QUICK, fit_steps=40), []
     for seed in range(3):
-        (found, report), (wanted, other) = (
+        (ours, report), (expected, other) = (
             fit_full(start, photos, options, seed=seed, engine=engine) for engine in (torch_engine(CPU), KERNELS)
         )
         assert (report.method, report.accepted, report.steps) == (other.method, other.accepted, other.steps)
         assert report.holdout_before == other.holdout_before
         assert report.holdout_after > report.holdout_before + 3
-        scenes.assert_invariants(found, scene)
-        gaps.append(abs(scenes.psnr_of(found, scene) - scenes.psnr_of(wanted, scene)))
+        scenes.assert_invariants(ours, scene)
+        gaps.append(abs(scenes.psnr_of(ours, scene) - scenes.psnr_of(expected, scene)))
     assert np.median(gaps) < 0.1
     assert max(gaps) < 1.0
 
@@ -149,17 +161,17 @@ def test_long_run_grows_to_the_count(scene: PixelScene, start: Gaussians, photos
 
 
 @pytest.mark.parametrize("size", [(20, 17), (7, 7), (3, 5), (1, 9)])
-@pytest.mark.parametrize("dssim", [0.0, 0.2, 1.0])
-def test_loss_is_the_kernels(size: tuple[int, int], dssim: float) -> None:
+@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
+def test_loss_is_the_kernels(size: tuple[int, int], ssim_lambda: float) -> None:
     rng = np.random.default_rng(0)
     photo = rng.uniform(0, 1, (*size, 3)).astype(np.float32)
     image = photo + 0.2 * rng.normal(size=photo.shape).astype(np.float32)
     weight = (rng.random(size) > 0.2).astype(np.float32)
     variable = torch.from_numpy(image).requires_grad_()
-    image_loss(variable, torch.from_numpy(photo), torch.from_numpy(weight), dssim).backward()
-    wanted = image_gradient(image, photo, weight, dssim)
+    image_loss(variable, torch.from_numpy(photo), torch.from_numpy(weight), ssim_lambda).backward()
+    expected = image_gradient(image, photo, weight, ssim_lambda)
     assert variable.grad is not None
-    assert np.linalg.norm(variable.grad.numpy() - wanted) <= 1e-3 * np.linalg.norm(wanted)
+    assert np.linalg.norm(variable.grad.numpy() - expected) <= 1e-3 * np.linalg.norm(expected)
 
 
 def test_nothing_to_fit(start: Gaussians, photos: Pair) -> None:
@@ -180,13 +192,13 @@ def test_stage_steps_where_it_is_told(start: Gaussians, photos: Pair, monkeypatc
     monkeypatch.setattr(cuda_module, "find_spec", lambda name: name)
     monkeypatch.setattr(module, "start_gpu", lambda device: asked.append(f"start {device}"))
     monkeypatch.setattr(module, "torch_engine", lambda device: asked.append(str(device)) or torch_engine(CPU))
-    found, report = fit(start, photos, replace(QUICK, device="cuda"), seed=4)
+    ours, report = fit(start, photos, replace(QUICK, device="cuda"), seed=4)
     assert asked == ["start cuda", "cuda"]
     assert report is not None
     assert report.accepted
-    wanted, _ = fit(start, photos, QUICK, seed=4)
+    expected, _ = fit(start, photos, QUICK, seed=4)
     assert len(asked) == 2
-    torch.testing.assert_close(found.means, wanted.means, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(ours.means, expected.means, rtol=1e-3, atol=1e-3)
     assert engine_for("cpu") is KERNELS
 
 
@@ -212,10 +224,10 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
         return image, torch.ones(len(colors), dtype=torch.bool, device=colors.device)
 
     plan = plan_run(photos, replace(QUICK, dropout=0.2), 0)
-    held = module.upload(start_state(start), torch.device("meta"))
+    tensors = module.upload(start_state(start), torch.device("meta"))
     for progress in (0.0, 0.9):
-        assert module.torch_step(held, plan, 1, 1, progress, np.random.default_rng(0)) == "meta"
-    assert held.x.is_meta
+        assert module.torch_step(tensors, plan, 1, 1, progress, np.random.default_rng(0)) == "meta"
+    assert tensors.x.is_meta
 
 
 @gpu

@@ -41,7 +41,7 @@ def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> Non
     assert plan_run(photos, replace(LONG, dropout=0.0), 0).dropout == 0
     very_long = replace(LONG, fit_steps=LONG_STEPS)
     assert 0 < plan_run(pair, very_long, 0).dropout < plan_run(photos, very_long, 0).dropout
-    assert very_long.coarse_share < LONG.coarse_share < replace(LONG, coarse=0.9).coarse_share
+    assert very_long.half_res_part < LONG.half_res_part < replace(LONG, half_res_share=0.9).half_res_part
 
 
 def test_dropout_leaves_out_its_share(truth: Gaussians, photos: tuple[Photos, Photos]) -> None:

@@ -15,9 +15,9 @@ from gsmerge import Gaussians, PixelScene
 from gsmerge.render import plan_view, splat_adjoint
 from gsmerge.render.photos import Photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.fit import FitOptions, Rates, start_share
+from gsmerge.stages.fit import FitOptions, LearningRates, start_share
 from gsmerge.stages.fit import full as full_module
-from gsmerge.stages.fit.full import affordable_steps, first_look, fit_full, holdout_score, plan_run, step_sizes
+from gsmerge.stages.fit.full import affordable_steps, fit_full, holdout_score, initial_scores, plan_run, step_sizes
 from gsmerge.stages.fit.state import start_state
 from gsmerge.types import SH_C0
 
@@ -91,7 +91,7 @@ def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
-    rates = Rates(reach_mean=0.5, reach_size=0.1, reach_logit=0.2)
+    rates = LearningRates(max_mean_shift=0.5, max_scale_change=0.1, max_opacity_change=0.2)
     start = scenes.spoil(truth)
     result, report = fit_full(start, photos, replace(QUICK, rates=rates))
     assert report.accepted
@@ -103,21 +103,21 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
-    state, least = start_state(truth), QUICK.rates.reach_alone
+    state, least = start_state(truth), QUICK.rates.single_view_share
 
     def shares_of(some: Pair) -> np.ndarray:
         plan = plan_run(some, QUICK, 0)
-        psnr, found = first_look(state, plan)
+        psnr, found = initial_scores(state, plan)
         assert psnr == holdout_score(state, plan)
         return found
 
     def with_views(views: list[int]) -> Pair:
         return tuple(Photos(p.images[views], p.viewmats[views], p.Ks[views], p.eps2d) for p in photos)  # type: ignore[return-value]
 
-    shares, alone = shares_of(photos), with_views([0])
-    assert shares.dtype == np.float32
-    assert shares.min() >= np.float32(least)
-    assert shares.max() == 1
+    box_shares, alone = shares_of(photos), with_views([0])
+    assert box_shares.dtype == np.float32
+    assert box_shares.min() >= np.float32(least)
+    assert box_shares.max() == 1
     np.testing.assert_array_equal(shares_of(alone), np.full(len(truth), least, np.float32))
     whole = np.ones((alone[1].height, alone[1].width, 1))
     shown = splat_adjoint(plan_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
@@ -131,14 +131,19 @@ def test_single_photo_moves_less(truth: Gaussians) -> None:
     assert report.accepted
     rates = QUICK.rates
     unit = start.scales.sort(1).values[:, 1:].prod(1).sqrt()
-    assert ((result.means - start.means).norm(dim=1) <= 1.001 * rates.reach_alone * rates.reach_mean * unit).all()
-    assert float((result.scales / start.scales).log().abs().max()) <= 1.001 * rates.reach_alone * rates.reach_size
+    assert (
+        (result.means - start.means).norm(dim=1) <= 1.001 * rates.single_view_share * rates.max_mean_shift * unit
+    ).all()
+    assert (
+        float((result.scales / start.scales).log().abs().max())
+        <= 1.001 * rates.single_view_share * rates.max_scale_change
+    )
 
 
-@pytest.mark.parametrize(("name", "field"), [("opacity_pull", "opacities"), ("size_pull", "scales")])
+@pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
 def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
     start = scenes.spoil(truth)
-    free, pulled = (fit_full(start, photos, replace(QUICK, **{name: pull}))[0] for pull in (0.0, 0.05))
+    free, pulled = (fit_full(start, photos, replace(QUICK, **{name: prior_weight}))[0] for prior_weight in (0.0, 0.05))
     assert getattr(pulled, field).log().mean() < getattr(free, field).log().mean() - 0.02
 
 
@@ -194,11 +199,11 @@ def test_a_rival_is_what_the_fit_has_to_beat(truth: Gaussians, noise: Pair) -> N
     grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
     _, alone = fit_full(grey, noise, LONG)
     black = replace(truth, sh0=torch.full_like(truth.sh0, -0.5 / SH_C0))
-    _, report = fit_full(grey, noise, LONG, rival=black)
+    _, report = fit_full(grey, noise, LONG, baseline_start=black)
     assert not alone.accepted
     assert alone.holdout_before - 2 > report.holdout_before  # of black
     assert report.accepted
-    _, better = fit_full(black, noise, LONG, rival=grey)
+    _, better = fit_full(black, noise, LONG, baseline_start=grey)
     assert better == fit_full(black, noise, LONG)[1]  # its own blocks are the worse ones
 
 
@@ -222,7 +227,7 @@ def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos
 
 def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
-    options = replace(QUICK, coarse=1.0, dssim=0.0)
+    options = replace(QUICK, half_res_share=1.0, ssim_lambda=0.0)
     start = scenes.spoil(truth)
     weights = plan_run(photos, options, seed=0).weights[1]
     painted = photos[1].images.copy()
@@ -317,9 +322,15 @@ def test_steps_follow_the_time_budget(photos: Pair) -> None:
 
 
 def test_rates_decay() -> None:
-    rates = Rates()
+    rates = LearningRates()
     start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
-    wanted = [rates.mean] * 3 + [rates.size] * 3 + [rates.quat] * 4 + [rates.logit] + [rates.color] * 3
+    wanted = (
+        [rates.means_lr] * 3
+        + [rates.scales_lr] * 3
+        + [rates.quats_lr] * 4
+        + [rates.opacities_lr]
+        + [rates.colors_lr] * 3
+    )
     np.testing.assert_allclose(start, wanted, rtol=1e-6)
     np.testing.assert_allclose(end, rates.decay * start, rtol=1e-6)
     assert rates.decay < 1

@@ -18,7 +18,7 @@ def test_steps_do_not_look_where_the_mask_is_not(coarse: float) -> None:
     """Rubbish on the left third of every photo; at both sizes, and at half size alone."""
     scene, truth = scenes.self_made(0)
     start = scenes.spoil(truth)
-    options = FitOptions(fit_steps=40, holdout=0.2, coarse=coarse, dropout=0.0)
+    options = FitOptions(fit_steps=40, holdout=0.2, half_res_share=coarse, dropout=0.0)
 
     def spoilt(photos: Photos) -> Photos:
         images = photos.images.copy()

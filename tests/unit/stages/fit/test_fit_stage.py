@@ -14,7 +14,7 @@ from gsmerge import Gaussians, PixelScene
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions, FitReport, fit
 from gsmerge.stages.fit.full import fit_full
-from gsmerge.stages.fit.stage import shown
+from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.types import SH_C0
 
 Pair = tuple[Photos, Photos]
@@ -66,7 +66,7 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch
 
 def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
     grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
-    options = replace(LONG, pull=1e-6, iterations=60, huber=10.0)
+    options = replace(LONG, prior_weight=1e-6, iterations=60, huber=10.0)
     result, report = fit(grey, noise, options, count=2 * len(grey))
     assert report is not None
     assert not report.accepted
@@ -81,11 +81,11 @@ def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None
     start = Gaussians.concat([opaque, hidden, behind])
     result, report = fit(start, photos, replace(QUICK, fit="none"))
     assert report is None
-    keep = shown(start, photos[1], QUICK.prune)
+    keep = visible_mask(start, photos[1], QUICK.min_contribution)
     assert scenes.identical(result, start[keep])
     assert not keep[-6:-3].any()
     assert keep[-3:].all()
-    for hasty in ({"prune": 0.0}, {"effort": "draft"}):
+    for hasty in ({"min_contribution": 0.0}, {"effort": "draft"}):
         assert scenes.identical(fit(start, photos, replace(QUICK, fit="none", **hasty))[0], start)
 
 
@@ -108,8 +108,8 @@ def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
     "setting",
     [
         {"fit": "best"}, {"fit_steps": 0}, {"time_budget": 0.0}, {"time_budget": -1.0}, {"dropout": 1.0},
-        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"pull": -1.0}, {"opacity_pull": -1.0},
-        {"size_pull": -1.0},
+        {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"prior_weight": -1.0}, {"opacity_reg": -1.0},
+        {"scale_reg": -1.0},
     ],
     ids=str,
 )  # fmt: skip
@@ -129,4 +129,4 @@ def test_shown(photos: Pair) -> None:
         torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
     )  # fmt: skip
     made.scales[-3:] = 0.02
-    assert shown(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]
+    assert visible_mask(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]

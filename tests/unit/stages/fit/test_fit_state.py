@@ -48,7 +48,7 @@ def used(gaussians: Gaussians) -> State:
     state.v[:] = rng.uniform(size=state.v.shape)
     state.x0 -= np.float32(0.01)
     state.units *= np.float32(1.5)
-    state.shares[:] = rng.uniform(size=len(state.x))
+    state.box_shares[:] = rng.uniform(size=len(state.x))
     return state
 
 
@@ -179,13 +179,13 @@ def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
     grown = grow(state, photos, n + 9)
     worst = np.sort(np.argsort(-error_masses(state, photos), kind="stable")[:9])
     rest = np.setdiff1d(np.arange(n), worst)
-    for name in ("x", "x0", "m", "v", "units", "shares", "colors"):
+    for name in ("x", "x0", "m", "v", "units", "box_shares", "colors"):
         np.testing.assert_array_equal(getattr(grown, name)[rest], getattr(state, name)[rest], err_msg=name)
     halves = np.concatenate([worst, np.arange(n, n + 9)])
     parents = np.concatenate([worst, worst])
     np.testing.assert_array_equal(grown.m[halves], state.m[parents])
     np.testing.assert_array_equal(grown.v[halves], state.v[parents])
-    np.testing.assert_array_equal(grown.shares[halves], state.shares[parents])
+    np.testing.assert_array_equal(grown.box_shares[halves], state.box_shares[parents])
     np.testing.assert_array_equal(grown.x0[halves], grown.x[halves])
     own = np.sort(grown.x[halves, SIZE:QUAT], 1)[:, 1:].mean(1)
     np.testing.assert_allclose(grown.units[halves], np.exp(own), rtol=1e-5)
@@ -216,7 +216,7 @@ def test_growing_happens_where_the_error_is(scene: PixelScene, gaussians: Gaussi
 
 def test_growing_repeats(gaussians: Gaussians, photos: Photos) -> None:
     one, two = (grow(used(gaussians), photos, len(gaussians) + 13) for _ in range(2))
-    for name in ("x", "x0", "m", "v", "units", "shares"):
+    for name in ("x", "x0", "m", "v", "units", "box_shares"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
@@ -244,8 +244,8 @@ def test_every_view_holds_something_out(size: tuple[int, int]) -> None:
 
 def test_share_of_the_blocks() -> None:
     photos = scene_photos(scenes.make_scene(scenes.wall(), scenes.arc(4, 128, 128)))
-    shares = [1 - np.mean(training_weights(photos, share, 0)) for share in (0.05, 0.25, 0.6)]
-    assert shares == pytest.approx([0.06, 0.25, 0.6], abs=0.12)
+    box_shares = [1 - np.mean(training_weights(photos, share, 0)) for share in (0.05, 0.25, 0.6)]
+    assert box_shares == pytest.approx([0.06, 0.25, 0.6], abs=0.12)
     one, other = (np.stack(training_weights(photos, 0.3, seed)) for seed in (0, 1))
     assert (one != other).any()
     assert (one[0] != one[1]).any()

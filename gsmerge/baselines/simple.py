@@ -1,0 +1,113 @@
+"""Baselines of a few lines: the input as it is or fitted, pruned, or merged over blocks of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.baselines.baseline import Baseline, merge_groups, most_important, own_gaussians, view_shares
+from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.fit import FitOptions, fit_scene
+from gsmerge.stages.prepare import PreparedScene
+from gsmerge.stages.segment import grid_labels
+from gsmerge.types import Cameras, Gaussians, Groups
+
+MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
+
+
+def unmerged(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """All Gaussians, whatever the count."""
+    return own_gaussians(prepared.scene)
+
+
+def unmerged_color(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """The colour fit on all Gaussians, none left out; whatever the count."""
+    return _fit_input(prepared, replace(prepared.options.fit, fit="color", min_contribution=0.0), log)
+
+
+def unmerged_fit(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """The full fit, with as many steps or as much time as ours; whatever the count.
+
+    Gaussians that no photo shows are replaced by others, so the number stays.
+    """
+    return _fit_input(prepared, replace(prepared.options.fit, fit="full"), log)
+
+
+def _fit_input(prepared: PreparedScene, options: FitOptions, log: RunLog) -> Gaussians:
+    """All Gaussians, fitted to the photos."""
+    gaussians = own_gaussians(prepared.scene)
+    return fit_scene(gaussians, prepared.scene, options, len(gaussians), seed=prepared.options.seed, log=log)
+
+
+def prune_by_opacity(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """The most opaque, unchanged and in their order; of equal ones the first of the file."""
+    gaussians = own_gaussians(prepared.scene)
+    with log.stage("reduce"):
+        return gaussians[most_important(gaussians.opacities, count)]
+
+
+def prune_by_contribution(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """Those that add most to the views (Mini-Splatting), unchanged and in their order; of equal ones the first."""
+    gaussians = own_gaussians(prepared.scene)
+    with log.stage("reduce"):
+        return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
+
+
+def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
+    """``[n]`` float64 blending weights summed over the pixels of all views; the same on any number of threads."""
+    splats = prepare(gaussians)
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+
+    def one_view(view: int) -> np.ndarray:
+        sums, _ = contributions(plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
+        return sums
+
+    total, step = np.zeros(len(splats)), max(1, MAX_PLANNED // max(len(splats), 1))
+    for first in range(0, len(cameras), step):
+        for sums in parallel_map(one_view, range(first, min(first + step, len(cameras)))):
+            total += sums
+    return total
+
+
+def prune_at_random(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """A random choice that depends only on the seed, unchanged and in their order."""
+    gaussians = own_gaussians(prepared.scene)
+    with log.stage("reduce"):
+        rng = np.random.default_rng(prepared.options.seed)
+        return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
+
+
+def merge_blocks(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """As many blocks as Gaussians, the same number in every view; those without a valid pixel are left out."""
+    scene = prepared.scene
+    height, width = scene.cameras.height, scene.cameras.width
+    with log.stage("segment"):
+        counts = view_shares(count, len(scene), height * width)
+        labels: Tensor = torch.from_numpy(np.stack([grid_labels(height, width, own) for own in counts]))
+    return merge_groups(prepared, Groups(labels, tuple(counts)), log)
+
+
+UNMERGED = Baseline("unmerged", "the input as it is", unmerged, uses=())
+UNMERGED_COLOR = Baseline(
+    "unmerged-color",
+    "the input with colours solved on the photos",
+    unmerged_color,
+    needs=("photos",),
+    uses=("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout"),
+)
+UNMERGED_FIT = Baseline(  # what merging has to be better than
+    "unmerged-fit",
+    "the input after the same full fit",
+    unmerged_fit,
+    needs=("photos",),
+    uses=tuple(f.name for f in fields(FitOptions) if f.name != "fit"),
+)
+OPACITY = Baseline("opacity", "keep the most opaque", prune_by_opacity)
+CONTRIBUTION = Baseline("contribution", "keep those with the largest summed blending weight", prune_by_contribution)
+RANDOM = Baseline("random", "keep a random choice", prune_at_random)
+BLOCKS = Baseline("blocks", "uniform pixel blocks, our moment rule", merge_blocks, needs=("pixels",))

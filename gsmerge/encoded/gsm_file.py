@@ -1,0 +1,344 @@
+"""The ``.gsm`` container, of encoded scenes and of states, and the encoded scene in it.
+
+A safetensors file with one metadata entry, whose name says the kind of content and whose text is a header in JSON.
+Nothing in a file is ever executed; every tensor and every entry is checked before it is used. Within one major schema
+tensors and entries are only ever added, and unknown ones are ignored. Keys that differ from the names in the code are
+in SETTING_KEYS, and these: division.whole (Division.uniform), division.deals (Division.growth_order), features.solved
+(GroupSet.fitted_sh0), features.held (GroupSet.color_precision), kept (Gaussians that no view sees).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from gsmerge import __version__
+from gsmerge.encoded.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
+from gsmerge.errors import SceneError
+from gsmerge.io.atomic import atomic_output
+from gsmerge.io.bounds import check_file
+from gsmerge.networks.checkpoint import build_networks
+from gsmerge.networks.tokens import GROUP
+from gsmerge.stages.decode import MAX_CHILDREN
+from gsmerge.stages.prepare import Frame
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+
+SCHEMA, MINOR = 1, 0  # files of a larger schema cannot be read; minor: what was added since the schema's first files
+SUFFIX = ".gsm"
+ENCODED, STATE = "gsmerge-encoded", "gsmerge-state"  # names of the metadata entry
+REMEDY = "copy it again, or encode the scene again"
+MAX_COUNT = 1 << 40
+MAX_SIDE = 1 << 16  # pixels per side of a view
+
+SETTING_KEYS = {
+    "max_k": "most",
+    "min_contribution": "prune",
+    "target_count": "wanted",
+    "num_slots": "places",
+    "knee_count": "knee",
+}
+COMMON_ENTRIES = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}
+ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind of content
+    ENCODED: COMMON_ENTRIES | {"networks": dict | None},
+    STATE: COMMON_ENTRIES,
+}
+PREFIXES = (
+    "features.", "division.", "children.", "kept.", "cameras.", "frame.", "heads.", "networks.", "replay.",
+)  # fmt: skip
+FEATURE_COLUMNS = tuple(
+    f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views", "backing")
+)
+
+
+def write_gsm(
+    path: str | PathLike[str],
+    kind: str,
+    stored: StoredScene,
+    features: FeatureGaussians,
+    children: tuple[str, Gaussians],
+    entries: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    *,
+    overwrite: bool,
+) -> None:
+    """Write a ``.gsm`` file: what both kinds have, and ``entries`` and ``tensors`` of one kind.
+
+    Args:
+        path: The file; complete, or what it was before.
+        kind: ``ENCODED`` or ``STATE``.
+        stored: The content.
+        features: Its groups.
+        children: The prefix of their children's keys, and the children.
+        entries: Further entries of the header.
+        tensors: Further tensors by key.
+        overwrite: Replace an existing file.
+
+    Raises:
+        SceneError: If the file exists or cannot be written.
+    """
+    frame, cameras, settings = stored.frame, stored.cameras, asdict(stored.settings)
+    header = {
+        "schema": SCHEMA,
+        "gsmerge": __version__,
+        "minor": MINOR,
+        "settings": {SETTING_KEYS.get(name, name): value for name, value in settings.items()},
+        "unit": frame.unit,
+        "width": cameras.width,
+        "height": cameras.height,
+        **entries,
+    }
+    kept = children[1][:0] if stored.kept is None else stored.kept
+    content = {f"features.{name}": getattr(features, name).float() for name in FEATURE_COLUMNS}
+    content |= {"features.views": features.views.int(), "features.backing": features.backing.to(torch.uint8)}
+    content |= {"cameras.viewmats": cameras.viewmats.double(), "cameras.Ks": cameras.Ks.double()}
+    content |= {"frame.origin": frame.origin.double()}
+    for prefix, gaussians in (children, ("kept", kept)):
+        content |= {f"{prefix}.{f.name}": getattr(gaussians, f.name).float() for f in fields(Gaussians)}
+    # Cloned, as safetensors refuses shared memory; one entry, as the order of several is not fixed.
+    data = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in (content | dict(tensors)).items()}
+    with atomic_output(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(save(data, {kind: json.dumps(header)}))
+
+
+def save_encoded(
+    path: str | PathLike[str],
+    encoded: Encoded,
+    *,
+    overwrite: bool = False,
+    source: Mapping[str, Any] | None = None,
+) -> None:
+    """Write an encoded scene.
+
+    Args:
+        path: The file, ``.gsm`` by convention; complete or not there at all.
+        encoded: From :func:`gsmerge.encode_scene`.
+        overwrite: Replace an existing file.
+        source: What is known of the file that the scene was read from; plain JSON types.
+
+    Raises:
+        SceneError: If the file exists or cannot be written.
+    """
+    division, heads = encoded.division, encoded.heads
+    entries = {
+        "networks": None if heads is None else asdict(heads.networks.options),
+        "about": {**encoded.about, **({} if source is None else {"source": dict(source)})},
+        "precision": "float32",  # of the networks' arithmetic: earlier versions had others and expect the key
+    }
+    tensors = {
+        "division.splits": division.splits,
+        "division.slots": division.slots,
+        "division.whole": division.uniform.int(),
+        "division.deals": division.growth_order.int(),
+    }
+    if heads is not None:
+        tensors |= {"heads.views": heads.views.int(), "heads.group": heads.group.float()}
+        tensors |= {f"networks.{name}": tensor for name, tensor in heads.networks.state_dict().items()}
+    children = "division", division.children
+    write_gsm(path, ENCODED, encoded, encoded.features, children, entries, tensors, overwrite=overwrite)
+
+
+@dataclass(frozen=True, eq=False)
+class GsmFile:
+    """The content of a ``.gsm`` file, checked as it is taken.
+
+    Args:
+        path: The file.
+        kind: ``ENCODED`` or ``STATE``.
+        header: Its header, each entry of its type.
+        tensors: Tensors by key.
+    """
+
+    path: Path
+    kind: str
+    header: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]
+
+    def error(self, problem: str) -> SceneError:
+        """That the file is damaged, and what to do."""
+        return SceneError(self.path, problem, REMEDY)
+
+    def tensor(self, key: str, dtype: torch.dtype, *shape: int | None) -> Tensor:
+        """A tensor of a type and shape (None: any size), finite.
+
+        Raises:
+            SceneError: If it is missing, another one, or not finite.
+        """
+        tensor = self.tensors.get(key)
+        expected = f"{key}: expected {str(dtype).removeprefix('torch.')} {['n' if n is None else n for n in shape]}"
+        if tensor is None:
+            raise self.error(f"{expected}, found none")
+        same_rank = tensor.dtype == dtype and tensor.ndim == len(shape)
+        if not same_rank or any(n is not None and n != size for n, size in zip(shape, tensor.shape, strict=True)):
+            raise self.error(f"{expected}, found {str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}")
+        if dtype.is_floating_point and not bool(torch.isfinite(tensor).all()):
+            raise self.error(f"{key}: expected finite numbers, found others")
+        return tensor
+
+    def features(self) -> FeatureGaussians:
+        """Feature Gaussians without their members."""
+        g = len(self.tensor("features.means", torch.float32, None, 3))
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (None, 3), "latents": (None,),
+        }  # fmt: skip
+        return FeatureGaussians(
+            **{
+                name: self.tensor(f"features.{name}", torch.float32, g, *shapes.get(name, ()))
+                for name in FEATURE_COLUMNS
+            },
+            views=self.tensor("features.views", torch.int32, g).long(),
+            backing=self.tensor("features.backing", torch.uint8, g).bool(),
+            starts=torch.zeros(g + 1, dtype=torch.int64),
+            members=torch.zeros(0, dtype=torch.int64),
+        )
+
+    def gaussians(self, prefix: str, count: int | None, num_higher: int) -> Gaussians:
+        """``count`` Gaussians (None: any number) with ``num_higher`` bases of higher harmonics."""
+        n = len(self.tensor(f"{prefix}.means", torch.float32, count, 3))
+        shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
+        return Gaussians(*(self.tensor(f"{prefix}.{name}", torch.float32, n, *shape) for name, shape in shapes.items()))
+
+    def common(self, num_higher: int) -> dict[str, Any]:
+        """Fields that encoded scenes and states share: kept, frame, cameras."""
+        kept = self.gaussians("kept", None, num_higher)
+        unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
+        origin = self.tensor("frame.origin", torch.float64, 3)
+        if not 0 < unit < float("inf"):
+            raise self.error(f"unit: expected a length above 0, found {unit}")
+        viewmats = self.tensor("cameras.viewmats", torch.float64, None, 4, 4)
+        Ks = self.tensor("cameras.Ks", torch.float64, len(viewmats), 3, 3)
+        if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+            raise self.error(f"expected the size of the views, found {width} x {height}")
+        cameras = Cameras(viewmats, Ks, width, height)
+        return {"kept": kept if len(kept) else None, "frame": Frame(origin, unit), "cameras": cameras}
+
+    def settings(self) -> StoredSettings:
+        """The settings that are known here, each within its range."""
+        values: dict[str, Any] = {}
+        for f in fields(StoredSettings):
+            key = SETTING_KEYS.get(f.name, f.name)
+            value, is_share = self.header["settings"].get(key), f.name in ("min_opacity", "min_contribution")
+            low, high = (1, MAX_CHILDREN) if f.name in ("k", "max_k") else (0, 1 if is_share else MAX_COUNT)
+            absent = value is None and key in self.header["settings"] and f.name in ("target_count", "num_slots")
+            if not absent and not (f.name == "k" and value == "auto"):
+                number = isinstance(value, int | float if is_share else int) and not isinstance(value, bool)
+                if not number or not low <= value <= high:
+                    raise self.error(f"{key}: expected a number from {low} to {high}, found {value!r:.40}")
+            values[f.name] = value
+        return StoredSettings(**values)
+
+
+def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
+    """Read a ``.gsm`` file of one of some kinds.
+
+    Raises:
+        SceneError: If there is no such file, it is damaged or of another format or a newer schema, or its header lacks
+            an entry.
+    """
+    path = Path(path)
+    check_file(path)
+    try:
+        with safe_open(path, "pt") as file:
+            known = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
+            metadata, tensors = file.metadata() or {}, {name: file.get_tensor(name) for name in known}
+    except (SafetensorError, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode or extend"
+        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({reason})", remedy) from error
+    kind = next((kind for kind in kinds if kind in metadata), None)
+    if kind is None:
+        raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
+    return GsmFile(path, kind, _read_header(path, metadata[kind], ENTRIES[kind]), tensors)
+
+
+def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    """The header, of a schema that is known here; ``entries``: the type of each entry that it must have."""
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise SceneError(path, "expected a header in JSON, found something else", REMEDY) from error
+    if not isinstance(header, dict) or not isinstance(header.get("schema"), int):
+        raise SceneError(path, "expected a header with its schema, found none", REMEDY)
+    if header["schema"] != SCHEMA:
+        newer = f"written by gsmerge {str(header.get('gsmerge'))[:40]}; this is {__version__}, update it"
+        problem = f"expected schema {SCHEMA}, found {header['schema']}"
+        raise SceneError(path, problem, newer if header["schema"] > SCHEMA else REMEDY)
+    for name, kind in entries.items():
+        if name not in header or not isinstance(header[name], kind):
+            raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
+    return header
+
+
+def load_encoded(path: str | PathLike[str]) -> Encoded:
+    """An encoded scene from a file; nothing in it is ever executed.
+
+    Raises:
+        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks a tensor, or holds
+            numbers out of range.
+    """
+    return read_encoded(read_gsm(path, ENCODED))
+
+
+def read_encoded(file: GsmFile) -> Encoded:
+    """The encoded scene of a file of that kind.
+
+    Raises:
+        SceneError: As :func:`load_encoded`.
+    """
+    features, settings = file.features(), file.settings()
+    common = file.common(features.shN.shape[1])
+    return Encoded(
+        features=features,
+        division=_read_division(file, features),
+        settings=settings,
+        heads=_read_heads(file, features, len(common["cameras"])),
+        about=file.header["about"],
+        **common,
+    )
+
+
+def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
+    """The children, with every index within its range."""
+    g = len(features)
+    splits, slots = file.tensor("division.splits", torch.uint8, g), file.tensor("division.slots", torch.uint8, None)
+    uniform = file.tensor("division.whole", torch.int32, None)
+    order = file.tensor("division.deals", torch.int32, None)
+    counts, rows = splits.numpy().astype(np.int64), uniform.numpy()
+    ok = counts.max(initial=0) < MAX_CHILDREN and counts.sum() == len(slots)
+    if ok:
+        steps = np.arange(len(slots)) - np.repeat(np.cumsum(counts) - counts, counts)
+        in_order = len(rows) == 0 or bool(rows[0] >= 0 and rows[-1] < g and (np.diff(rows) > 0).all())
+        ok = bool((slots.numpy() <= steps).all()) and in_order and not counts[rows].any()
+    if ok and len(order):
+        ok = int(order.min()) >= 0 and int(order.max()) < g
+        ok = ok and bool((np.bincount(order.numpy(), minlength=g) <= counts).all())
+    if not ok:
+        raise file.error("division: expected children that belong to their groups, found others")
+    children = file.gaussians("division", 2 * len(slots) + len(uniform), features.shN.shape[1])
+    return Division(splits, slots, uniform.long(), children, order.long())
+
+
+def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> StoredHeads | None:
+    """The networks, if there are any, and what they know of the groups."""
+    header, prefix = file.header, "networks."
+    if header["networks"] is None:
+        return None
+    weights = {name.removeprefix(prefix): t for name, t in file.tensors.items() if name.startswith(prefix)}
+    networks = build_networks(file.path, header["networks"], weights, REMEDY)
+    views = file.tensor("heads.views", torch.int32, len(features)).long()
+    if len(views) and not 0 <= int(views.min()) <= int(views.max()) < num_views:
+        raise file.error("heads.views: expected views of the scene, found others")
+    latent, expected = features.latents.shape[1], networks.options.latent
+    if latent != expected:
+        raise file.error(f"features.latents: expected {expected} numbers, as of its networks, found {latent}")
+    group = file.tensor("heads.group", torch.float32, len(features), GROUP)
+    return StoredHeads(networks, views, group)

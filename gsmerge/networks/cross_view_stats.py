@@ -1,0 +1,56 @@
+"""How well the Gaussians of the other views agree with a Feature Gaussian, without any photo."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
+from gsmerge.moments import Members
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import SH_C0, Cameras
+
+NUM_STATS = COLUMNS + 1
+NEAR = 0.03  # largest difference of the logarithms of two depths on the same surface
+FAR = 0.3  # larger differences of the logarithms of depths are clipped to this
+MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
+ROWS = 8192  # points per task
+
+
+def cross_view_stats(means: Tensor, sh0: Tensor, views: Tensor, members: Members, cameras: Cameras) -> Tensor:
+    """Agreement with the Gaussian of the pixel that each point projects to in every other view.
+
+    Args:
+        means: ``[g,3]`` points, world.
+        sh0: ``[g,1,3]`` base colours.
+        views: ``[g]`` int64 view that each belongs to, which is left out.
+        members: The scene's Gaussians, one per pixel; for an unaligned scene the statistics are zero.
+        cameras: All views.
+
+    Returns:
+        ``[g,7]``: logarithm of the number of views that see the point; the shares of these views whose surface is at
+        the point, behind it and in front of it; the mean difference of colours and of relative depths; the logarithm
+        of the number of views.
+    """
+    stats = torch.zeros(len(means), NUM_STATS)
+    stats[:, 6] = float(np.log(len(cameras))) / 4
+    if members.pixels is not None or len(means) == 0:
+        return stats
+    points, colors = means.double().contiguous().numpy(), (SH_C0 * sh0[:, 0]).contiguous().numpy()
+    viewmats, Ks = (tensor.double().contiguous().numpy() for tensor in (cameras.viewmats, cameras.Ks))
+    size, limits = (cameras.width, cameras.height), (SH_C0, NEAR, FAR, MIN_OPACITY)
+    sums, m = np.zeros((len(points), COLUMNS)), members
+
+    def add(first: int) -> None:
+        last = min(first + ROWS, len(points))
+        sum_cross_view(
+            points, colors, views.numpy(), viewmats, Ks, *size, m.means, m.opacities, m.sh0, *limits, first, last, sums
+        )  # fmt: skip
+
+    parallel_map(add, range(0, len(points), ROWS))
+    num_seen, num_same = np.maximum(sums[:, 0], 1), np.maximum(sums[:, 1], 1)
+    shares = [sums[:, 1] / num_seen, sums[:, 2] / num_seen, sums[:, 3] / num_seen, sums[:, 4] / num_same]
+    columns = np.stack([np.log1p(sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
+    stats[:, :6] = torch.from_numpy(columns).float()
+    return stats

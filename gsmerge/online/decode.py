@@ -1,0 +1,102 @@
+"""State -> gaussians: decoded at any K or number, and fitted to the photos that the state has stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsmerge.encoded.decode import decode_scene, plan_decode
+from gsmerge.encoded.encoded import Encoded
+from gsmerge.errors import UsageError
+from gsmerge.online.photos import BatchPhotos
+from gsmerge.online.state import OnlineState, to_encoded
+from gsmerge.runtime.run_log import Progress, RunLog
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.fit import FitOptions, FitReport, fit, start_share
+from gsmerge.stages.prepare import Frame
+from gsmerge.types import Gaussians
+
+
+@dataclass(frozen=True)
+class DecodeResult:
+    """Gaussians of a state in the world frame, what the fit did (None without one), and notes for the user."""
+
+    gaussians: Gaussians
+    fit: FitReport | None
+    notes: tuple[str, ...]
+
+
+def decodable(stored: Encoded | OnlineState, *, fitted_colors: bool = True) -> Encoded:
+    """What is decoded: the encoded scene, or the state as one, see :func:`gsmerge.online.state.to_encoded`."""
+    return stored if isinstance(stored, Encoded) else to_encoded(stored, fitted_colors=fitted_colors)
+
+
+def num_photos(stored: Encoded | OnlineState) -> int:
+    """Photos that a fit can use."""
+    return 0 if isinstance(stored, Encoded) else len(stored.replay)
+
+
+def default_fit(stored: Encoded | OnlineState) -> FitOptions:
+    """The full fit where there are photos, otherwise none."""
+    return FitOptions(fit="full" if num_photos(stored) else "none")
+
+
+def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
+    """Refuse a fit without photos.
+
+    Raises:
+        UsageError: If a fit is asked for and there are no photos.
+    """
+    if options.fit != "none" and not num_photos(stored):
+        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
+
+
+def decode_stored(
+    stored: Encoded | OnlineState,
+    *,
+    k: int | str | None = None,
+    budget: int | str | None = None,
+    options: FitOptions | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> DecodeResult:
+    """A state as Gaussians in the world frame, fitted to the photos that it has stored; or an encoded scene.
+
+    Args:
+        stored: A state of one or more batches, or an encoded scene, which has no photos.
+        k: As of :func:`gsmerge.decode_scene`.
+        budget: As there. A full fit begins with fewer and grows to the number.
+        options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
+        seed: Of the fit.
+        threads: Threads to use; None: all processors.
+        progress: As of :func:`gsmerge.compact`.
+
+    Raises:
+        UsageError: If a fit is asked for and there are no photos, or K or the budget is out of range.
+    """
+    options = options or default_fit(stored)
+    check_fit(stored, options)
+    encoded = decodable(stored, fitted_colors=options.fit == "none")
+    plan = plan_decode(encoded, k=k, budget=budget)
+    if options.fit == "none":
+        return DecodeResult(decode_scene(encoded, k=k, budget=budget, threads=threads), None, plan.notes)
+    assert isinstance(stored, OnlineState)
+    log = RunLog(progress)
+    max_count = int(plan.counts.sum())
+    start_count = max(len(encoded), int(start_share(options) * max_count)) + encoded.num_kept
+    canonical = replace(encoded, frame=Frame(torch.zeros(3, dtype=torch.float64), 1.0))
+    with use_threads(threads), torch.no_grad():
+        gaussians = decode_scene(canonical, budget=start_count, threads=threads)
+        images = stored.replay.images.astype(np.float32) / np.float32(255)
+        replay = BatchPhotos(images, stored.cameras[torch.from_numpy(stored.replay.views)])
+        photos = replay.photos(), replay.photos(2)
+        with log.stage("fit"):
+            gaussians, report = fit(gaussians, photos, options, max_count, seed, log.fit_progress)
+    if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
+        note = "the fit was not accepted: held-out parts of the photos did not get better"
+        gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)
+        return DecodeResult(gaussians, report, (*plan.notes, note))
+    return DecodeResult(stored.frame.leave(gaussians), report, plan.notes)

@@ -1,0 +1,106 @@
+"""Which groups of the state a batch sees, and which of its own groups show something new."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.online.options import OnlineOptions
+from gsmerge.render.photos import Photos, photo_errors
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+
+REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
+MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
+
+
+def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
+    """``[v,g]`` bool: groups that may show in each view, by their position and size.
+
+    The only step that goes through all groups: the time of those after it depends on what the views see.
+    """
+    means = features.means.double().numpy()
+    radii = REACH * np.sqrt(features.covars.double().diagonal(dim1=1, dim2=2).sum(1).numpy())
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+
+    def one_view(view: int) -> np.ndarray:
+        viewmat, K = viewmats[view], Ks[view]
+        points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        inside: np.ndarray = points[:, 2] > -radii
+        for axis, size in ((0, cameras.width), (1, cameras.height)):
+            for edge, sign in ((-MARGIN, 1), (size + MARGIN, -1)):
+                normal = np.zeros(3)  # of the plane through the camera and an edge of the image, inward
+                normal[axis], normal[2] = sign * K[axis, axis], sign * (K[axis, 2] - edge)
+                inside &= points @ (normal / np.linalg.norm(normal)) > -radii
+        return inside
+
+    return np.stack(parallel_map(one_view, range(len(cameras))))
+
+
+def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> Tensor:
+    """Rows, rising, of the groups that may show in some view."""
+    return torch.from_numpy(np.flatnonzero(groups_in_view(features, cameras).any(0)))
+
+
+def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
+    """``[v,h,w]`` float32 mean squared colour error of every pixel, plus the squared transmittance.
+
+    The transmittance counts holes, which a black photo would hide.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        photos: The views, usually at half size.
+        height: Of the result.
+        width: Of the result.
+    """
+
+    def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
+        errors = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(-1) + transmittance**2
+        return cv2.resize(errors.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
+
+    return np.stack(photo_errors(gaussians, photos, score))
+
+
+def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
+    """``[g]`` mean of the pixels' errors over the members of every group; a member without a pixel counts as 1.
+
+    Args:
+        features: g Feature Gaussians, each with at least one member.
+        members: The scene's Gaussians that they point to.
+        errors: ``[v,h,w]``.
+    """
+    rows = features.members.numpy()
+    pixels = rows if members.pixels is None else members.pixels[rows]
+    each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)
+    starts = features.starts.numpy()
+    return np.add.reduceat(each, starts[:-1]) / np.diff(starts)
+
+
+def novel_rows(
+    there: Gaussians,
+    features: FeatureGaussians,
+    members: Members,
+    photos: Photos,
+    cameras: Cameras,
+    options: OnlineOptions,
+) -> Tensor:
+    """Rows of a batch's groups that show something which the state does not show as well.
+
+    Args:
+        there: The state's Gaussians in view.
+        features: The batch's groups.
+        members: The Gaussians that they point to.
+        photos: The batch's photos at half the state's size.
+        cameras: The batch's own cameras.
+        options: The errors that count as shown well.
+    """
+    if options.tolerance == 0:
+        return torch.arange(len(features))
+    size = cameras.height, cameras.width
+    errors = group_errors(features, members, pixel_errors(there, photos, *size))
+    own_errors = group_errors(features, members, pixel_errors(feature_to_gaussians(features), photos, *size))
+    limit = np.maximum(options.tolerance**2, options.margin**2 * own_errors)
+    return torch.from_numpy(np.flatnonzero(errors > limit))

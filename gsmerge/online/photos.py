@@ -1,0 +1,129 @@
+"""The photos of a batch: brought to the state's size, colours fitted to them, some of them stored for later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.online.novelty import rows_in_view
+from gsmerge.online.state import GroupSet, Replay, replace_groups, select_groups
+from gsmerge.render.photos import Photos, photos_of
+from gsmerge.render.weights import apply_transposed
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.fit import FitReport
+from gsmerge.stages.fit.color import draw, fit_colors
+from gsmerge.stages.fit.options import FitOptions
+from gsmerge.types import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class BatchPhotos:
+    """Photos ``images [v,h,w,3]`` float32, sRGB in [0, 1], and their cameras, of the same size."""
+
+    images: np.ndarray
+    cameras: Cameras
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def photos(self, level: int = 1) -> Photos:
+        """For rendering against them, each side divided by ``level``."""
+        return photos_of(self.images, self.cameras, level)
+
+
+def resize_photos(images: Tensor, cameras: Cameras, width: int, height: int) -> BatchPhotos:
+    """Photos brought to another size (area averages)."""
+    arrays, size = images.numpy(), (width, height)
+    if size == (cameras.width, cameras.height):
+        return BatchPhotos(arrays, cameras)
+    small = parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), arrays)
+    return BatchPhotos(np.stack(small), resize_cameras(cameras, width, height))
+
+
+def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
+    """The same views in pictures of another size."""
+    shape = torch.tensor([[width / cameras.width], [height / cameras.height], [1.0]], dtype=torch.float64)
+    return Cameras(cameras.viewmats.double(), cameras.Ks.double() * shape, width, height)
+
+
+def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
+    """Cameras of one size, one after the other."""
+    viewmats = torch.cat([first.viewmats.double(), second.viewmats.double()])
+    return Cameras(viewmats, torch.cat([first.Ks.double(), second.Ks.double()]), first.width, first.height)
+
+
+def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
+    """``[v]`` index of each view: of the known view with the same camera to the last bit, or a new one."""
+    known_ids = {row: i for i, row in reversed(list(enumerate(_rows(known))))}
+    ids = np.array([known_ids.get(row, -1) for row in _rows(cameras)], np.int64)
+    ids[ids < 0] = len(known) + np.arange(np.count_nonzero(ids < 0))
+    return ids
+
+
+def _rows(cameras: Cameras) -> list[bytes]:
+    """Every camera as bytes."""
+    flat = torch.cat([cameras.viewmats.double().flatten(1), cameras.Ks.double().flatten(1)], 1)
+    return [row.tobytes() for row in flat.numpy()]
+
+
+def update_replay(
+    replay: Replay, batch_photos: BatchPhotos, view_ids: np.ndarray, num_views: int, max_photos: int
+) -> Replay:
+    """The stored photos with new ones among them: every n-th of all views, n a power of two.
+
+    Args:
+        replay: Those stored so far.
+        batch_photos: The new ones.
+        view_ids: ``[s]`` the view of each new one; of a view that is stored already, the first photo stays.
+        num_views: Views in all.
+        max_photos: Most photos that are stored.
+    """
+    ids, rows = np.unique(view_ids, return_index=True)
+    new = ~np.isin(ids, replay.views)
+    views, step = np.concatenate([replay.views, ids[new]]), 1
+    while max_photos and -(-num_views // step) > max_photos:  # of all views, so that the batches' sizes do not matter
+        step *= 2
+    stays = (views % step == 0) & (max_photos > 0)
+    if max_photos and not stays.any():  # earlier views came without photos
+        stays[np.argmax(views)] = True
+    old_stays, new_stays = stays[: len(replay)], stays[len(replay) :]
+    images = np.rint(batch_photos.images[rows[new][new_stays]] * 255).astype(np.uint8)
+    order = np.argsort(views[stays])
+    return Replay(np.concatenate([replay.images[old_stays], images])[order], views[stays][order])
+
+
+def fit_batch_colors(
+    groups: GroupSet, batch_photos: BatchPhotos, options: FitOptions, seed: int = 0
+) -> tuple[GroupSet, FitReport]:
+    """Fit base colours to new photos, with earlier photos as a prior.
+
+    The normal equations of earlier photos are stored as their diagonal (``GroupSet.color_precision``) about the colours
+    that solve them: ``color_precision |colour - fitted colour|^2`` is added to the equations of the new photos, so that
+    no earlier photo is needed again.
+
+    Args:
+        groups: The state's groups.
+        batch_photos: The new photos.
+        options: Of the colour fit.
+        seed: Chooses the held-out blocks.
+
+    Returns:
+        The groups, the new photos added to their colour precision, and what was done. Where held-out blocks did not
+        get better, the colours stay and their precision grows all the same.
+    """
+    rows = rows_in_view(groups.features, batch_photos.cameras)
+    in_view, photos = select_groups(groups, rows), batch_photos.photos(2)
+    before = replace(feature_to_gaussians(in_view.features), sh0=in_view.fitted_sh0)
+    drawn = draw(before, photos)
+    after, report = fit_colors(before, drawn, photos, options, seed, in_view.color_precision.numpy())
+    all_pixels = np.ones((photos.height, photos.width, 1), np.float32)
+    precision = in_view.color_precision.double().numpy()
+    for view in drawn.views:
+        precision[view.ids] += apply_transposed(replace(view, weights=view.weights**2), all_pixels)[:, 0]
+    refitted = replace(in_view, fitted_sh0=after.sh0, color_precision=torch.from_numpy(precision).float())
+    return replace_groups(groups, rows, refitted), report

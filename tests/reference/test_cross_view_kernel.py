@@ -1,0 +1,64 @@
+"""What other views say of points, against one point and one view at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import arc, make_scene, room
+
+from gsmerge.geometry import project
+from gsmerge.moments import Members, scene_members
+from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import SH_C0, Cameras, PixelScene
+
+
+def slowly(
+    means: torch.Tensor, sh0: torch.Tensor, views: torch.Tensor, members: Members, cameras: Cameras
+) -> np.ndarray:
+    """``[g,7]``: a loop over points and views."""
+    places, depths = project(means, cameras)
+    found = np.zeros((len(means), 7))
+    found[:, 6] = np.log(len(cameras)) / 4
+    for i in range(len(means)):
+        seen, kinds, color, ratios = 0, [0, 0, 0], 0.0, 0.0
+        for v in range(len(cameras)):
+            x, y = (int(np.floor(float(c))) for c in places[v, i]) if depths[v, i] > 0 else (-1, -1)
+            if v == int(views[i]) or not (0 <= x < cameras.width and 0 <= y < cameras.height):
+                continue
+            j = (v * cameras.height + y) * cameras.width + x
+            there = project(torch.from_numpy(members.means[j : j + 1]), cameras)[1][v, 0]
+            if not (there > 0 and members.opacities[j] > MIN_OPACITY):
+                continue
+            ratio, seen = float(torch.log(depths[v, i] / there)), seen + 1
+            kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
+            if abs(ratio) < NEAR:
+                color += float(np.abs(SH_C0 * (sh0[i, 0].numpy() - members.sh0[j, 0])).mean())
+            ratios += float(np.clip(ratio, -FAR, FAR))
+        shares = [kind / max(seen, 1) for kind in kinds]
+        found[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
+    return found
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return make_scene(room(), arc(4, 24, 18))
+
+
+def test_every_point_and_view(scene: PixelScene) -> None:
+    """Points on surfaces, before and behind them, behind cameras, and of no view."""
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randperm(len(scene.gaussians), generator=generator)[:160]
+    means = scene.gaussians.means[rows] * (1 + 0.1 * torch.randn(160, 1, generator=generator))
+    means[:8] = -means[:8]
+    views = rows // scene.pixels_per_view
+    views[8:16] = -1
+    members = scene_members(scene)
+    members.opacities[::7] = 0
+    with use_threads(2):
+        found = cross_view_stats(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+    wanted = slowly(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+    assert len(np.unique(found[:, 0])) > 3
+    assert (wanted[:, 1:4].max(0) > 0).all()
+    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-5)

@@ -1,0 +1,160 @@
+"""The file: what comes back, what is ignored, and every kind of damage."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import scenes
+import torch
+from learned import noisy, written
+from safetensors.torch import load_file, save_file
+from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
+
+from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
+from gsmerge.encoded.gsm_file import ENCODED
+from gsmerge.errors import SceneError
+
+
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory: pytest.TempPathFactory) -> Encoded:
+    checkpoint = written(tmp_path_factory.mktemp("networks") / "a.safetensors", noisy())
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3), degree=1)
+    return encode_scene(scene, superpixels=60, checkpoint=str(checkpoint), fit="none")
+
+
+@pytest.fixture
+def path(encoded: Encoded, tmp_path: Path) -> Path:
+    save_encoded(tmp_path / "scene.gsm", encoded)
+    return tmp_path / "scene.gsm"
+
+
+TENSORS = (
+    *(f"features.{name}" for name in ("means", "covars", "masses", "latents", "views", "backing", "sh0", "shN")),
+    *("division.splits", "division.slots", "division.whole", "division.deals", "division.quats", "division.shN"),
+    *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "heads.views", "heads.group"),
+    "networks.heads.1.out.weight",
+)
+DAMAGED: dict[str, Spoil] = {
+    "missing": Path.unlink,
+    "empty": lambda path: path.write_bytes(b""),
+    "a few bytes": cut(0.0001),
+    "half": cut(0.5),
+    "all but the end": cut(0.999),
+    "a byte too many": lambda path: path.write_bytes(path.read_bytes() + b"x"),
+    "a PLY file": lambda path: path.write_text("ply\nformat ascii 1.0\nend_header\n"),
+    "a pickle": lambda path: path.write_bytes(pickle.dumps({"a": 1}) * 9),
+    "a huge header": lambda path: path.write_bytes(b"\xff" * 8 + path.read_bytes()[8:]),
+    "no header": lambda path: save_file(load_file(path), path),
+    "another's header": with_text("{}", "gsmerge-networks"),
+    "no JSON": with_text("{"),
+    "a list": with_text("[]"),
+    "deep JSON": with_text("[" * 100_000),
+    "no schema": without("schema"),
+    "an older schema": with_header(schema=0),
+    "a newer schema": with_header(schema=2, gsmerge="9.9"),
+    "no settings": without("settings"),
+    "no unit": without("unit"),
+    "a unit of zero": with_header(unit=0.0),
+    "a unit that is none": with_header(unit=float("nan")),
+    "no networks": with_header(networks={"width": -1}),
+    "networks of another size": with_header(networks={"width": 32, "heads": 2, "latent": 4}),
+    "no width": without("width"),
+    "views without pixels": with_header(width=0),
+    "k of nine": with_settings(k=9),
+    "k of words": with_settings(k="many"),
+    "most of none": with_settings(most=0),
+    "an opacity of two": with_settings(min_opacity=2.0),
+    "a share that is none": with_settings(prune=float("nan")),
+    "a negative number": with_settings(wanted=-1),
+    "a knee of words": with_settings(knee="knee"),
+    "slots beyond the children": with_tensor("division.slots", lambda t: t + 8),
+    "more splits than slots": with_tensor("division.splits", lambda t: t + 1),
+    "fewer slots": with_tensor("division.slots", lambda t: t[1:].clone()),
+    "deals to nobody": with_tensor("division.deals", filled(10_000_000)),
+    "deals to one": with_tensor("division.deals", torch.zeros_like),
+    "negative deals": with_tensor("division.deals", filled(-1)),
+    "wholes beyond": with_tensor("division.whole", lambda t: torch.full((1,), 10_000_000, dtype=torch.int32)),
+    "wholes that are split": with_tensor("division.whole", lambda t: torch.zeros(1, dtype=torch.int32)),
+    "views beyond": with_tensor("heads.views", filled(3)),
+    **{f"no {name}": with_tensor(name, None) for name in TENSORS},
+    **{
+        f"{name} of doubles": with_tensor(name, lambda t: t.float() if t.dtype == torch.float64 else t.double())
+        for name in TENSORS
+    },
+    **{f"{name} of another shape": with_tensor(name, lambda t: t[None].clone()) for name in TENSORS},
+    **{
+        f"NaN in {name}": with_tensor(name, filled(float("nan")))
+        for name in ("features.covars", "division.means", "cameras.Ks", "frame.origin", "heads.group")
+    },
+    "infinity in features.means": with_tensor("features.means", filled(float("inf"))),
+}
+
+
+def test_everything_comes_back(path: Path, encoded: Encoded) -> None:
+    found = load_encoded(path)
+    assert found.settings == encoded.settings
+    assert found.frame.unit == encoded.frame.unit
+    assert found.about == json.loads(json.dumps(encoded.about))
+    assert len(found) == len(encoded)
+    assert found.heads is not None
+    for name, tensor in vars(encoded.features).items():
+        assert torch.equal(getattr(found.features, name), tensor), name
+    for k in (1, 2, 4):
+        assert scenes.identical(decode_scene(found, k=k), decode_scene(encoded, k=k))
+
+
+def test_what_no_view_sees_comes_back(encoded: Encoded, tmp_path: Path) -> None:
+    kept = replace(encoded, kept=encoded.division.children[:5])
+    save_encoded(tmp_path / "kept.gsm", kept)
+    found = load_encoded(tmp_path / "kept.gsm")
+    assert found.num_kept == 5
+    assert scenes.identical(decode_scene(found), decode_scene(kept))
+
+
+def test_the_same_scene_gives_the_same_bytes(path: Path, encoded: Encoded, tmp_path: Path) -> None:
+    save_encoded(tmp_path / "again.gsm", encoded)
+    assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
+    save_encoded(tmp_path / "loaded.gsm", load_encoded(path))
+    assert (tmp_path / "loaded.gsm").read_bytes() == path.read_bytes()
+
+
+def test_the_source_is_told(encoded: Encoded, tmp_path: Path) -> None:
+    save_encoded(tmp_path / "scene.gsm", encoded, source={"name": "scene.ply", "bytes": 5})
+    assert load_encoded(tmp_path / "scene.gsm").about["source"] == {"name": "scene.ply", "bytes": 5}
+
+
+def test_what_is_not_known_is_not_looked_at(path: Path, encoded: Encoded) -> None:
+    told, tensors = header(path), load_file(path)
+    tensors["features.moods"], tensors["state.views"] = torch.full((7,), float("nan")), torch.zeros(3)
+    told |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # older versions wrote a precision
+    told["settings"]["mood"] = "better"
+    save_file(tensors, path, {ENCODED: json.dumps(told), "mood": "best"})
+    assert scenes.identical(decode_scene(load_encoded(path)), decode_scene(encoded))
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGED))
+def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
+    DAMAGED[damage](path)
+    with pytest.raises(SceneError) as told:
+        load_encoded(path)
+    assert str(told.value).startswith(f"{path}: ")
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 400 + len(str(path))
+
+
+def test_a_newer_schema_says_what_to_do(path: Path) -> None:
+    DAMAGED["a newer schema"](path)
+    with pytest.raises(SceneError, match=r"expected schema 1, found 2; written by gsmerge 9\.9; this is .*, update it"):
+        load_encoded(path)
+
+
+def test_an_existing_file_is_kept(path: Path, encoded: Encoded) -> None:
+    before = path.read_bytes()
+    with pytest.raises(SceneError, match="exists already"):
+        save_encoded(path, encoded)
+    save_encoded(path, encoded, overwrite=True)
+    assert path.read_bytes() == before

@@ -1,0 +1,155 @@
+"""Photos at the state's size, and which of them are kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from arriving import room
+
+from gsmerge import Cameras
+from gsmerge.geometry import project
+from gsmerge.online.photos import BatchPhotos, concat_cameras, resize_cameras, resize_photos, update_replay, view_ids
+from gsmerge.online.state import Replay
+
+NOTHING = Replay(np.zeros((0, 2, 3, 3), np.uint8), np.zeros(0, np.int64))
+
+
+def batch_photos(first: int, count: int) -> BatchPhotos:
+    """Pictures of 3 x 2 pixels, each of its number."""
+    images = np.broadcast_to(np.arange(first, first + count)[:, None, None, None] / np.float32(255), (count, 2, 3, 3))
+    eyes, lenses = torch.eye(4, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    return BatchPhotos(
+        np.ascontiguousarray(images, np.float32), Cameras(eyes.expand(count, 4, 4), lenses.expand(count, 3, 3), 3, 2)
+    )
+
+
+def kept(sizes: list[int], most: int, start: int = 0) -> Replay:
+    """What is kept of batches of given sizes."""
+    found, first = NOTHING, start
+    for size in sizes:
+        found = update_replay(found, batch_photos(first, size), np.arange(first, first + size), first + size, most)
+        first += size
+    return found
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 4, 7, 16])
+@pytest.mark.parametrize("num_views", [1, 2, 5, 6, 8, 9, 23])
+def test_kept_photos_do_not_depend_on_the_batches(most: int, num_views: int) -> None:
+    """At most so many, every so many-th of all, whatever the sizes of the batches were."""
+    rng = np.random.default_rng(most)
+    whole = kept([num_views], most)
+    views = whole.views.tolist()
+    assert 1 <= len(views) <= most
+    assert len(views) > min(most, num_views) / 2
+    step = views[1] - views[0] if len(views) > 1 else num_views
+    assert views == list(range(0, num_views, step))
+    assert whole.images[:, 0, 0, 0].tolist() == views
+    cuts = [[1] * num_views, [num_views - num_views // 2, num_views // 2]]
+    cuts += [np.diff([0, *sorted(rng.integers(0, num_views, 3)), num_views]).tolist() for _ in range(3)]
+    for sizes in cuts:
+        found = kept([size for size in sizes if size], most)
+        assert found.views.tolist() == views, sizes
+        np.testing.assert_array_equal(found.images, whole.images)
+
+
+@pytest.mark.parametrize("start", [1, 3, 7])
+@pytest.mark.parametrize("most", [1, 2, 5])
+def test_views_without_photos_before(start: int, most: int) -> None:
+    """Where the first photo is no even one, one is kept all the same."""
+    found = kept([1, 1, 1], most, start)
+    assert 1 <= len(found) <= most
+    assert found.views.tolist() == kept([3], most, start).views.tolist()
+    assert found.images[:, 0, 0, 0].tolist() == found.views.tolist()
+
+
+def test_views_that_come_again_are_kept_once() -> None:
+    many = kept([4], 4)
+    again = update_replay(many, batch_photos(10, 3), np.array([1, 4, 1]), 5, 8)
+    assert again.views.tolist() == [0, 1, 2, 3, 4]
+    assert again.images[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 11]
+
+
+def test_photos_of_views_that_came_without() -> None:
+    found = update_replay(kept([1, 1], 8, 4), batch_photos(0, 3), np.array([0, 2, 1]), 6, 8)
+    assert found.views.tolist() == [0, 1, 2, 4, 5]
+    assert found.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
+
+
+def test_known_cameras_are_found() -> None:
+    cameras = room(6).cameras
+    some, others = cameras[torch.tensor([4, 0, 4])], cameras[torch.tensor([5, 4, 3])]
+    assert view_ids(some, others).tolist() == [3, 0, 4]
+    assert view_ids(some[:0], others).tolist() == [0, 1, 2]
+    assert view_ids(some, others[:0]).tolist() == []
+
+
+def test_no_photos_are_kept_where_none_are_wanted() -> None:
+    found = kept([3, 2], 0)
+    assert found.images.shape == (0, 2, 3, 3)
+    assert len(found.views) == 0
+
+
+def test_fewer_may_be_wanted_later() -> None:
+    many = kept([8], 8)
+    few = update_replay(many, batch_photos(8, 1), np.array([8]), 9, 3)
+    assert few.views.tolist() == [0, 4, 8]
+
+
+def test_colours_are_rounded() -> None:
+    one = batch_photos(0, 1)
+    values = np.linspace(0, 1, 18, dtype=np.float32).reshape(1, 2, 3, 3)
+    found = update_replay(NOTHING, BatchPhotos(values, one.cameras), np.array([0]), 1, 4)
+    assert found.images.dtype == np.uint8
+    np.testing.assert_allclose(found.images / 255, values, atol=0.5 / 255 + 1e-6)
+
+
+def test_pictures_of_the_states_size_are_left_as_they_are() -> None:
+    scene = room(2)
+    assert scene.images is not None
+    found = resize_photos(scene.images, scene.cameras, 36, 24)
+    assert found.images is not None
+    np.testing.assert_array_equal(found.images, scene.images.numpy())
+    assert found.cameras is scene.cameras
+
+
+@pytest.mark.parametrize("size", [(18, 12), (12, 8), (18, 24)])
+def test_pictures_of_another_size_are_averages(size: tuple[int, int]) -> None:
+    scene = room(2)
+    assert scene.images is not None
+    found = resize_photos(scene.images, scene.cameras, *size)
+    w, h = size
+    means = scene.images.numpy().reshape(2, h, 24 // h, w, 36 // w, 3).mean((2, 4))
+    np.testing.assert_allclose(found.images, means, atol=1e-5)
+    assert len(found) == 2
+
+
+def test_larger_pictures_keep_the_view() -> None:
+    scene = room(1)
+    assert scene.images is not None
+    found = resize_photos(scene.images, scene.cameras, 72, 48)
+    assert found.images.shape == (1, 48, 72, 3)
+    assert float(np.abs(found.images.mean((1, 2)) - scene.images.numpy().mean((1, 2))).max()) < 0.01
+
+
+def test_the_same_points_are_at_the_same_share_of_the_picture() -> None:
+    cameras = room(3).cameras
+    points = torch.tensor([[0.1, -0.2, 3.0], [0.5, 0.4, 2.0]], dtype=torch.float64)
+    large, small = (project(points, c)[0] for c in (cameras, resize_cameras(cameras, 9, 12)))
+    np.testing.assert_allclose(small, large * torch.tensor([9 / 36, 12 / 24]), atol=1e-9)
+    assert resize_cameras(cameras, 9, 12).viewmats.dtype == torch.float64
+
+
+def test_joined_cameras_come_one_after_the_other() -> None:
+    first, second = room(2).cameras, room(3).cameras
+    found = concat_cameras(first, second)
+    assert (len(found), found.width, found.height) == (5, 36, 24)
+    assert torch.equal(found.viewmats[2:], second.viewmats.double())
+    assert torch.equal(found.Ks[:2], first.Ks.double())
+
+
+def test_photos_at_half_size() -> None:
+    scene = room(2)
+    assert scene.images is not None
+    found = resize_photos(scene.images, scene.cameras, 36, 24).photos(2)
+    assert (found.width, found.height, len(found)) == (18, 12, 2)

@@ -1,0 +1,330 @@
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from gsmerge import PixelScene
+from gsmerge.baselines.baseline import most_important
+from gsmerge.moments import Members, scene_members
+from gsmerge.stages.decode import DecodeOptions, decode, split_counts
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.region_tree import (
+    AllocateOptions,
+    RegionTree,
+    auto_count,
+    cut_tree,
+    knee,
+    pixel_depths,
+    region_tree,
+)
+from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.types import SH_C0, FeatureGaussians, Groups
+
+HEIGHT, WIDTH = 40, 60
+
+
+def cut(images: torch.Tensor, count: int) -> Groups:
+    return segment(images, SegmentOptions(), count)
+
+
+def tree_of(images: torch.Tensor, depths: torch.Tensor, count: int = 200, **weights: float) -> RegionTree:
+    valid = torch.ones(depths.shape, dtype=torch.bool)
+    return region_tree(images, depths, cut(images, count), valid, AllocateOptions(**weights))
+
+
+def grey(num_views: int = 1) -> torch.Tensor:
+    return torch.full((num_views, HEIGHT, WIDTH, 3), 0.5)
+
+
+def noise(num_views: int = 1) -> torch.Tensor:
+    return torch.rand((num_views, HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(0))
+
+
+def slanted(num_views: int = 1) -> torch.Tensor:
+    """Depths of a wall that is not parallel to the image."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    return (1 / (1 + 0.01 * x - 0.008 * y)).expand(num_views, -1, -1).clone()
+
+
+# ---------------------------------------------------------------- merging regions
+
+
+def test_wall_is_cheap_and_texture_is_not() -> None:
+    """One view of a plain wall and one of noise: nearly all regions go to the noise."""
+    images = torch.cat([grey(), noise()])
+    groups = cut_tree(tree_of(images, slanted(2), max_extent=0.5), 200)
+    assert groups.counts[0] + groups.counts[1] == 200
+    assert groups.counts[0] < 15
+
+
+def test_depth_edges_are_kept() -> None:
+    """Of equal colour, but the right half is nearer: no region reaches across."""
+    depths = slanted()
+    depths[:, :, WIDTH // 2 :] *= 0.7
+    images = grey()
+    labels = torch.arange(HEIGHT * WIDTH // 4, dtype=torch.int32).reshape(1, HEIGHT // 2, WIDTH // 2)
+    fine = labels.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    tree = region_tree(
+        images,
+        depths,
+        Groups(fine, (HEIGHT * WIDTH // 4,)),
+        torch.ones_like(depths, dtype=torch.bool),
+        AllocateOptions(max_extent=1.0),
+    )
+    coarse = cut_tree(tree, 20).labels[0].numpy()
+    assert not set(np.unique(coarse[:, : WIDTH // 2])) & set(np.unique(coarse[:, WIDTH // 2 :]))
+    assert tree.distortions[-1] > 10 * tree.distortions[-20]
+    without = tree_of(images, depths, depth_weight=0.0)
+    np.testing.assert_allclose(without.distortions, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("portrait", [False, True])
+def test_regions_keep_below_the_largest_extent_until_there_is_no_other_way(portrait: bool) -> None:
+    """A quarter of the longer side, whichever that is."""
+    images, depths = grey(), slanted()
+    if portrait:
+        images, depths = images.transpose(1, 2), depths.transpose(1, 2)
+    tree = tree_of(images, depths, max_extent=1 / 4)
+    side = WIDTH / 4
+
+    def extents(count: int) -> np.ndarray:
+        labels = cut_tree(tree, count).labels[0].numpy()
+        boxes = [np.nonzero(labels == i) for i in range(count)]
+        return np.array([max(np.ptp(y), np.ptp(x)) for y, x in boxes])
+
+    assert tree.min_regions < 60
+    assert side / 2 < extents(tree.min_regions).max() < side
+    assert extents(3).max() >= side
+
+
+@pytest.mark.parametrize("depth_weight", [0.0, 4.0])
+def test_distortions_are_those_of_the_cuts(depth_weight: float) -> None:
+    images, tree = noise(2), tree_of(noise(2), slanted(2), 50, depth_weight=depth_weight)
+    assert tree.counts.tolist() == list(range(100, 1, -1))
+    assert (np.diff(tree.distortions) >= 0).all()
+    for count in (100, 60, 20, 2):
+        groups, error = cut_tree(tree, count), 0.0
+        for view in range(2):
+            labels, pixels = groups.labels[view].numpy(), images[view].double().numpy()
+            error += sum(
+                ((pixels[labels == i] - pixels[labels == i].mean(0)) ** 2).sum() for i in range(groups.counts[view])
+            )
+        assert tree.distortions[100 - count] == pytest.approx(error / images.numel(), rel=1e-3)
+
+
+def test_regions_without_valid_pixels_go_first() -> None:
+    images, depths = noise(), slanted()
+    valid = torch.ones_like(depths, dtype=torch.bool)
+    valid[:, :, : WIDTH // 2] = False
+    groups = cut(images, 100)
+    filled = len(torch.unique(groups.labels[valid]))
+    coarse = cut_tree(region_tree(images, depths, groups, valid), filled)
+    assert len(torch.unique(coarse.labels[valid])) == filled
+
+
+def test_strange_depths_do_no_harm() -> None:
+    depths = slanted(3)
+    depths[0, :5], depths[0, 5:10], depths[0, 10:15], depths[0, 15:20] = 0, -1, torch.nan, torch.inf
+    depths[1], depths[2] = -1, torch.nan
+    tree = tree_of(noise(3), depths)
+    assert np.isfinite(tree.distortions).all()
+    assert len(cut_tree(tree, 100)) == 100
+
+
+def test_a_single_superpixel_cannot_be_merged() -> None:
+    tree = tree_of(noise(2), slanted(2), 1)
+    assert cut_tree(tree, 2).counts == (1, 1)
+    assert len(tree.distortions) == 1
+
+
+def test_pixel_depths() -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 8, 6))
+    depths = pixel_depths(scene)
+    eyes = scene.cameras.centres.repeat_interleave(48, 0)
+    forward = scene.cameras.viewmats[:, 2, :3].repeat_interleave(48, 0)
+    wanted = ((scene.gaussians.means - eyes) * forward).sum(1)
+    np.testing.assert_allclose(depths.reshape(-1), wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": torch.zeros(1, HEIGHT, WIDTH)}, r"images: expected shape \[1, 40, 60, 3\]"),
+        ({"depths": torch.zeros(2, HEIGHT, WIDTH)}, r"depths: expected shape \[1, 40, 60\]"),
+        ({"valid": torch.zeros(1, 3, 3)}, r"valid: expected shape"),
+        ({"groups": Groups(torch.zeros(1, HEIGHT, WIDTH, dtype=torch.int32), (2,))}, "expected 2 superpixels"),
+        ({"groups": Groups(torch.ones(1, HEIGHT, WIDTH, dtype=torch.int32), (1,))}, "expected 1 superpixels"),
+    ],
+)
+def test_arguments_that_do_not_fit(change: dict[str, object], message: str) -> None:
+    good = {"images": grey(), "depths": slanted(), "groups": cut(grey(), 5), "valid": slanted() > 0}
+    with pytest.raises(ValueError, match=message):
+        region_tree(**{**good, **change})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("change", [{"depth_weight": -1}, {"max_extent": 0}, {"knee_floor": 0}, {"knee_slope": -1}])
+def test_options_out_of_range(change: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(change))):
+        AllocateOptions(**change)
+
+
+def test_budget_below_the_number_of_views() -> None:
+    with pytest.raises(ValueError, match="budget: expected at least 2, one per view, got 1"):
+        cut_tree(tree_of(noise(2), slanted(2)), 1)
+
+
+# ---------------------------------------------------------------- the knee
+
+
+def test_knee_of_a_wall_and_of_a_texture() -> None:
+    wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
+    assert knee(wall.counts, wall.distortions) == 1
+    assert knee(texture.counts, texture.distortions) > 100
+
+
+def test_auto_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
+    wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
+    assert auto_count(wall) == wall.least < 150
+    labels = cut_tree(wall, wall.least).labels[0].numpy()
+    boxes = [np.nonzero(labels == i) for i in range(wall.least)]
+    assert max(max(np.ptp(y), np.ptp(x)) for y, x in boxes) < WIDTH / 8
+    assert auto_count(texture) == knee(texture.counts, texture.distortions) > wall.least
+
+
+def test_knee_is_where_the_slope_is_the_one_asked_for() -> None:
+    """D = 0.1 / N without a floor: 10 / ln 10 = 4.3 dB per relative increase everywhere; with one it falls."""
+    counts = np.arange(1, 2000)
+    for floor in (1e-3, 1e-4):
+        found = knee(counts, 0.1 / counts, AllocateOptions(knee_slope=2.0, knee_floor=floor))
+        middle = found / 1.25**0.5  # the slope is measured over a factor of 1.25
+        share = (0.1 / middle) / (floor + 0.1 / middle)
+        assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
+
+
+def test_knee_does_not_rise_with_the_slope() -> None:
+    tree = tree_of(noise(), slanted())
+    found = [knee(tree.counts, tree.distortions, AllocateOptions(knee_slope=s)) for s in (0.1, 0.5, 1, 2, 4, 50)]
+    assert found == sorted(found, reverse=True)
+    assert found[-1] == 1
+
+
+def test_knee_of_nothing() -> None:
+    with pytest.raises(ValueError, match="as many distortions as counts"):
+        knee(np.array([], int), np.array([]))
+
+
+# ---------------------------------------------------------------- splitting groups
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
+
+
+@pytest.fixture(scope="module")
+def members(scene: PixelScene) -> Members:
+    return scene_members(scene)
+
+
+@pytest.fixture(scope="module")
+def features(scene: PixelScene, members: Members) -> FeatureGaussians:
+    assert scene.images is not None
+    return encode(scene, members, cut(scene.images, 12), EncodeOptions())
+
+
+@pytest.mark.parametrize("extra", [0, 1, 7, 40, 100, 24 * 7])
+def test_splits_give_the_count_asked_for(features: FeatureGaussians, members: Members, extra: int) -> None:
+    counts = split_counts(features, members, extra)
+    assert counts.sum() == len(features) + extra
+    assert len(decode(features, members, DecodeOptions(min_opacity=0), counts)) == len(features) + extra
+
+
+def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, members: Members) -> None:
+    assert split_counts(features, members, 10_000).tolist() == [8] * 24
+    assert split_counts(features, members, 10_000, 3).tolist() == [3] * 24
+
+
+def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
+    """Group 5 gets many colours, all others one each, on a plane."""
+    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]].numpy()
+    sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
+    means = members.means.copy()
+    means[:, 2] = 0
+    counts = split_counts(features, replace(members, sh0=sh0, means=means), 6)
+    assert counts.tolist() == [7 if group == 5 else 1 for group in range(24)]
+
+
+def test_a_first_step_that_only_pays_with_the_second() -> None:
+    """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
+    from gsmerge.stages.decode import _hull_gains
+
+    gains = _hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
+    assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
+
+
+def test_splits_leave_the_backing_alone(features: FeatureGaussians, members: Members) -> None:
+    backing = torch.arange(24) % 2 == 0
+    counts = split_counts(replace(features, backing=backing), members, 1000)
+    assert counts.tolist() == [1, 8] * 12
+    assert split_counts(replace(features, backing=torch.ones(24, dtype=torch.bool)), members, 5).tolist() == [1] * 24
+
+
+def test_splits_of_nothing(members: Members) -> None:
+    assert split_counts(scenes.make_features(np.zeros((0, 3))), members, 5).tolist() == []
+
+
+def test_splits_out_of_range(features: FeatureGaussians, members: Members) -> None:
+    with pytest.raises(ValueError, match="extra: expected at least 0, got -1"):
+        split_counts(features, members, -1)
+    with pytest.raises(ValueError, match="max_children: expected at least 1, got 0"):
+        split_counts(features, members, 1, 0)
+
+
+def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians, members: Members) -> None:
+    counts = np.arange(24) % 3 + 1
+    children = decode(features, members, DecodeOptions(min_opacity=0), counts)
+    one = decode(features, members, DecodeOptions(min_opacity=0))
+    for group, (first, last) in enumerate(itertools.pairwise(np.append(0, np.cumsum(counts)))):
+        low, high = children.means[first:last].aminmax(dim=0)
+        assert (one.means[group] >= low - 1e-5).all()
+        assert (one.means[group] <= high + 1e-5).all()
+    whole = counts == 1
+    np.testing.assert_array_equal(children.means[np.repeat(whole, counts)], one.means[whole])
+
+
+def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Members) -> None:
+    for counts in (np.ones(3, int), np.zeros(24, int)):
+        with pytest.raises(ValueError, match="counts: expected 24 numbers"):
+            decode(features, members, DecodeOptions(), counts)
+
+
+# ---------------------------------------------------------------- keeping the best
+
+
+def test_most_important_keeps_the_most_important() -> None:
+    importance = torch.tensor([3.0, 1.0, 3.0, float("nan"), 0.0, 5.0])
+    assert most_important(importance, 3).tolist() == [0, 2, 5]
+    assert most_important(importance, 2).tolist() == [0, 5]
+    assert most_important(importance, 5).tolist() == [0, 1, 2, 4, 5]
+    assert most_important(importance.numpy(), 9).tolist() == [0, 1, 2, 3, 4, 5]
+    assert most_important(importance, 0).tolist() == []
+    with pytest.raises(ValueError, match="count: expected at least 0, got -1"):
+        most_important(importance, -1)
+
+
+def test_colours_of_sh_and_of_photos_weigh_the_same() -> None:
+    """A group of two flat colours: its error is the squared distance from their mean, in sRGB."""
+    from gsmerge.stages.decode import _child_errors
+
+    same = Members(
+        np.zeros((4, 3), np.float32), np.zeros((4, 4), np.float32), np.ones((4, 3), np.float32),
+        np.ones(4, np.float32), np.array([0, 0, 1, 1], np.float32)[:, None, None] * np.full(3, 0.2 / SH_C0, np.float32),
+        np.zeros((4, 0, 3), np.float32), np.ones(4, np.float32),
+    )  # fmt: skip
+    one = replace(scenes.make_features(np.zeros((1, 3))), starts=torch.tensor([0, 4]), members=torch.arange(4))
+    np.testing.assert_allclose(_child_errors(one, same, np.array([0]), 3), [[0.12, 0, np.nan]], atol=1e-7)
