@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.tables import read_table
+from gsmerge.io.bounds import read_table
 from gsmerge.research.charts.record import INPUT
 
 OURS = "gsmerge"
