@@ -10,7 +10,7 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import CameraFile, SceneFiles, read_cameras
-from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
+from gsmerge.io.cameras.json_files import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.trajectory import INTRINSICS
 from gsmerge.io.scene_files import IMAGE_PLACES

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.estimate_cameras import SOURCE as ESTIMATED
-from gsmerge.io.alignment.fill import fill_from_depths
 from gsmerge.io.alignment.fit_cameras import CameraFit, fit_cameras
-from gsmerge.io.alignment.layouts import to_grid
+from gsmerge.io.alignment.layouts import fill_from_depths, to_grid
 from gsmerge.io.alignment.recover import Recovery
 from gsmerge.io.alignment.rotations import choose_rotations, read_rotations
 from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, read_images, read_ply
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.sharp import read_sharp
 from gsmerge.io.formats.ply_file import REQUIRED
 

@@ -16,7 +16,7 @@ from gsmerge.io.alignment.poses import check_one_fits, find_aligned_poses, other
 from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput, color_error
 from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
-from gsmerge.io.cameras.da3 import read_depths
+from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photos import Photos, as_tensor, natural_key, photo_size
 

@@ -6,18 +6,14 @@ import os
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file, read_json
+from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.colmap import is_colmap, read_colmap
-from gsmerge.io.cameras.da3 import read_da3
-from gsmerge.io.cameras.dump import is_dump, read_dump
-from gsmerge.io.cameras.inria import read_inria
-from gsmerge.io.cameras.long_lrm import read_long_lrm
+from gsmerge.io.cameras.json_files import read_json_cameras
+from gsmerge.io.cameras.npz_files import is_dump, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k
 from gsmerge.io.cameras.trajectory import is_trajectory, read_trajectory
-from gsmerge.io.cameras.transforms import read_transforms
-from gsmerge.io.cameras.world_mirror import read_world_mirror
 
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
@@ -86,22 +82,5 @@ def read_cameras(path: str | os.PathLike[str], *, scene: str | None = None) -> C
     if path.suffix == CHUNK:
         return read_re10k(path, scene)
     if path.suffix == ".json":
-        return _read_json(path)
+        return read_json_cameras(path)
     raise SceneError(path, "expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file")
-
-
-def _read_json(path: Path) -> CameraFile:
-    data = read_json(path)
-    if isinstance(data, dict) and "frames" in data:
-        frames = data["frames"]
-        if isinstance(frames, list) and frames and all(isinstance(f, dict) and "w2c" in f for f in frames):
-            return read_long_lrm(path, data)
-        return read_transforms(path, data)
-    if isinstance(data, list) and data and all(isinstance(entry, dict) for entry in data):
-        if "transform_matrix" in data[0]:
-            return read_transforms(path, data)
-        if "position" in data[0] or "rotation" in data[0]:
-            return read_inria(path, data)
-    if isinstance(data, dict) and {"extrinsics", "intrinsics"} <= data.keys():
-        return read_world_mirror(path, data)
-    raise SceneError(path, "expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither")

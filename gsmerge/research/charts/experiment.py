@@ -11,7 +11,7 @@ from typing import Any
 
 from gsmerge.budget import share_text
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.tables import read_table
+from gsmerge.io.bounds import read_table
 from gsmerge.research.charts.record import INPUT
 
 OURS = "gsmerge"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.tables import read_table
+from gsmerge.io.bounds import read_table
 from gsmerge.research.generate.paths import PATHS
 from gsmerge.research.generate.styles import STYLES
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 from gsmerge.errors import SceneError
-from gsmerge.io.tables import read_table
+from gsmerge.io.bounds import read_table
 from gsmerge.networks import NetworkOptions
 from gsmerge.networks.modules import SLOTS
 from gsmerge.stages.fit.loss import LOSS_WINDOW

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsmerge.errors import SceneError
-from gsmerge.io.tables import read_table
+from gsmerge.io.bounds import read_table
 
 
 def test_json_and_toml(tmp_path: Path) -> None:
