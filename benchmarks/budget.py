@@ -16,17 +16,17 @@ from pathlib import Path
 
 import numpy as np
 from quality import score
-from shared_scenes import export, read_targets, scene_folders
+from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.moments import Members, scene_members
 from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import Frame, canonicalise
-from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree, split_counts
+from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Gaussians, Groups, PixelScene
 
@@ -54,7 +54,7 @@ def fitted(gaussians: Gaussians, scene: PixelScene, frame: Frame, steps: int) ->
 
 def show(folder: Path, cache: Path, steps: int) -> None:
     world = gsmerge.read_scene(export(folder, cache))
-    targets = read_targets(folder) if steps else None
+    targets = read_held_out(folder) if steps else None
     scene, frame = canonicalise(world)
     assert scene.images is not None
     members, depths, total = scene_members(scene), pixel_depths(scene), len(scene.gaussians)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared_scenes import export, read_targets, scene_folders
+from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
@@ -36,7 +36,7 @@ STAGES = ("encode", "match", "refine", "decode")  # that networks take part in
 
 @dataclass(frozen=True)
 class Condition:
-    """A way to run; both with and without networks unless ``learned`` alone is wanted."""
+    """A way to run; both with and without networks unless ``learned`` says otherwise."""
 
     name: str
     settings: dict[str, Any]
@@ -101,7 +101,7 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
 
 def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, lpips: bool) -> dict[str, Any]:
     """One run on one scene, judged by its held-out views."""
-    scene, targets = gsmerge.read_scene(export(folder, cache)), read_targets(folder)
+    scene, targets = gsmerge.read_scene(export(folder, cache)), read_held_out(folder)
     if condition.views is not None:
         scene = subset(scene, even_views(len(scene), min(condition.views, len(scene))))
     start = time.perf_counter()

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from many_views import many_views
 from quality import score
-from shared_scenes import Targets, export, exporter, read_targets, scene_folders
+from shared_scenes import Targets, export, exporter, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge import Compactor
@@ -29,14 +29,14 @@ from gsmerge.io import find_scene_files
 
 
 def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[Path]:
-    """A scene's views in batches, each the export of a scene of its own; made once."""
+    """A scene's views in batches, each exported as its own scene; created once."""
     source = many_views(scene_folders(name)[0], cache / f"{name}-{views}", views)
     document = json.loads((source / "transforms.json").read_text())
     context = [f for f in document["frames"] if f["role"] == "context"]
     ids = np.arange(len(context))
     if order == "cycle":  # every batch goes once through the scene
         ids = np.concatenate([ids[i :: -(-views // size)] for i in range(-(-views // size))])
-    found = []
+    results = []
     for number, first in enumerate(range(0, len(ids), size)):
         folder = cache / f"{name}-{views}-{order}-{size}" / f"{number:03d}"
         ply = folder / "plain" / "scene.ply"
@@ -49,13 +49,13 @@ def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[P
             (folder / "transforms.json").write_text(json.dumps(document | {"frames": frames}))
             ply = Path(exporter().export(folder, folder / "plain", "plain"))
             (folder / "done").touch()
-        found.append(ply)
-    return found
+        results.append(ply)
+    return results
 
 
 def online(args: argparse.Namespace) -> dict:
     """One batch after the other, and what is decoded in the end."""
-    targets = read_targets(scene_folders(args.scenes)[0])
+    targets = read_held_out(scene_folders(args.scenes)[0])
     compactor, steps = Compactor(replay=args.replay), []
     for ply in batches(args.scenes, args.views, args.size, args.order, args.cache):
         scene = gsmerge.read_scene(find_scene_files(ply).ply)
@@ -71,18 +71,18 @@ def online(args: argparse.Namespace) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         compactor.save(Path(folder) / "state.gsm")
         size = (Path(folder) / "state.gsm").stat().st_size
-    found = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
+    results = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
     for fit, k in (("none", 1), ("none", 2), ("none", 4), ("color", 1), ("full", 1), ("full", 2), ("full", 4)):
         start = time.perf_counter()
         gaussians = compactor.decode(k=k, fit=fit)
-        found[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
-    return found
+        results[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
+    return results
 
 
 def whole(args: argparse.Namespace, fit: str) -> dict:
     """All views at once; ``input``: as they are."""
     source = many_views(scene_folders(args.scenes)[0], args.cache / f"{args.scenes}-{args.views}", args.views)
-    scene, targets = gsmerge.read_scene(export(source, args.cache)), read_targets(scene_folders(args.scenes)[0])
+    scene, targets = gsmerge.read_scene(export(source, args.cache)), read_held_out(scene_folders(args.scenes)[0])
     start = time.perf_counter()
     if fit == "input":
         return _scored(scene.gaussians, targets, 0.0, args.lpips)
@@ -94,8 +94,8 @@ def whole(args: argparse.Namespace, fit: str) -> dict:
 
 def _scored(gaussians: gsmerge.Gaussians, targets: Targets, seconds: float, perceptual: bool) -> dict:
     values = score(gaussians, targets, perceptual)
-    found = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
-    return {"count": len(gaussians), **found, "seconds": round(seconds, 1)}
+    results = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
+    return {"count": len(gaussians), **results, "seconds": round(seconds, 1)}
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_text
 from gsmerge.io.content_hash import stem_of
-from gsmerge.io.formats.ply_file import promised
+from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
 from gsmerge.runtime.estimate import memory_bytes
 
@@ -66,18 +66,18 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
         if real in inputs or real in own:
             continue
         inputs.add(real)
-        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *promised(ply))
-        for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
+        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
+        for name in (job.output, *further_outputs(job.output, options.settings.budget.levels)):
             if name in owners:
                 raise UsageError(
                     f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
-                    f" {scene}; tell them apart with --output, such as '{{parent}}-{{stem}}.ply'"
+                    f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
         jobs.append(job)
     for name in owners:
         if os.path.realpath(out / name) in inputs:
-            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --out")
+            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")
     return jobs
 
 
@@ -102,7 +102,7 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     try:
         return os.path.normpath(options.output.format(**values))
     except ValueError as error:  # a format that fits numbers only
-        raise UsageError(f"--output: {options.output!r} does not fit {values}: {error}") from error
+        raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error
 
 
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:

@@ -164,7 +164,7 @@ def evaluate(
     Args:
         scene: The input. Without photos, results are compared with its own renders.
         results: Gaussians by name, in the scene's world.
-        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_targets`; None: input views alone.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_held_out`; None: input views alone.
         options: What is measured.
         progress: Called with ("evaluate", done, total) after each result.
 

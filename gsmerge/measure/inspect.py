@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 
-from gsmerge.budget import file_bytes
 from gsmerge.errors import SceneError
 from gsmerge.io import (
     Alignment,
@@ -23,10 +22,11 @@ from gsmerge.io import (
     read_cameras,
     read_ply_with_hints,
 )
-from gsmerge.io.alignment.unaligned import Sight, sight
+from gsmerge.io.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.io.exporters import exporter_names
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_layout import LOGIT_COMMENT
+from gsmerge.io.formats.ply_file import LOGIT_COMMENT
+from gsmerge.io.formats.ply_writer import file_bytes
 from gsmerge.io.hints import make_hints
 from gsmerge.measure.extents import Coverage, Extents, coverage, extents
 from gsmerge.options import CompactOptions
@@ -122,7 +122,7 @@ class Inspection:
     rows: str | None = None
     alignment_score: float | None = None
     alignment_margin: float | None = None
-    sight: Sight | None = None
+    sight: CameraCheck | None = None
     coverage: tuple[Coverage, ...] = ()
     estimate: dict[str, float] | None = None
 
@@ -213,18 +213,18 @@ def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, A
         "alignment": load.alignment,
         "alignment_score": load.alignment.share_within_1px,
         "alignment_margin": load.recovery.margin,
-        "rows": load.recovery.words,
+        "rows": load.recovery.description,
     }
 
 
-def _sight(load: SceneLoad) -> Sight | None:
+def _sight(load: SceneLoad) -> CameraCheck | None:
     scene = load.scene
     if len(scene) == 0:
         return None
     valid = torch.ones(len(scene.gaussians), dtype=torch.bool)
     if isinstance(scene, PixelScene):
         valid = scene.stored.reshape(-1)
-    return sight(scene.gaussians, valid, scene.cameras, scene.images)
+    return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 
 def estimate(scene: PixelScene | UnalignedScene) -> dict[str, Any]:

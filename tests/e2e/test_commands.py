@@ -130,7 +130,7 @@ def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
 @pytest.mark.parametrize(
     ("option", "told"),
     [
-        (("--max-bytes", "5"), "max bytes: expected at least 502 for one Gaussian, got 5"),
+        (("--budget", "5B"), "budget: expected at least 502 bytes for one Gaussian, got 5"),
         (("--budget", "0.001%"), "budget: expected at least one Gaussian, got '0.001%'"),
         (("--effort", "slow"), "'--effort': 'slow' is not one of 'draft', 'fast', 'default', 'best'"),
     ],
@@ -222,8 +222,8 @@ def test_segment(made_scene: Path, tmp_path: Path, run: Run) -> None:
     pictures = sorted((tmp_path / "overlays").iterdir())
     assert len(pictures) == 3 * VIEWS
     assert {cv2.imread(str(path)).shape for path in pictures} == {(HEIGHT, WIDTH, 3)}
-    photo = cv2.imread(str(made_scene / "images" / "view_00.png")).astype(float)
-    means = cv2.imread(str(tmp_path / "overlays" / "view_00.means.png")).astype(float)
+    photo = cv2.imread(str(made_scene / "images" / "view_000.png")).astype(float)
+    means = cv2.imread(str(tmp_path / "overlays" / "view_000.means.png")).astype(float)
     assert np.abs(photo - means).mean() < 12  # the pictures belong to the views that they are named after
 
 

@@ -85,7 +85,7 @@ def test_a_dry_run_writes_nothing(command: str, scene_copy: Path, run: Run) -> N
 
 @pytest.mark.parametrize(
     ("wish", "most"),
-    [(("--k", "auto"), 5 * 200), (("--budget", "2%"), 614), (("--budget", "2%", "--max-bytes", "20KB"), 287)],
+    [(("--budget", "auto"), 5 * 200), (("--budget", "2%"), 614), (("--budget", "20KB"), 287)],
 )
 def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, scene_copy: Path, run: Run) -> None:
     arguments = ["compact", scene_copy, "--superpixels", 200, *wish, "--dry-run"]
@@ -137,7 +137,7 @@ def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Pa
         ("compact", "transforms.json"),
         ("encode", "transforms.json"),
         ("preview", "transforms.json"),
-        ("preview", "images/view_00.png"),
+        ("preview", "images/view_000.png"),
         ("render", "images"),
         ("segment", "images"),
     ],

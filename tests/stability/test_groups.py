@@ -66,7 +66,7 @@ def test_coincident_members_stack(small: PixelScene) -> None:
 
 
 def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
-    found = scenes.plain(small, density=1.0)
+    found = scenes.plain(small, superpixels="100%")
     order = torch.cdist(small.gaussians.means, found.means).argmin(1)
     assert len(order.unique()) == len(found) == len(small.gaussians)
     own, kept = small.gaussians, found[order]
@@ -223,7 +223,7 @@ def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settin
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
-    sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(1e6, scenes.flat(0.1, 0.2, 1.0))]
+    sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(8e5, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
     found = scenes.compacted(scene, **settings).gaussians
     depths = project(found.means, scene.cameras)[1][0]

@@ -14,10 +14,10 @@ from statistics import median
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.budget import file_bytes
 from gsmerge.errors import error_line
 from gsmerge.io import AUTO, ReadHints, load_files
 from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.ply_writer import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.pipeline import compact
 from gsmerge.research.charts.experiment import OURS, Experiment, run_settings
@@ -26,7 +26,7 @@ from gsmerge.research.charts.measure import (
     choose_views,
     keep_pictures,
     measure,
-    read_held_out,
+    read_target_views,
     time_render,
 )
 from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
@@ -203,7 +203,7 @@ def _read(source: SceneSource, options: RunOptions) -> _LoadedScene | str:
     """The scene with its targets, or why it cannot be read."""
     try:
         load = load_files(source.files, opacity=options.opacity, hints=options.hints)
-        targets, places = read_held_out(load, source.targets, source.target_images)
+        targets, places = read_target_views(load, source.targets, source.target_images)
         return _LoadedScene(load.scene, targets, places, tuple(load.notes))
     except Exception as error:
         return error_line(error)

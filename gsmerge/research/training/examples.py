@@ -21,9 +21,10 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
+from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.io import SceneLoad, load_scene, read_targets
+from gsmerge.io import SceneLoad, load_scene, read_held_out
 from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.evaluate import Views
 from gsmerge.moments import Members
@@ -144,7 +145,7 @@ def _read_held_out(load: SceneLoad) -> Views | None:
     folder = load.files.ply.parent / "targets"
     if not folder.is_dir():
         return None
-    read = read_targets(load, folder)
+    read = read_held_out(load, folder)
     return Views(read.cameras, read.images, read.names)
 
 
@@ -224,7 +225,13 @@ def _fit_columns(
     training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None
 ) -> dict[str, Any]:
     """Arrays of an example, computed from scratch."""
-    changes = {"density": density, "match": options.match, "fit": "none", "robust": False, "seed": options.seed}
+    changes = {
+        "superpixels": share_text(density),
+        "match": options.match,
+        "fit": "none",
+        "robust": False,
+        "seed": options.seed,
+    }
     settings = CompactOptions().with_settings(changes)
     scene, members = training.scene, training.members
     groups = segment(scene_pictures(scene), settings.segment)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 import subprocess
 import sys
@@ -80,20 +79,19 @@ def test_an_index_reads_on_and_past_what_is_damaged(tmp_path: Path) -> None:
     assert {name: known.failed_since for name, known in index.known.items()} == {"a.ply": False, "c.ply": True}
 
 
-def _append(path: Path, name: str) -> None:
-    for number in range(25):
-        append_line(path, {"name": name, "number": number, "padding": "x" * 5000})
+APPEND = """
+import pathlib, sys
+from gsmerge.runtime.jsonl import append_line
+for number in range(25):
+    append_line(pathlib.Path(sys.argv[1]), {"name": sys.argv[2], "number": number, "padding": "x" * 5000})
+"""
 
 
 def test_lines_of_several_processes_stay_whole(tmp_path: Path) -> None:
     path = tmp_path / "lines.jsonl"
     path.write_bytes(b'{"torn": ')
-    context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=_append, args=(path, name)) for name in "ab"]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
+    processes = [subprocess.Popen([sys.executable, "-c", APPEND, str(path), name]) for name in "ab"]
+    assert [process.wait() for process in processes] == [0, 0]
     lines = read_lines(path)
     assert lines.notes == ()
     for name in "ab":
@@ -332,7 +330,7 @@ def test_totals_do_not_grow_with_the_number_of_scenes(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_told_before_anything_is_done(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(SceneError, match=r"cannot be written .*--out"):
+    with pytest.raises(SceneError, match=r"cannot be written .*--output"):
         check_folder(tmp_path / "file" / "out")
     check_folder(tmp_path / "new" / "out")
     assert (tmp_path / "new" / "out" / RECORDS).exists()

@@ -42,7 +42,7 @@ def scene() -> PixelScene:
 def drawn(scene: PixelScene, degree: int) -> Gaussians:
     """Merged Gaussians with random rotations, sizes and harmonics."""
     rng = torch.Generator().manual_seed(degree)
-    g = scenes.plain(scene, density=0.1)
+    g = scenes.plain(scene, superpixels="10%")
     quats = torch.nn.functional.normalize(torch.randn(g.quats.shape, generator=rng), dim=1)
     shN = 0.1 * torch.randn((len(g), (degree + 1) ** 2 - 1, 3), generator=rng)
     scales = g.scales * (0.5 + torch.rand(g.scales.shape, generator=rng))
@@ -179,11 +179,11 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
     assert float((found.means - means).abs().max()) < 0.5
 
 
-def test_harmonics_that_have_no_room_are_told() -> None:
+def test_harmonics_without_room_are_noted() -> None:
     assert lost_harmonics("a.ply", 4) is None
     assert lost_harmonics("a.spz", 3) is None
-    told = lost_harmonics("a.splat", 1)
-    assert told == ".splat has no room for harmonics above degree 0: left out"
+    note = lost_harmonics("a.splat", 1)
+    assert note == ".splat has no room for harmonics above degree 0: left out"
     assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmerge.io.alignment.layouts import Layout, exact_layouts, thinned
-from gsmerge.io.alignment.verify import pixel_limit
+from gsmerge.io.alignment.layouts import Layout, exact_layouts, subsample
+from gsmerge.io.alignment.score import pixel_limit
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
 from gsmerge.types import Gaussians
 
@@ -46,26 +46,26 @@ def estimate_cameras(
         None if no order of the rows fits at least twice as well as all others.
     """
     means = gaussians.means.numpy()
-    tried = []
+    fits = []
     for layout in exact_layouts(len(gaussians), len(names), width, height):
         if layout.per_pixel == 1 and len(layout.views) == len(names):
-            tried.append(_calibrated(means, valid, thinned(layout, _SAMPLES)))
-    tried.sort(key=lambda found: found[0])
+            fits.append(_calibrate(means, valid, subsample(layout, _SAMPLES)))
+    fits.sort(key=lambda fit: fit[0])
     limit = pixel_limit(width, height)
-    if not tried or tried[0][0] > limit or (len(tried) > 1 and tried[1][0] < _MARGIN * tried[0][0]):
+    if not fits or fits[0][0] > limit or (len(fits) > 1 and fits[1][0] < _MARGIN * fits[0][0]):
         return None
-    _, focal, poses = tried[0]
+    _, focal, poses = fits[0]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     count = len(names)
     return make_camera_file(path, SOURCE, W2C_OPENCV, poses, [K] * count, [(width, height)] * count, names)
 
 
-def _calibrated(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
-    """(largest median distance in pixels, focal length, poses) of one order of the rows; inf where none is found."""
+def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
+    """(largest median distance in pixels, focal length, poses) of one order of the rows; inf without one."""
     points, pixels = [], []
-    for rows, where in zip(layout.rows, layout.pixels, strict=True):
+    for rows, cells in zip(layout.rows, layout.pixels, strict=True):
         good = valid[rows]
-        y, x = np.divmod(where[good], layout.width)
+        y, x = np.divmod(cells[good], layout.width)
         points.append(means[rows[good]].astype(np.float64))
         pixels.append(np.stack([x, y], 1) + 0.5)
     everything = np.concatenate(points)
@@ -78,20 +78,20 @@ def _calibrated(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[f
     try:
         for _ in range(_ROUNDS):
             near = [p[k].astype(np.float32) for p, k in zip(points, kept, strict=True)]
-            seen = [p[k].astype(np.float32) for p, k in zip(pixels, kept, strict=True)]
-            _, K, _, turns, shifts = cv2.calibrateCamera(
-                near, seen, (layout.width, layout.height), K, np.zeros(5), flags=_FLAGS
+            where = [p[k].astype(np.float32) for p, k in zip(pixels, kept, strict=True)]
+            _, K, _, rotations, shifts = cv2.calibrateCamera(
+                near, where, (layout.width, layout.height), K, np.zeros(5), flags=_FLAGS
             )
             errors = [
                 np.linalg.norm(cv2.projectPoints(p, r, t, K, None)[0][:, 0] - q, axis=1)
-                for p, q, r, t in zip(points, pixels, turns, shifts, strict=True)
+                for p, q, r, t in zip(points, pixels, rotations, shifts, strict=True)
             ]
             kept = [e <= max(1.0, 3 * float(np.median(e))) for e in errors]
     except cv2.error:
         return math.inf, 0.0, []
     poses = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        rotation = cv2.Rodrigues(turn)[0]
-        poses.append(np.concatenate([rotation, unit * shift.reshape(3, 1) - rotation @ middle[:, None]], 1))
+    for vector, shift in zip(rotations, shifts, strict=True):
+        R = cv2.Rodrigues(vector)[0]
+        poses.append(np.concatenate([R, unit * shift.reshape(3, 1) - R @ middle[:, None]], 1))
     worst = max(float(np.median(e)) for e in errors)
     return (worst if np.isfinite(worst) else math.inf), float(K[0, 0]), poses

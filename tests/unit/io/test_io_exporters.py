@@ -36,7 +36,7 @@ def smooth() -> Tiny:
 
 
 def home(scene: PixelScene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
-    """Share of the valid (or of the kept) pixels whose Gaussian is the one made for them, told by its opacity."""
+    """Share of the valid (or of the kept) pixels whose Gaussian is the one made for them, recognised by its opacity."""
     found, want = scene.gaussians.opacities, tiny.gaussians.opacities
     valid = scene.valid.reshape(-1) if kept is None else torch.from_numpy(kept)
     assert found.shape == want.shape
@@ -259,7 +259,7 @@ def test_extra_elements_are_ignored(tmp_path: Path, smooth: Tiny) -> None:
     assert home(read_scene(path), smooth) == 1
 
 
-def test_voxels_are_loose(tmp_path: Path, smooth: Tiny) -> None:
+def test_voxels_are_unaligned(tmp_path: Path, smooth: Tiny) -> None:
     rows = export_rows(smooth, np.lexsort(smooth.gaussians.means.numpy().round(1).T)[::2])
     rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
     loaded = load_scene(save_export(tmp_path, smooth, rows))
@@ -271,13 +271,13 @@ def test_voxels_are_loose(tmp_path: Path, smooth: Tiny) -> None:
     assert loaded.problem is not None
 
 
-def test_a_scene_can_be_told_to_be_loose(tmp_path: Path, smooth: Tiny) -> None:
+def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None:
     path = save_export(tmp_path, smooth, export_rows(smooth))
     assert isinstance(read_scene(path, order="none"), UnalignedScene)
     assert isinstance(read_scene(path, exporter="volsplat"), UnalignedScene)
 
 
-def test_a_told_scale(tmp_path: Path, smooth: Tiny) -> None:
+def test_a_given_scale(tmp_path: Path, smooth: Tiny) -> None:
     c2w = smooth.c2w.copy()
     c2w[:, :3, 3] *= 2
     path = save_export(tmp_path, replace(smooth, c2w=c2w), export_rows(smooth))
