@@ -102,12 +102,9 @@ def report_document(
         hashed: Also hash the input, which takes time on large files.
 
     Returns:
-        ``schema_version`` 1: tool, input, output, levels, ratio, options, seed, choices, seconds, psnr, memory, notes,
-        and ``unmet``: why a target is not met, or null.
-        Keys are only ever added within one schema version.
+        ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
     """
     numbers = asdict(report)
-    stages = {**seconds_before, **numbers["seconds"], **seconds_after}
     return {
         **document_head(),
         "input": {
@@ -132,7 +129,7 @@ def report_document(
         "options": to_schema(report.options),
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
-        **seconds_document(stages),
+        **seconds_document({**seconds_before, **report.seconds, **seconds_after}),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],

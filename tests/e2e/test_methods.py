@@ -56,7 +56,7 @@ def test_every_method_writes_a_ply(
     elif not method.startswith("unmerged"):
         assert count == 400
     assert document["psnr_input_views"]["after"] > 5
-    assert document["notes"] == ([f"method {method} does not look at budget"] if method.startswith("unmerged") else [])
+    assert document["notes"] == ([f"method {method} does not use budget"] if method.startswith("unmerged") else [])
 
 
 def test_the_program_is_found_on_the_path(
