@@ -1,6 +1,6 @@
 """What the trained networks gain on real scenes: learned against analytic at equal counts, and stage by stage.
 
-python benchmarks/networks.py eval                      # the tables of docs/networks.md; what is done is kept
+python benchmarks/networks.py eval                      # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
 
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared_scenes import export, read_targets, scene_folders
+from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
@@ -101,7 +101,7 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
 
 def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, lpips: bool) -> dict[str, Any]:
     """One run on one scene, judged by its held-out views."""
-    scene, targets = gsmerge.read_scene(export(folder, cache)), read_targets(folder)
+    scene, targets = gsmerge.read_scene(export(folder, cache)), read_held_out(folder)
     if condition.views is not None:
         scene = subset(scene, even_views(len(scene), min(condition.views, len(scene))))
     start = time.perf_counter()

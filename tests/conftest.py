@@ -1,8 +1,9 @@
-"""Fixtures for the whole suite: a scene that the project makes itself."""
+"""Fixtures for the whole suite: a scene that the project makes itself; and how the suite runs in several processes."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -10,8 +11,37 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from floors import NUDGE, at_least_the_floor, nudged
 
 ROOT = Path(__file__).resolve().parent.parent
+MAX_PROCESSES = 8  # a process takes about 1 GB
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A process for each processor; for named test files this one alone, which starts sooner."""
+    if any(".py" in argument for argument in config.args):
+        return 0
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_PROCESSES)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Processes beside one another share processors, and compile no kernel twice."""
+    if hasattr(config, "workerinput"):
+        import torch
+
+        torch.set_num_threads(max(1, torch.get_num_threads() // config.workerinput["workercount"]))
+        if os.name == "posix":
+            from one_compiler import compile_once
+
+            compile_once()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests with the fixture have the mark of that name, so that ``measure_floors.py`` finds them."""
+    for item in items:
+        if "floor" in getattr(item, "fixturenames", ()):
+            item.add_marker("floor")
 
 
 def load_script(path: Path) -> ModuleType:
@@ -40,6 +70,13 @@ def make_scene() -> Callable[..., Path]:
     return load_script(ROOT / "examples" / "01_make_scene.py").make_scene
 
 
+@pytest.fixture
+def floor(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """``floor(value, "what of several")``: at least the floor of ``floors.csv``."""
+    name = request.node.nodeid.removeprefix("tests/")
+    return lambda value, part="": at_least_the_floor(f"{name}{part and f' {part}'}", float(value))
+
+
 @pytest.fixture(scope="session")
 def target_psnr() -> Callable[[Path, Path], float]:
     """``target_psnr(targets, ply)`` of the measuring example, dB."""
@@ -49,10 +86,16 @@ def target_psnr() -> Callable[[Path, Path], float]:
 @pytest.fixture(scope="session")
 def made_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scene.ply, transforms.json, images/ and targets/: 5 views of 96 x 64. Read only."""
-    return make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=96, height=64)
+    folder = make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=96, height=64)
+    if NUDGE in os.environ:
+        import gsmerge
+
+        gaussians = gsmerge.read_scene(folder).gaussians
+        gsmerge.write_ply(folder / "scene.ply", nudged(gaussians), overwrite=True)
+    return folder
 
 
 @pytest.fixture
 def scene_copy(made_scene: Path, tmp_path: Path) -> Path:
-    """A copy of the made scene that a test may spoil."""
+    """A copy of the made scene that a test may change."""
     return Path(shutil.copytree(made_scene, tmp_path / "scene"))

@@ -1,36 +1,43 @@
-"""Tiny made scenes in memory, and what must hold of every compact scene.
+"""Tiny synthetic scenes in memory, and what must hold of every compact scene.
 
-Surfaces are traced analytically: photos are exact, and every pixel gets one Gaussian on the surface that it sees,
-the size of its footprint, flat along the viewing ray, of random opacity.
+The maker is the product's own (:mod:`gsmerge.research.generate`): its rays, and its Gaussians with the errors set to
+zero. Surfaces here have colours that are functions of the place alone, so photos are exact, and every pixel gets one
+Gaussian on the surface that it sees, the size of its footprint, flat along the surface's normal.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 import torch
+from floors import nudged
 from torch import Tensor
 
 from gsmerge import Cameras, Gaussians, PixelScene, compact, render
 from gsmerge.geometry import covariances, quat_to_rotmat
 from gsmerge.pipeline import CompactReport, CompactResult
 from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.research.generate import objects, paths, photograph, shapes
+from gsmerge.research.generate.noise import TrueView, pixel_gaussians
+from gsmerge.research.generate.options import Noise
 from gsmerge.types import SH_C0, FeatureGaussians
 from gsmerge.views import subset
 
 Texture = Callable[[np.ndarray], np.ndarray]
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-MISS = 1e30
+WIDE = 1e7  # half the width of a plane without ends
+NO_ERRORS = Noise(**{**dict.fromkeys((f.name for f in fields(Noise)), 0.0), "sh_degree": 0})  # type: ignore[arg-type]
+UNPAINTED = shapes.Material(0)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """``trace(eyes [n,3], rays [n,3])`` gives distances along the rays, MISS where there is none."""
+    """A shape of the generator's; ``texture(points [n,3])`` gives the colours ``[n,3]`` of world positions."""
 
-    trace: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    shape: shapes.Shape
     texture: Texture
 
 
@@ -51,28 +58,14 @@ def flat(*rgb: float) -> Texture:
     return lambda points: np.broadcast_to(np.array(rgb), points.shape)
 
 
-def plane(depth: float, texture: Texture, *, left: float = -MISS, right: float = MISS) -> Surface:
+def plane(depth: float, texture: Texture, *, left: float = -WIDE, right: float = WIDE) -> Surface:
     """The plane z = depth between two x."""
-
-    def trace(eyes: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        distances = (depth - eyes[:, 2]) / rays[:, 2]
-        x = eyes[:, 0] + distances * rays[:, 0]
-        return np.where((distances > 0) & (x > left) & (x < right), distances, MISS)
-
-    return Surface(trace, texture)
+    return Surface(shapes.quad(((left + right) / 2, 0, depth), ((right - left) / 2, WIDE), UNPAINTED), texture)
 
 
 def ball(centre: Sequence[float], radius: float, texture: Texture) -> Surface:
     """A sphere."""
-
-    def trace(eyes: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        a, offset = (rays**2).sum(1), eyes - np.array(centre)
-        b, c = (offset * rays).sum(1), (offset**2).sum(1) - radius**2
-        inside = b * b - a * c
-        distances = (-b - np.sqrt(np.maximum(inside, 0))) / a
-        return np.where((inside > 0) & (distances > 0), distances, MISS)
-
-    return Surface(trace, texture)
+    return Surface(shapes.ball(centre, (radius, radius, radius), UNPAINTED), texture)
 
 
 def wall(seed: int = 0) -> list[Surface]:
@@ -110,37 +103,44 @@ def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8,
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> Tensor:
     """World to camera, OpenCV axes, y down."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(np.array([0.0, 1.0, 0.0]), z)
-    x /= np.linalg.norm(x)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return torch.from_numpy(viewmat)
+    return torch.from_numpy(np.linalg.inv(paths.look_at(eye, target)))
 
 
 def intrinsics(num_views: int, width: int, height: int) -> Tensor:
     """A lens whose focal length is the image's width."""
-    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return K.expand(num_views, 3, 3).clone()
+    return torch.from_numpy(photograph.Lens(width, height, width).intrinsics).expand(num_views, 3, 3).clone()
+
+
+def views_of(
+    surfaces: Sequence[Surface], cameras: Cameras
+) -> tuple[photograph.Lens, list[tuple[np.ndarray, photograph.Hits, np.ndarray]]]:
+    """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
+    lens = photograph.Lens(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
+    assert np.allclose(cameras.Ks.numpy(), lens.intrinsics)
+    packed, found = shapes.pack([surface.shape for surface in surfaces]), []
+    for viewmat in cameras.viewmats.double().numpy():
+        c2w = np.linalg.inv(viewmat)
+        hits = photograph.trace(packed, c2w, lens, 1)
+        assert (hits.ids >= 0).all(), "every ray must meet a surface"
+        places = world_points(hits.depth, c2w, lens)
+        shades = np.stack([surface.texture(places.reshape(-1, 3)) for surface in surfaces])
+        colors = shades[hits.ids.ravel(), np.arange(hits.ids.size)].reshape(places.shape)
+        found.append((c2w, hits, np.clip(colors, 0, 1)))
+    return lens, found
+
+
+def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Lens) -> np.ndarray:
+    """World positions ``[h,w,3]`` of pixels' centres at depths ``[h,w]``."""
+    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(lens.intrinsics).T  # of unit depth
+    return c2w[:3, 3] + depth[..., None] * rays @ c2w[:3, :3].T
 
 
 def trace(surfaces: Sequence[Surface], cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World positions ``[v,hw,3]``, depths ``[v,hw]`` and colours ``[v,hw,3]`` of every pixel's centre."""
-    ys, xs = np.meshgrid(np.arange(cameras.height) + 0.5, np.arange(cameras.width) + 0.5, indexing="ij")
-    pixels = np.stack([xs.ravel(), ys.ravel(), np.ones(xs.size)], 1)
-    points, depths, colors = [], [], []
-    for viewmat, K, eye in zip(cameras.viewmats.numpy(), cameras.Ks.numpy(), cameras.centres.numpy(), strict=True):
-        rays = pixels @ np.linalg.inv(K).T @ viewmat[:3, :3]  # of unit depth
-        found = np.stack([s.trace(np.broadcast_to(eye, rays.shape), rays) for s in surfaces])
-        nearest, depth = found.argmin(0), found.min(0)
-        assert (depth < MISS).all(), "every ray must meet a surface"
-        where = eye + depth[:, None] * rays
-        shades = np.stack([s.texture(where) for s in surfaces])
-        points.append(where)
-        depths.append(depth)
-        colors.append(shades[nearest, np.arange(len(where))])
-    return np.stack(points), np.stack(depths), np.clip(np.stack(colors), 0, 1)
+    lens, found = views_of(surfaces, cameras)
+    points = np.stack([world_points(hits.depth, c2w, lens).reshape(-1, 3) for c2w, hits, _ in found])
+    return points, np.stack([h.depth.ravel() for _, h, _ in found]), np.stack([c.reshape(-1, 3) for *_, c in found])
 
 
 def make_scene(
@@ -160,34 +160,25 @@ def make_scene(
         cameras: The views.
         seed: Of opacities, depth noise and higher harmonics.
         noise: Standard deviation of the depth, as a share of it.
-        opacity: Least and largest opacity.
+        opacity: Most opacities lie between these two, less at edges.
         degree: Of the spherical harmonics; those above degree 0 are small and random.
         photos: With the exact images.
     """
+    errors = replace(
+        NO_ERRORS, grain=noise, far=1e9, bleed_width=1.0, trust=0.5, opacity_low=opacity[0], opacity_high=opacity[1],
+        opacity_grain=(opacity[1] - opacity[0]) / 4, scale=0.6, scale_jitter=0.06, flatness=0.3,
+        sh_degree=degree, harmonics=0.05,
+    )  # fmt: skip
     rng = np.random.default_rng(seed)
-    points, depths, colors = trace(surfaces, cameras)
-    if noise:
-        eyes = cameras.centres.numpy()[:, None]
-        factors = np.exp(noise * rng.normal(size=depths.shape))
-        points, depths = eyes + (points - eyes) * factors[..., None], depths * factors
-    count, shape = depths.size, (len(cameras), cameras.height, cameras.width)
-    sizes = 0.6 * depths / cameras.Ks[:, 0, 0, None].numpy()
-    scales = sizes[..., None] * np.array([1.0, 1.0, 0.3]) * rng.uniform(0.9, 1.1, (*depths.shape, 3))
-    quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].transpose(1, 2))[:, None].expand(*depths.shape, 4)
-
-    def column(values: np.ndarray, *width: int) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32)).reshape(count, *width)
-
-    gaussians = Gaussians(
-        means=torch.from_numpy(points).reshape(count, 3),
-        quats=quats.reshape(count, 4).float(),
-        scales=column(scales, 3),
-        opacities=column(rng.uniform(*opacity, count)),
-        sh0=column((colors - 0.5) / SH_C0, 1, 3),
-        shN=column(0.05 * rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)), (degree + 1) ** 2 - 1, 3),
-    )
-    images = torch.from_numpy(colors.astype(np.float32)).reshape(*shape, 3) if photos else None
-    return PixelScene(gaussians, cameras, images, torch.ones(shape, dtype=torch.bool), names(len(cameras)))
+    lens, found = views_of(surfaces, cameras)
+    images = [colors.astype(np.float32) for *_, colors in found]
+    parts = [
+        pixel_gaussians(TrueView(image, hits.depth, hits.normals, c2w), lens, errors, rng)
+        for image, (c2w, hits, _) in zip(images, found, strict=True)
+    ]
+    valid = torch.ones((len(cameras), cameras.height, cameras.width), dtype=torch.bool)
+    pictures = torch.from_numpy(np.stack(images)) if photos else None
+    return PixelScene(nudged(Gaussians.concat(parts)), cameras, pictures, valid, names(len(cameras)))
 
 
 def names(count: int) -> tuple[str, ...]:
@@ -238,9 +229,7 @@ def rotmat_to_quat(rotmats: Tensor) -> Tensor:
 
 def random_rotation(seed: int) -> np.ndarray:
     """``[3,3]``."""
-    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
+    return objects.random_rotation(np.random.default_rng(seed))
 
 
 def images_of(gaussians: Gaussians, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:

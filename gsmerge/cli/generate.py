@@ -48,7 +48,7 @@ def generate(
     ranges: Annotated[
         Path | None,
         typer.Option(
-            help="TOML or JSON file with ranges of the errors, as in docs/generator.md.",
+            help="TOML or JSON file with ranges of the errors, as in docs/internals/generator.md.",
             show_default="the built-in ones",
             rich_help_panel=ERRORS,
         ),

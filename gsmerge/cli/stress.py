@@ -52,6 +52,7 @@ def stress(
     """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
     hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import atomic_output, find_scene_files, load_files
+    from gsmerge.options import to_schema
     from gsmerge.report import document_head, to_json
     from gsmerge.research.stress import stress as stress_scene
 
@@ -70,7 +71,7 @@ def stress(
     document = {
         **document_head(),
         "input": str(files.ply),
-        "options": settings.to_dict(),
+        "options": to_schema(settings.to_dict()),
         "cases": [outcome.to_dict() for outcome in found],
         "held": sum(outcome.passed is True for outcome in found),
         "failed": sum(outcome.passed is False for outcome in found),

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 RENDER_SUMS = """
 import hashlib, sys
 import numpy as np, torch
@@ -60,6 +62,7 @@ def test_what_kernels_call_is_inlined(root: Path) -> None:
     assert loose == set()
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_what_was_compiled_before(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     """Compiled just now, loaded from the cache, and after another kernel that shares its parts: the same bits."""
     monkeypatch.setenv("GSMERGE_CACHE_DIR", str(tmp_path))

@@ -87,12 +87,12 @@ def resized_images(scene: Path) -> list[object]:
 
 
 def lost_image(scene: Path) -> list[object]:
-    (scene / "images" / "view_03.png").unlink()
+    (scene / "images" / "view_003.png").unlink()
     return []
 
 
 def unreadable_image(scene: Path) -> list[object]:
-    (scene / "images" / "view_03.png").write_bytes(b"no picture")
+    (scene / "images" / "view_003.png").write_bytes(b"no picture")
     return []
 
 
@@ -158,8 +158,8 @@ CASES: dict[str, tuple[Spoil, int, list[str]]] = {
     "all NaN": (all_nan, 3, ["scene.ply", "NaN", "30720"]),
     "unknown lens": (unknown_lens, 3, ["transforms.json", "EQUIRECTANGULAR", "undistort"]),
     "image size": (resized_images, 3, ["96 x 64", "48 x 32"]),
-    "fewer images than cameras": (lost_image, 3, ["images", "expected 5", "found 4", "view_03"]),
-    "unreadable image": (unreadable_image, 3, ["view_03.png"]),
+    "fewer images than cameras": (lost_image, 3, ["images", "expected 5", "found 4", "view_003"]),
+    "unreadable image": (unreadable_image, 3, ["view_003.png"]),
     "no cameras": (no_cameras, 3, ["scene.ply", "no cameras", "--cameras"]),
     "broken JSON": (broken_json, 3, ["transforms.json", "expected JSON"]),
     "missing cameras": (missing_cameras, 3, ["scene.ply", "30720", "24576", "5 views"]),

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import typer.main
-from batches import FAST, records, results, rows, statuses
+from batches import FAST, InlinePool, records, results, rows, statuses
 
 import gsmerge
 from gsmerge.cli.app import app
@@ -39,6 +39,12 @@ def first(rooms: Path) -> tuple[int, Path]:
 
     out = rooms.parent / "out"
     return main(["batch", str(rooms), "--out", str(out), *FAST, "-q", "--jobs", "2"]), out
+
+
+@pytest.fixture(autouse=True)
+def in_this_process(first: tuple[int, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes are the subject of ``first`` alone, and of ``test_batch_faults.py``; each takes seconds to start."""
+    monkeypatch.setattr("gsmerge.batch.run.LocalPool", InlinePool)
 
 
 @pytest.fixture

@@ -48,6 +48,7 @@ def _runs(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """At random moments from the first scene on: what is recorded stays, what is not is done, once.
 
@@ -71,6 +72,7 @@ def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[s
     assert statuses(out) == {name: ["done"] for name in NAMES}
 
 
+@pytest.mark.slow
 def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     runs = [start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "--json") for _ in range(2)]
     told = [[json.loads(line) for line in process.communicate()[0].splitlines()] for process in runs]
@@ -82,6 +84,7 @@ def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[
     assert sum(line["status"] == "done" for lines in told for line in lines) == len(NAMES)
 
 
+@pytest.mark.slow
 def test_a_run_with_other_settings_is_refused_meanwhile(rooms: Path, tmp_path: Path) -> None:
     first = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")
     until(lambda: holders(tmp_path), first)
@@ -96,7 +99,7 @@ def test_a_run_with_other_settings_is_refused_meanwhile(rooms: Path, tmp_path: P
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
 
 
-@pytest.mark.parametrize(("retries", "code"), [(1, 0), (0, 5)])
+@pytest.mark.parametrize(("retries", "code"), [(1, 0), pytest.param(0, 5, marks=pytest.mark.slow)])
 def test_a_killed_process_costs_its_scene_alone(
     retries: int, code: int, rooms: Path, tmp_path: Path, undisturbed: dict[str, str]
 ) -> None:
@@ -113,6 +116,7 @@ def test_a_killed_process_costs_its_scene_alone(
     assert results(tmp_path) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) -> None:
     quick, slow = rooms / "room0", tmp_path / "slow"
     shutil.copytree(rooms / "room1", slow)
@@ -125,6 +129,7 @@ def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) ->
     assert finish(quick, "--out", tmp_path / "out", *FAST, "--timeout", PATIENCE, "-q") == 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     process = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1)
     until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path), process)
@@ -151,6 +156,7 @@ def limited(limit: int, *arguments: object) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Results do not fit and records do; then records do not either."""
     told = (rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")

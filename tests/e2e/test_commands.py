@@ -222,8 +222,8 @@ def test_segment(made_scene: Path, tmp_path: Path, run: Run) -> None:
     pictures = sorted((tmp_path / "overlays").iterdir())
     assert len(pictures) == 3 * VIEWS
     assert {cv2.imread(str(path)).shape for path in pictures} == {(HEIGHT, WIDTH, 3)}
-    photo = cv2.imread(str(made_scene / "images" / "view_00.png")).astype(float)
-    means = cv2.imread(str(tmp_path / "overlays" / "view_00.means.png")).astype(float)
+    photo = cv2.imread(str(made_scene / "images" / "view_000.png")).astype(float)
+    means = cv2.imread(str(tmp_path / "overlays" / "view_000.means.png")).astype(float)
     assert np.abs(photo - means).mean() < 12  # the pictures belong to the views that they are named after
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ def small(scene_copy: Path, run: Run) -> Path:
     return scene_copy / "small.ply"
 
 
-def test_table_and_files(scene_copy: Path, small: Path, run: Run) -> None:
+def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callable[..., None]) -> None:
     table, report = scene_copy / "a.csv", scene_copy / "a.json"
     outcome = run(
         "evaluate", scene_copy / "scene.ply", small, "--targets", scene_copy / "targets", "--lpips", "none",
@@ -29,7 +30,7 @@ def test_table_and_files(scene_copy: Path, small: Path, run: Run) -> None:
     before, after = document["results"]
     assert after["bytes"] == small.stat().st_size
     assert sum(after["bytes_by_attribute"].values()) < after["bytes"]
-    assert after["mean"]["target"]["psnr_visible"] > before["mean"]["target"]["psnr_visible"] + 2
+    floor(after["mean"]["target"]["psnr_visible"] - before["mean"]["target"]["psnr_visible"])
     assert document["num_views"] == {"context": 5, "target": 4}
     with table.open() as file:
         assert len(list(csv.DictReader(file))) == 2 * 9

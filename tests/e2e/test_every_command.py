@@ -137,7 +137,7 @@ def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Pa
         ("compact", "transforms.json"),
         ("encode", "transforms.json"),
         ("preview", "transforms.json"),
-        ("preview", "images/view_00.png"),
+        ("preview", "images/view_000.png"),
         ("render", "images"),
         ("segment", "images"),
     ],

@@ -1,4 +1,4 @@
-"""Scenes in no order from files to files, with floors in dB on photos that no stage has seen."""
+"""Scenes in no order from files to files, with floors (floors.csv, dB) on photos that no stage has seen."""
 
 from __future__ import annotations
 
@@ -26,19 +26,14 @@ def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-# Measured when written: 30.1, 25.1, 27.8 and 30.8 dB; the floors are half a dB below.
-@pytest.mark.parametrize(
-    ("settings", "floor"),
-    [({}, 29.5), ({"fit": "color"}, 24.6), ({"budget": "2%"}, 27.3), ({"k": 2}, 30.3)],
-    ids=str,
-)
-def test_floor(settings: dict, floor: float, made: Path, tmp_path: Path, target_psnr: Measure) -> None:
+@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"budget": "2%"}, {"k": 2}], ids=str)
+def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure, floor: Callable[..., None]) -> None:
     scene = read_scene(made, order="none")
     result = gsmerge.compact(scene, fit_steps=300, **settings)
     assert len(result.gaussians) <= 0.044 * settings.get("k", 1) * len(scene.gaussians)
     out = tmp_path / "small.ply"
     gsmerge.write_ply(out, result.gaussians)
-    assert target_psnr(made / "targets", out) >= floor
+    floor(target_psnr(made / "targets", out))
 
 
 def test_a_grid_without_its_order(made_scene: Path, tmp_path: Path, target_psnr: Measure) -> None:

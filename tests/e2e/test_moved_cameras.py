@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -58,7 +59,9 @@ def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) 
     assert found["like"] > found["own"] + 3
 
 
-def test_preview_and_render_agree_with_photos_that_are_broken(moved_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_preview_and_render_agree_with_photos_that_are_broken(
+    moved_scene: Path, tmp_path: Path, run: Run, floor: Callable[..., None]
+) -> None:
     photos = tmp_path / "photos"
     (moved_scene / "images").rename(photos)
     (moved_scene / "images").mkdir()
@@ -66,7 +69,7 @@ def test_preview_and_render_agree_with_photos_that_are_broken(moved_scene: Path,
         (moved_scene / "images" / path.name).write_bytes(path.read_bytes()[:100])
     outcome = run("render", moved_scene, "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
-    assert psnr(tmp_path / "out", photos) > 20
+    floor(psnr(tmp_path / "out", photos))
     assert run("preview", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
 
 
@@ -80,4 +83,4 @@ def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run:
     path.write_text(json.dumps(data))
     outcome = run("render", scene_copy, "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
-    assert "the cameras do not fit the Gaussians and stand as their file has them" in outcome.err
+    assert "the cameras do not fit the Gaussians and stay as their file has them" in outcome.err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree, rmtree
@@ -51,7 +52,7 @@ def test_train_then_compact(scene_copy: Path, run: Run) -> None:
     assert "refine" in report["seconds"]
 
 
-def test_photos_beside_the_scene_are_novel_views(scene_copy: Path) -> None:
+def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callable[..., None]) -> None:
     options = TrainOptions(views=(2, 0), densities=(0.02,), fit_steps=6, levels=(1,))
     few, whole = read_examples(scene_copy, options)
     context, held_out = (
@@ -63,7 +64,7 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path) -> None:
     assert whole.photo_ids(novel=True) == list(range(context, context + held_out))
     assert few.name == whole.name == scene_copy.name
     # between two views the scene's Gaussians render a photo that nobody fitted
-    assert np.mean([window_psnr(whole_photo(whole, photo), None) for photo in whole.photo_ids(novel=True)]) > 15
+    floor(np.mean([window_psnr(whole_photo(whole, photo), None) for photo in whole.photo_ids(novel=True)]))
     rmtree(scene_copy / "targets")
     (alone,) = read_examples(scene_copy / "scene.ply", replace(options, views=(0,)))
     assert len(alone.photos) == context

@@ -47,7 +47,7 @@ def test_exposure_that_changes_between_views(room: PixelScene) -> None:
     for images in (0.8 * room.images, 0.8 * room.images * factors):
         photos = scene_photos(replace(room, images=images), 2)
         found.append(fit_colors(merged, draw(merged, photos), photos, FitOptions())[0])
-    surfaces = [scenes.Surface(s.trace, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
+    surfaces = [scenes.Surface(s.shape, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
     steady, varied = (novel_psnr(g, surfaces) for g in found)
     assert steady > novel_psnr(merged, surfaces) + 1
     assert varied > steady - 0.2
@@ -59,7 +59,7 @@ def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: s
     assert room.images is not None
     factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)
-    surfaces = [scenes.Surface(s.trace, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
+    surfaces = [scenes.Surface(s.shape, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
     before = novel_psnr(scenes.compacted(scene, robust=robust, fit="none").gaussians, surfaces)
     after = [
         novel_psnr(scenes.compacted(scene, robust=robust, fit=fit, seed=seed).gaussians, surfaces) for seed in range(3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -38,12 +39,12 @@ SETTINGS = [
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_every_setting(room: PixelScene, settings: dict) -> None:
+def test_every_setting(room: PixelScene, settings: dict, floor: Callable[..., None]) -> None:
     result = compacted(loose.shuffled(room), **settings)
     if "budget" in settings:
         assert len(result.gaussians) == 150
     if "fit" not in settings and "rule" not in settings:
-        assert scenes.psnr_of(result.gaussians, room) > 18
+        floor(scenes.psnr_of(result.gaussians, room))
 
 
 def test_values_that_are_not_finite(room: PixelScene) -> None:
@@ -80,10 +81,10 @@ def test_gaussians_that_nobody_sees_change_nothing(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("fit", ["none", "color", "full"])
-def test_one_view(room: PixelScene, fit: str) -> None:
+def test_one_view(room: PixelScene, fit: str, floor: Callable[..., None]) -> None:
     single = scenes.take_views(room, [1])
     result = compacted(loose.shuffled(single), fit=fit, fit_steps=20)
-    assert scenes.psnr_of(result.gaussians, single) > 16
+    floor(scenes.psnr_of(result.gaussians, single))
 
 
 def test_one_gaussian(room: PixelScene) -> None:
@@ -92,7 +93,7 @@ def test_one_gaussian(room: PixelScene) -> None:
 
 
 @pytest.mark.parametrize("fit", ["color", "full"])
-def test_without_images(room: PixelScene, fit: str) -> None:
+def test_without_images(room: PixelScene, fit: str, floor: Callable[..., None]) -> None:
     """The result looks like the scene itself."""
     blind = replace(loose.shuffled(room), images=None)
     result = compacted(blind, fit=fit, fit_steps=60)
@@ -100,15 +101,15 @@ def test_without_images(room: PixelScene, fit: str) -> None:
     assert result.report.psnr_before is None
     assert result.report.psnr_after is None
     own = render(room.gaussians, room.cameras).images.clamp(0, 1)
-    assert scenes.psnr_of(result.gaussians, replace(room, images=own)) > 22
+    floor(scenes.psnr_of(result.gaussians, replace(room, images=own)))
 
 
-def test_without_cameras(room: PixelScene) -> None:
+def test_without_cameras(room: PixelScene, floor: Callable[..., None]) -> None:
     blind = UnalignedScene(loose.shuffled(room).gaussians, loose.NO_CAMERAS, None, ())
     result = compacted(blind, fit="full", fit_steps=60)
     assert any("no cameras" in note for note in result.report.notes)
     own = render(room.gaussians, room.cameras).images.clamp(0, 1)
-    assert scenes.psnr_of(result.gaussians, replace(room, images=own)) > 18
+    floor(scenes.psnr_of(result.gaussians, replace(room, images=own)))
 
 
 @pytest.mark.parametrize("shift", [[1e6, -3e6, 400.0]])
@@ -138,12 +139,12 @@ def test_harmonics_survive(degree: int) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_stacked_layers(room: PixelScene, threads: int) -> None:
+def test_stacked_layers(room: PixelScene, threads: int, floor: Callable[..., None]) -> None:
     """Every Gaussian four times at one place, fainter: layers that hide nothing and are hidden by nothing."""
     g = room.gaussians
     layers = Gaussians.concat([replace(g, opacities=1 - (1 - g.opacities) ** 0.25)] * 4)
     result = compacted(replace(loose.loosened(room), gaussians=layers), threads=threads)
-    assert scenes.psnr_of(result.gaussians, room) > 18
+    floor(scenes.psnr_of(result.gaussians, room))
 
 
 def test_empty_sky() -> None:

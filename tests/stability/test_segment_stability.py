@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -40,27 +42,17 @@ def test_positions_stay_exact_in_wide_pictures() -> None:
     assert np.array_equal(near, far)
 
 
-@pytest.fixture(scope="module")
-def default_scores() -> dict[int, np.ndarray]:
-    """Density -> mean (proxy, splat) of the six photos, dB."""
-    found = {}
-    for density in DENSITIES:
-        scores = []
-        for image in photos().values():
-            labels = superpixels(image, count_at(image, density)).numpy()
-            scores.append((proxy_psnr(image, labels), splat_psnr(image, labels)))
-        found[density] = np.mean(scores, 0)
-    return found
-
-
 @pytest.mark.parametrize(
-    ("density", "proxy", "splat"), [(5_000, 32.6, 30.0), (12_000, 35.9, 34.0), (23_000, 39.2, 37.9)]
+    "density", [DENSITIES[0], *(pytest.param(density, marks=pytest.mark.slow) for density in DENSITIES[1:])]
 )
-def test_photos_are_described_well(
-    default_scores: dict[int, np.ndarray], density: int, proxy: float, splat: float
-) -> None:
-    assert default_scores[density][0] >= proxy
-    assert default_scores[density][1] >= splat
+def test_photos_are_described_well(density: int, floor: Callable[..., None]) -> None:
+    scores = []
+    for image in photos().values():
+        labels = superpixels(image, count_at(image, density)).numpy()
+        scores.append((proxy_psnr(image, labels), splat_psnr(image, labels)))
+    mean = np.mean(scores, 0)
+    floor(mean[0], "mean colours")
+    floor(mean[1], "a Gaussian each")
 
 
 def test_methods_rank_as_published() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.measure.compare import break_even
+from gsmerge.measure.comparison import break_even
 from gsmerge.research.charts.experiment import OURS
 from gsmerge.research.charts.proxies import SEGMENTATIONS, Proxy
 from gsmerge.research.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from gsmerge.io import SceneLoad, atomic_output, read_targets
+from gsmerge.io import SceneLoad, atomic_output, read_held_out
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plane
 from gsmerge.measure.preview import Picture, to_picture
 from gsmerge.render import render
@@ -29,13 +29,13 @@ QUALITY = 88  # of the JPEG files
 MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
 
 
-def read_held_out(
+def read_target_views(
     load: SceneLoad, cameras: Path | None, images: Path | None
 ) -> tuple[Views | None, TargetPlaces | None]:
     """The target views of a scene, and their places along the trajectory if those are known."""
     if cameras is None:
         return None, None
-    targets = read_targets(load, cameras, images)
+    targets = read_held_out(load, cameras, images)
     places = None if targets.context_places is None else (targets.context_places, targets.places)
     return Views(targets.cameras, targets.images, targets.names), places
 

@@ -14,10 +14,10 @@ from statistics import median
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.budget import file_bytes
 from gsmerge.errors import error_line
 from gsmerge.io import AUTO, ReadHints, load_files
 from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.ply_writer import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.pipeline import compact
 from gsmerge.research.charts.experiment import OURS, Experiment, run_settings
@@ -26,23 +26,23 @@ from gsmerge.research.charts.measure import (
     choose_views,
     keep_pictures,
     measure,
-    read_held_out,
+    read_target_views,
     time_render,
 )
 from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
 from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experiment_key, read_runs
 from gsmerge.research.charts.scenes import SceneSource
 from gsmerge.runtime.estimate import (
+    COST_BASELINES,
     COST_COLOR_FIT,
-    COST_FIT_LOOKS,
+    COST_FIT_RENDERS,
     COST_FULL_FIT,
     COST_MERGE,
+    COST_OTHER_BASELINE,
     COST_READ,
-    COST_RIVAL,
-    COST_RIVAL_STEP,
-    COST_RIVALS,
     COST_ROBUST,
     COST_SEGMENT,
+    COST_UNMERGED_STEP,
     score_cost,
 )
 from gsmerge.runtime.threads import available_threads, use_threads
@@ -203,7 +203,7 @@ def _read(source: SceneSource, options: RunOptions) -> _LoadedScene | str:
     """The scene with its targets, or why it cannot be read."""
     try:
         load = load_files(source.files, opacity=options.opacity, hints=options.hints)
-        targets, places = read_held_out(load, source.targets, source.target_images)
+        targets, places = read_target_views(load, source.targets, source.target_images)
         return _LoadedScene(load.scene, targets, places, tuple(load.notes))
     except Exception as error:
         return error_line(error)
@@ -329,7 +329,7 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
     fit = settings.get("fit", "full")
     if fit == "full":
         work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
-        work += pixels * COST_FIT_LOOKS
+        work += pixels * COST_FIT_RENDERS
     else:
         work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
     return work / threads
@@ -337,10 +337,14 @@ def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads:
 
 def _baseline_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
     """The same of a baseline."""
-    work = COST_RIVALS.get(method, COST_RIVAL) + score_cost(views) + COST_COLOR_FIT * (method == "unmerged-color")
+    work = (
+        COST_BASELINES.get(method, COST_OTHER_BASELINE)
+        + score_cost(views)
+        + COST_COLOR_FIT * (method == "unmerged-color")
+    )
     work *= pixels
     if method == "unmerged-fit":
-        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_RIVAL_STEP)
+        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_UNMERGED_STEP)
     return work / threads
 
 

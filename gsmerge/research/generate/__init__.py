@@ -1,7 +1,7 @@
 """Synthetic scenes from random numbers alone, as a feed-forward network would export them, for training and tests."""
 
 from gsmerge.research.generate.options import GenerateOptions, NoiseOptions, read_ranges
-from gsmerge.research.generate.run import SceneFolder, generate, plan
+from gsmerge.research.generate.run import SceneFolder, generate, generate_scene, plan
 from gsmerge.research.generate.scene import SyntheticScene, make_scene
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "SceneFolder",
     "SyntheticScene",
     "generate",
+    "generate_scene",
     "make_scene",
     "plan",
     "read_ranges",

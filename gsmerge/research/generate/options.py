@@ -27,8 +27,8 @@ SPREAD = ("view_bias", "drift", "grain", "turn", "shift")  # drawn uniformly in 
 class NoiseOptions:
     """Ranges of every error and habit of an exporter, from which each scene draws its values.
 
-    Depth errors are deviations of the logarithm of depth, so about relative errors. docs/generator.md has the values of
-    real exports.
+    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/internals/generator.md
+    compares them with real exports.
 
     Args:
         view_bias: Scale error of a view.
@@ -126,12 +126,12 @@ def read_ranges(path: Path) -> NoiseOptions:
     table = read_table(path)
     unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
     if unknown:
-        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/generator.md has the names")
+        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/internals/generator.md has the names")
     values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
     try:
         return NoiseOptions(**values)
     except (ValueError, TypeError) as error:
-        raise SceneError(path, str(error), "docs/generator.md has the ranges") from error
+        raise SceneError(path, str(error), "docs/internals/generator.md has the ranges") from error
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,23 @@ def plan(
     return folders
 
 
+def generate_scene(
+    folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0, overwrite: bool = False
+) -> Path:
+    """Make scene ``index`` of the series of ``seed`` in a folder, as :func:`generate` does, and return the folder.
+
+    Raises:
+        UsageError: If the folder holds something else.
+        SceneError: If the folder cannot be written.
+    """
+    options = options or GenerateOptions()
+    key = scene_key(seed, index, options)
+    if not is_complete(folder, key):
+        check_replaceable(folder, overwrite=overwrite)
+        write_scene(folder, make_scene(seed, index, options), key)
+    return folder
+
+
 def generate(
     out: Path,
     count: int,
@@ -90,7 +107,7 @@ def generate(
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
     def work(index: int) -> None:
-        write_scene(planned[index].folder, make_scene(seed, index, options), scene_key(seed, index, options))
+        generate_scene(planned[index].folder, options, seed=seed, index=index, overwrite=overwrite)
 
     with use_threads(threads) as workers:
         for first in range(0, len(todo), workers):

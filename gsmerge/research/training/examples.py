@@ -23,7 +23,7 @@ from torch import Tensor
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.io import SceneLoad, load_scene, read_targets
+from gsmerge.io import SceneLoad, load_scene, read_held_out
 from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.evaluate import Views
 from gsmerge.moments import Members
@@ -144,7 +144,7 @@ def _read_held_out(load: SceneLoad) -> Views | None:
     folder = load.files.ply.parent / "targets"
     if not folder.is_dir():
         return None
-    read = read_targets(load, folder)
+    read = read_held_out(load, folder)
     return Views(read.cameras, read.images, read.names)
 
 

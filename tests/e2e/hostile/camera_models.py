@@ -183,7 +183,7 @@ def _text() -> dict[str, Case]:
         cases[f"cameras.txt with {word}"] = Case(model(lambda c, i, line=line: (line, i), text=True))
     lines = {
         "nothing": b"", "one line": b"1 2 3", "words": b"a b c d e f g h i j", "bytes": bytes(range(256)),
-        "an unknown camera": b"0 1 0 0 0 0 0 0 77 view_00.png\n\n", "inf": b"0 inf inf inf inf 0 0 0 1 a\n\n",
+        "an unknown camera": b"0 1 0 0 0 0 0 0 77 view_000.png\n\n", "inf": b"0 inf inf inf inf 0 0 0 1 a\n\n",
         "NaN": b"0 nan 0 0 0 0 0 0 1 a\n\n",
     }  # fmt: skip
     for word, line in lines.items():

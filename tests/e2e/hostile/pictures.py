@@ -95,9 +95,9 @@ def _spoiled() -> dict[str, Case]:
     cases |= {f"all PNG claim {w} x {h}": Case(every(with_size(w, h))) for w, h in sizes[:6]}
     cases["zero bytes"] = Case(first(lambda data: bytes(1000)))
     cases["all of zero bytes"] = Case(every(lambda data: bytes(1000)))
-    cases["8 GB of zeros"] = Case(lambda folder: sparse(folder / "images" / "view_00.png", 2**33))
+    cases["8 GB of zeros"] = Case(lambda folder: sparse(folder / "images" / "view_000.png", 2**33))
     cases["8 GB after a PNG"] = Case(
-        lambda f: sparse(f / "images" / "view_00.png", 2**33, (f / "images" / "view_00.png").read_bytes())
+        lambda f: sparse(f / "images" / "view_000.png", 2**33, (f / "images" / "view_000.png").read_bytes())
     )
     cases["a bomb"] = Case(first(bomb))
     cases["three bombs"] = Case(every(bomb))

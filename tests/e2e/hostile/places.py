@@ -91,7 +91,7 @@ def deep(folder: Path) -> Sequence[object]:
 
 
 def in_images(make: Callable[[Path], object]) -> Spoil:
-    return lambda folder: make(folder / "images" / "view_00.png")  # type: ignore[func-returns-value]
+    return lambda folder: make(folder / "images" / "view_000.png")  # type: ignore[func-returns-value]
 
 
 def many_images(folder: Path) -> None:
@@ -117,7 +117,7 @@ for thing, make in {"loop": loop, "ring": ring, "pipe": os.mkfifo, "folder": os.
     CASES[f"scene.ply as a {thing}"] = Case(replaced("scene.ply", make))
     CASES[f"transforms.json as a {thing}"] = Case(replaced("transforms.json", make), EITHER)
     CASES[f"images as a {thing}"] = Case(replaced("images", make), EITHER)
-    CASES[f"an image as a {thing}"] = Case(replaced("images/view_00.png", make))
+    CASES[f"an image as a {thing}"] = Case(replaced("images/view_000.png", make))
     for option, name in (("--cameras", "c.json"), ("--cameras", "c.npz"), ("--cameras", "c.txt"), ("--images", "i")):
         told = given(option, f"{{}}/{name}", make=lambda folder, make=make, name=name: make(folder / name))
         CASES[f"{option} {name}, a {thing}"] = Case(told)

@@ -60,7 +60,7 @@ def test_untrained_networks_change_no_bit(scene: Made) -> None:
     assert_close(refine(merged, learned), merged)
     for k in (1, 2, 3, 4, 6):
         options = DecodeOptions(k=k)
-        assert_close(decode(merged, scene.members, options, learned=learned), decode(merged, scene.members, options))
+        assert_close(decode(merged, scene.members, options, networks=learned), decode(merged, scene.members, options))
 
 
 def test_trained_networks_change_every_stage(scene: Made) -> None:
@@ -72,7 +72,7 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
     merged, plain = merge(encoded, pairs(encoded), learned), merge(encoded, pairs(encoded))
     assert torch.equal(merged.means[:2], plain.means[:2])  # alone
     refined, children = refine(merged, learned), decode(merged, scene.members, DecodeOptions(k=2))
-    decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), learned=learned)
+    decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), networks=learned)
     for after, before in ((geometry, encoded), (merged, plain), (refined, merged)):
         for name in ("means", "covars", "extinctions", "sh0"):
             assert not torch.equal(getattr(after, name), getattr(before, name)), name
@@ -86,7 +86,7 @@ def test_no_networks_and_nothing_to_do(scene: Made) -> None:
     none = take(encode_features(scene.features, learned), torch.zeros(0, dtype=torch.int64))
     assert len(refine(none, learned)) == 0
     assert len(encode_features(none, learned)) == 0
-    assert len(decode(none, scene.members, DecodeOptions(), learned=learned)) == 0
+    assert len(decode(none, scene.members, DecodeOptions(), networks=learned)) == 0
 
 
 def test_order_of_the_members_does_not_matter(scene: Made) -> None:
@@ -137,12 +137,12 @@ def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
     encoded = encode_features(scene.features, learned)
     counts = np.where(np.arange(len(encoded)) % 2 == 0, 3, 4)
     options = DecodeOptions(min_opacity=0)
-    mixed_counts = decode(encoded, scene.members, options, counts, learned=learned)
+    mixed_counts = decode(encoded, scene.members, options, counts, networks=learned)
     plain = decode(encoded, scene.members, options, counts)
     assert len(mixed_counts) == len(plain)
     row = next(i for i in range(0, len(encoded), 2) if encoded.starts[i + 1] - encoded.starts[i] >= 13)
     one = take(encoded, torch.tensor([row]))
-    alone = decode(one, scene.members, options, np.array([3]), learned=learned)
+    alone = decode(one, scene.members, options, np.array([3]), networks=learned)
     before = len(decode(take(encoded, torch.arange(row)), scene.members, options, counts[:row]))
     assert_close(alone, mixed_counts[before : before + 3], 2e-6)
 
@@ -158,13 +158,13 @@ def test_many_children_and_the_backing_layer_stay_as_they_are(scene: Made) -> No
     many = np.full(len(few), 6)
     parents = np.repeat(np.arange(len(few)), 6)
     if len(children) == len(parents):
-        assert_close(decode(few, scene.members, options, many, learned=learned), children)
+        assert_close(decode(few, scene.members, options, many, networks=learned), children)
     behind = replace(scene.features, backing=torch.ones(len(encoded), dtype=torch.bool))
     encoded = encode_features(behind, learned)
     assert torch.equal(encoded.means, behind.means)
     refined = refine(encoded, learned)
     assert_close(refined, encoded)
-    assert_close(decode(refined, scene.members, options, learned=learned), feature_to_gaussians(refined))
+    assert_close(decode(refined, scene.members, options, networks=learned), feature_to_gaussians(refined))
 
 
 def test_refiner_reads_the_neighbours(scene: Made) -> None:
@@ -287,7 +287,7 @@ def test_absolute_heads_know_no_children(scene: Made) -> None:
     plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.learned(Networks(absolute).requires_grad_(False))
     encoded = encode_features(scene.features, untrained)
     analytic = decode(encoded, scene.members, plain)
-    found = decode(encoded, scene.members, plain, learned=untrained)
+    found = decode(encoded, scene.members, plain, networks=untrained)
     parents = torch.cdist(found.means, encoded.means).argmin(1)
     torch.testing.assert_close(found.means, feature_to_gaussians(encoded).means[parents])
     assert torch.equal(found.scales, found.scales[:, :1].expand(-1, 3))
@@ -310,7 +310,7 @@ def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
     backing[0] = True
     features = encode_features(replace(scene.features, backing=backing), learned)
     options = DecodeOptions(k=6, min_opacity=0.0)
-    plain, found = decode(features, scene.members, options), decode(features, scene.members, options, learned=learned)
+    plain, found = decode(features, scene.members, options), decode(features, scene.members, options, networks=learned)
     sizes = np.bincount(parents_of(features, scene, 6), minlength=len(features))
     whole = torch.from_numpy(np.repeat((sizes > 4) | backing.numpy(), sizes))
     assert bool(whole.any())

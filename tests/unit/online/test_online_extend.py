@@ -155,7 +155,7 @@ def test_the_settings_of_each_batch_are_its_own(pairs: list[PixelScene], first: 
 # what batches may be
 
 
-def test_pictures_of_another_size(scene: PixelScene, first: OnlineState) -> None:
+def test_pictures_of_another_size(scene: PixelScene, first: OnlineState, floor: Callable[..., None]) -> None:
     large = room(6, 54, 36)
     state, report = extend(first, scenes.take_views(large, [2, 3]), options())
     assert report.num_input == 2 * 54 * 36
@@ -163,7 +163,7 @@ def test_pictures_of_another_size(scene: PixelScene, first: OnlineState) -> None
     assert state.replay.images.shape == (4, 24, 36, 3)
     assert report.num_covered + report.num_joined > 0.3 * report.num_new
     gaussians = decode_stored(state, options=options().fit).gaussians
-    assert scenes.psnr_of(gaussians, scenes.take_views(scene, [2, 3])) > 18
+    floor(scenes.psnr_of(gaussians, scenes.take_views(scene, [2, 3])))
     single, _ = extend(first, scenes.take_views(scene, [2, 3]), options())
     np.testing.assert_allclose(state.cameras.Ks, single.cameras.Ks, rtol=1e-9)
 
@@ -193,12 +193,13 @@ def test_photos_of_some_batches(bare: int, pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("change", [loosened, shuffled], ids=["loosened", "shuffled"])
-def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene]) -> None:
-    for batches in ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]]):
+def test_gaussians_in_no_order(change: Change, pairs: list[PixelScene], floor: Callable[..., None]) -> None:
+    choices = ([change(pairs[0]), pairs[1]], [pairs[0], change(pairs[1])], [change(pair) for pair in pairs[:2]])
+    for number, batches in enumerate(choices):
         compactor = fed(batches)  # type: ignore[arg-type]
         assert compactor.batches[1]["num_covered"] + compactor.batches[1]["num_joined"] > 0
         both = scenes.take_views(room(), range(4))
-        assert scenes.psnr_of(compactor.decode(fit="color"), both) > 17
+        floor(scenes.psnr_of(compactor.decode(fit="color"), both), str(number))
 
 
 def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
@@ -210,13 +211,13 @@ def test_gaussians_without_photos_in_no_order(pairs: list[PixelScene]) -> None:
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene]) -> None:
+def test_gaussians_without_cameras(first: bool, pairs: list[PixelScene], floor: Callable[..., None]) -> None:
     """Views are placed for them."""
     bare = UnalignedScene(pairs[0].gaussians, NO_CAMERAS, None, ())
     compactor = fed([bare, pairs[1]] if first else [pairs[1], bare])  # type: ignore[list-item]
     assert compactor.batches[1]["num_covered"] > 0
     assert len(state_of(compactor).replay) == 2
-    assert scenes.psnr_of(compactor.decode(fit="color"), pairs[1]) > 17
+    floor(scenes.psnr_of(compactor.decode(fit="color"), pairs[1]))
 
 
 def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
@@ -358,12 +359,12 @@ def test_decoding_changes_nothing(pairs: list[PixelScene]) -> None:
     same_state(state_of(compactor), state_of(fed(pairs)))
 
 
-def test_results_are_in_the_world(scene: PixelScene) -> None:
+def test_results_are_in_the_world(scene: PixelScene, floor: Callable[..., None]) -> None:
     turn, shift = scenes.random_rotation(0), np.array([30.0, -20.0, 10.0])
     moved = scenes.move(scene, turn, 4.0, shift)
     compactor = fed(parts_of(moved, 3))
     for fit in ("none", "color"):
-        assert scenes.psnr_of(compactor.decode(fit=fit), moved) > 17
+        floor(scenes.psnr_of(compactor.decode(fit=fit), moved), fit)
 
 
 # what is refused

@@ -13,7 +13,7 @@ import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
-from gsmerge.io import load_scene, read_targets
+from gsmerge.io import load_scene, read_held_out
 from gsmerge.io.scene import SceneLoad
 from gsmerge.measure.evaluate import Views
 from gsmerge.options import CompactOptions
@@ -100,7 +100,7 @@ def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
 
 
 def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
-    read = read_targets(load, made_scene / "targets")
+    read = read_held_out(load, made_scene / "targets")
     steps: list[tuple[str, int, int]] = []
     found = stress(
         load,

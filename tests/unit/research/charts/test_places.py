@@ -57,9 +57,9 @@ def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
     [
         ("scene.ply", True),
         ("transforms.json", True),
-        ("images/view_00.png", True),
+        ("images/view_000.png", True),
         ("targets/transforms.json", True),
-        ("targets/images/view_00.png", True),
+        ("targets/images/view_000.png", True),
         ("notes.txt", False),
     ],
 )

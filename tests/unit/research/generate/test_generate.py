@@ -13,7 +13,7 @@ import gsmerge
 from gsmerge import PixelScene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import project
-from gsmerge.io import load_scene, read_targets
+from gsmerge.io import load_scene, read_held_out
 from gsmerge.render.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate, make_scene
 from gsmerge.research.generate.styles import STYLES
@@ -64,7 +64,7 @@ def test_targets_look_at_the_same_scene(folder: Path) -> None:
     better = []
     for index in range(len(STYLES)):
         load = load_scene(folder / f"scene_{index:04d}")
-        targets = read_targets(load, folder / f"scene_{index:04d}" / "targets", None)
+        targets = read_held_out(load, folder / f"scene_{index:04d}" / "targets", None)
         images = gsmerge.render(load.scene.gaussians, targets.cameras).images
         own = np.mean([psnr(a, b) for a, b in zip(images, targets.images, strict=True)])
         other = np.mean([psnr(a, b) for a, b in zip(images, targets.images.flip(0), strict=True)])

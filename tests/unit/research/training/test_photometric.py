@@ -268,7 +268,7 @@ def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example,
     networks = noisy(replace(TINY, outputs=outputs))
     learned = NetworkContext(networks, example.members, example.cameras, 0)
     merged = merge(encode_features(example.features, learned), example.matches, learned)
-    expected = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), learned=learned)
+    expected = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), networks=learned)
     every = torch.arange(len(example.centres))
     with torch.no_grad():
         found = predict(Crop(example, 1, every, every, example.levels[1].mask), networks, 0).gaussians

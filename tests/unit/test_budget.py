@@ -1,0 +1,91 @@
+"""How many Gaussians a budget, a file size and a preset mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import scenes
+
+from gsmerge import write_ply
+from gsmerge.budget import PRESETS, parse_budget, parse_bytes
+from gsmerge.io.formats.ply_writer import count_for_bytes, file_bytes
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("40000", 40_000),
+        (40000, 40_000),
+        ("40_000", 40_000),
+        (" 2% ", 20_000),
+        ("2.5 %", 25_000),
+        (".1%", 1000),
+        ("29%", 290_000),  # 0.29 * 1e6 is not a whole number in floating point
+        ("0.00019%", 1),
+        ("100%", 1_000_000),
+        ("3000000", 1_000_000),
+    ],
+)
+def test_budget(text: str | int, count: int) -> None:
+    assert parse_budget(text, 1_000_000) == count
+
+
+@pytest.mark.parametrize("text", ["", "many", "-5", "2.5", "5%%", "1e4", "%", "4٤", "nan", "inf%"])
+def test_budgets_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match='expected a number of Gaussians as "40000" or a share as "2%"'):
+        parse_budget(text, 1000)
+
+
+@pytest.mark.parametrize("text", ["0", "0%", "0.01%"])
+def test_budgets_of_nothing(text: str) -> None:
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        parse_budget(text, 1000)
+
+
+def test_budget_above_everything() -> None:
+    with pytest.raises(ValueError, match="at most 100%, got '101%'"):
+        parse_budget("101%", 1000)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("5MB", 5_000_000), ("5 mb", 5_000_000), ("1.5KiB", 1536), ("77", 77), (77, 77), ("2GB", 2 * 10**9)],
+)
+def test_bytes(text: str | int, size: int) -> None:
+    assert parse_bytes(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "MB", "5 XB", "-5MB", "5MBB", "1e6"])
+def test_bytes_that_are_none(text: str) -> None:
+    with pytest.raises(ValueError, match='expected a size as "5MB"'):
+        parse_bytes(text)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_file_bytes_are_those_of_the_file(tmp_path: Path, degree: int) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 9), degree=degree)
+    for count in (1, 9, 10, 144):
+        write_ply(tmp_path / f"{count}.ply", scene.gaussians[:count])
+        assert (tmp_path / f"{count}.ply").stat().st_size == file_bytes(count, degree)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_count_for_bytes_is_the_most_that_fits(degree: int) -> None:
+    sizes = [file_bytes(1, degree), 10_000, 68_000, 68_001, 5_000_000]
+    sizes += [file_bytes(10**k, degree) - d for k in (1, 2, 5) for d in (0, 1, 2)]
+    for size in sizes:
+        if size >= file_bytes(1, degree):
+            count = count_for_bytes(size, degree)
+            assert file_bytes(count, degree) <= size < file_bytes(count + 1, degree)
+
+
+def test_count_for_bytes_out_of_range() -> None:
+    with pytest.raises(ValueError, match="for one Gaussian, got 100"):
+        count_for_bytes(100, 0)
+    with pytest.raises(ValueError, match="sh_degree: expected 0 to 4, got 5"):
+        count_for_bytes(10**6, 5)
+
+
+def test_presets_rise() -> None:
+    assert PRESETS["quest3"] < PRESETS["mobile"] < PRESETS["desktop"]
