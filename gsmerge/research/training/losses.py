@@ -114,7 +114,7 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """Mean :func:`gsmerge.stages.fit.loss.loss_ssim` of images ``[h,w,3]`` where ``mask [h,w]`` is; 1 where nowhere."""
+    """Mean :func:`gsmerge.stages.fit.loss.loss_ssim` of images ``[h,w,3]`` within ``mask [h,w]``; 1 if it is empty."""
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()

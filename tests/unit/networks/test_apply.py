@@ -49,30 +49,30 @@ def pairs(features: FeatureGaussians) -> Matches:
 
 
 def test_untrained_networks_change_no_bit(scene: Made) -> None:
-    learned = scene.learned(Networks(SMALL))
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(Networks(SMALL))
+    encoded = encode_features(scene.features, context)
     assert encoded.latents.shape == (len(scene.features), SMALL.latent)
     bare = replace(encoded, latents=torch.zeros(len(encoded), 0))
     assert_close(bare, scene.features)
-    assert_close(match_geometry(encoded, learned), encoded)
-    merged = merge(encoded, pairs(encoded), learned)
+    assert_close(match_geometry(encoded, context), encoded)
+    merged = merge(encoded, pairs(encoded), context)
     assert_close(merged, merge(encoded, pairs(encoded)))
-    assert_close(refine(merged, learned), merged)
+    assert_close(refine(merged, context), merged)
     for k in (1, 2, 3, 4, 6):
         options = DecodeOptions(k=k)
-        assert_close(decode(merged, scene.members, options, learned=learned), decode(merged, scene.members, options))
+        assert_close(decode(merged, scene.members, options, networks=context), decode(merged, scene.members, options))
 
 
 def test_trained_networks_change_every_stage(scene: Made) -> None:
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     assert not torch.equal(encoded.means, scene.features.means)
     assert torch.equal(encoded.covars, scene.features.covars)  # paper: the encoder leaves the geometry to the head
-    geometry = match_geometry(encoded, learned)
-    merged, plain = merge(encoded, pairs(encoded), learned), merge(encoded, pairs(encoded))
+    geometry = match_geometry(encoded, context)
+    merged, plain = merge(encoded, pairs(encoded), context), merge(encoded, pairs(encoded))
     assert torch.equal(merged.means[:2], plain.means[:2])  # alone
-    refined, children = refine(merged, learned), decode(merged, scene.members, DecodeOptions(k=2))
-    decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), learned=learned)
+    refined, children = refine(merged, context), decode(merged, scene.members, DecodeOptions(k=2))
+    decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), networks=context)
     for after, before in ((geometry, encoded), (merged, plain), (refined, merged)):
         for name in ("means", "covars", "extinctions", "sh0"):
             assert not torch.equal(getattr(after, name), getattr(before, name)), name
@@ -82,11 +82,11 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
 
 def test_no_networks_and_nothing_to_do(scene: Made) -> None:
     assert refine(scene.features, None) is scene.features
-    learned = scene.learned(noisy())
-    none = take(encode_features(scene.features, learned), torch.zeros(0, dtype=torch.int64))
-    assert len(refine(none, learned)) == 0
-    assert len(encode_features(none, learned)) == 0
-    assert len(decode(none, scene.members, DecodeOptions(), learned=learned)) == 0
+    context = scene.networks(noisy())
+    none = take(encode_features(scene.features, context), torch.zeros(0, dtype=torch.int64))
+    assert len(refine(none, context)) == 0
+    assert len(encode_features(none, context)) == 0
+    assert len(decode(none, scene.members, DecodeOptions(), networks=context)) == 0
 
 
 def test_order_of_the_members_does_not_matter(scene: Made) -> None:
@@ -95,61 +95,61 @@ def test_order_of_the_members_does_not_matter(scene: Made) -> None:
     for first, last in pairwise(starts):
         members[first:last] = rng.permutation(members[first:last])
     shuffled = replace(scene.features, members=torch.from_numpy(members))
-    learned = scene.learned(noisy())
-    a, b = encode_features(scene.features, learned), encode_features(shuffled, learned)
+    context = scene.networks(noisy())
+    a, b = encode_features(scene.features, context), encode_features(shuffled, context)
     assert torch.equal(a.latents, b.latents)
     assert torch.equal(a.means, b.means)
 
 
 def test_order_of_the_groups_and_the_table_they_share_do_not_matter(scene: Made) -> None:
     """Padding and bins: every group alone gives what all together give."""
-    learned = scene.learned(noisy())
-    together = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    together = encode_features(scene.features, context)
     for row in range(0, len(scene.features), 3):
-        alone = encode_features(take(scene.features, torch.tensor([row])), learned)
+        alone = encode_features(take(scene.features, torch.tensor([row])), context)
         assert_close(alone, take(together, torch.tensor([row])), 2e-6)
 
 
 def test_order_within_a_cluster_does_not_matter(scene: Made) -> None:
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     matches = pairs(encoded)
     back = torch.arange(len(encoded)).flip(0)
-    a = merge(encoded, matches, learned)
-    b = merge(take(encoded, back), Matches(matches.clusters[back], matches.count), learned)
+    a = merge(encoded, matches, context)
+    b = merge(take(encoded, back), Matches(matches.clusters[back], matches.count), context)
     torch.testing.assert_close(a.means.sort(0).values, b.means.sort(0).values, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(a.latents.sort(0).values, b.latents.sort(0).values, atol=1e-5, rtol=1e-5)
 
 
 def test_clusters_alone_and_together(scene: Made) -> None:
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     half, matches = len(encoded) // 2, pairs(encoded)
-    together = merge(encoded, matches, learned)
+    together = merge(encoded, matches, context)
     two = torch.tensor([5, half + 5])
-    alone = merge(take(encoded, two), Matches(torch.zeros(2, dtype=torch.int64), 1), learned)
+    alone = merge(take(encoded, two), Matches(torch.zeros(2, dtype=torch.int64), 1), context)
     assert_close(alone, take(together, torch.tensor([2 + 5 - 1])), 2e-6)
 
 
 def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
     """Slots that are empty do not count, whoever shares the table."""
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     counts = np.where(np.arange(len(encoded)) % 2 == 0, 3, 4)
     options = DecodeOptions(min_opacity=0)
-    mixed_counts = decode(encoded, scene.members, options, counts, learned=learned)
+    mixed_counts = decode(encoded, scene.members, options, counts, networks=context)
     plain = decode(encoded, scene.members, options, counts)
     assert len(mixed_counts) == len(plain)
     row = next(i for i in range(0, len(encoded), 2) if encoded.starts[i + 1] - encoded.starts[i] >= 13)
     one = take(encoded, torch.tensor([row]))
-    alone = decode(one, scene.members, options, np.array([3]), learned=learned)
+    alone = decode(one, scene.members, options, np.array([3]), networks=context)
     before = len(decode(take(encoded, torch.arange(row)), scene.members, options, counts[:row]))
     assert_close(alone, mixed_counts[before : before + 3], 2e-6)
 
 
 def test_many_children_and_the_backing_layer_stay_as_they_are(scene: Made) -> None:
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     large = torch.nonzero(encoded.starts.diff() >= 30)[:, 0]
     few, options = take(encoded, large), DecodeOptions(k=6, min_opacity=0)
     children = decode(few, scene.members, options)
@@ -158,25 +158,25 @@ def test_many_children_and_the_backing_layer_stay_as_they_are(scene: Made) -> No
     many = np.full(len(few), 6)
     parents = np.repeat(np.arange(len(few)), 6)
     if len(children) == len(parents):
-        assert_close(decode(few, scene.members, options, many, learned=learned), children)
+        assert_close(decode(few, scene.members, options, many, networks=context), children)
     behind = replace(scene.features, backing=torch.ones(len(encoded), dtype=torch.bool))
-    encoded = encode_features(behind, learned)
+    encoded = encode_features(behind, context)
     assert torch.equal(encoded.means, behind.means)
-    refined = refine(encoded, learned)
+    refined = refine(encoded, context)
     assert_close(refined, encoded)
-    assert_close(decode(refined, scene.members, options, learned=learned), feature_to_gaussians(refined))
+    assert_close(decode(refined, scene.members, options, networks=context), feature_to_gaussians(refined))
 
 
 def test_refiner_reads_the_neighbours(scene: Made) -> None:
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     near = find_neighbors(encoded, 4)
     far = int(np.setdiff1d(np.arange(len(encoded)), np.append(near[0], 0))[-1])
     for row, same in ((int(near[0, 0]), False), (far, True)):
         latents = encoded.latents.clone()
         latents[row] += 1
-        refined = refine_features(replace(encoded, latents=latents), learned)
-        assert torch.equal(refined.means[0], refine_features(encoded, learned).means[0]) is same
+        refined = refine_features(replace(encoded, latents=latents), context)
+        assert torch.equal(refined.means[0], refine_features(encoded, context).means[0]) is same
 
 
 def test_nearest_by_hand(scene: Made) -> None:
@@ -194,11 +194,11 @@ def test_nearest_by_hand(scene: Made) -> None:
 
 
 def test_one_thread_and_many_give_the_same_bits(scene: Made) -> None:
-    learned = scene.learned(noisy(replace(SMALL, width=32)))
+    context = scene.networks(noisy(replace(SMALL, width=32)))
 
     def run() -> FeatureGaussians:
-        encoded = encode_features(scene.features, learned)
-        return refine(merge(encoded, match(encoded, MatchOptions(overlap=0.3), learned), learned), learned)
+        encoded = encode_features(scene.features, context)
+        return refine(merge(encoded, match(encoded, MatchOptions(overlap=0.3), context), context), context)
 
     with use_threads(1), torch.no_grad():
         one = run()
@@ -208,8 +208,8 @@ def test_one_thread_and_many_give_the_same_bits(scene: Made) -> None:
 
 def test_the_seed_chooses_the_sample_of_large_groups(scene: Made) -> None:
     networks = noisy()
-    a, b = (encode_features(scene.features, scene.learned(networks, seed)).latents for seed in (0, 1))
-    assert torch.equal(a, encode_features(scene.features, scene.learned(networks, 0)).latents)
+    a, b = (encode_features(scene.features, scene.networks(networks, seed)).latents for seed in (0, 1))
+    assert torch.equal(a, encode_features(scene.features, scene.networks(networks, 0)).latents)
     large = scene.features.starts.diff() > SMALL.members
     twice = scene.features.starts.diff() > 2 * SMALL.members  # a group of nine has but one place with a choice
     assert bool((a[twice] != b[twice]).any(1).all())
@@ -218,14 +218,14 @@ def test_the_seed_chooses_the_sample_of_large_groups(scene: Made) -> None:
 
 def test_every_member_counts_in_the_mass_even_when_sampled(scene: Made) -> None:
     """Group mass is that of all members (paper supplement), so it does not change with the limit."""
-    few, many = scene.learned(noisy()), scene.learned(noisy(replace(SMALL, members=64)))
+    few, many = scene.networks(noisy()), scene.networks(noisy(replace(SMALL, members=64)))
     assert torch.equal(few.describe(scene.features).group, many.describe(scene.features).group)
 
 
 @pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
 def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
-    learned, f = (
-        scene.learned(noisy(replace(SMALL, members=64))),
+    context, f = (
+        scene.networks(noisy(replace(SMALL, members=64))),
         scene.features,
     )  # a sample depends on the bits of means
     cameras = scene.scene.cameras
@@ -238,25 +238,25 @@ def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
         f, means=f.means * factor, covars=f.covars * factor**2, masses=f.masses * factor**3,
         extinctions=f.extinctions * factor**2, footprints=f.footprints * factor,
     )  # fmt: skip
-    other = NetworkContext(learned.networks, members, replace(cameras, viewmats=viewmats))
-    a, b = encode_features(f, learned), encode_features(larger, other)
+    other = NetworkContext(context.networks, members, replace(cameras, viewmats=viewmats))
+    a, b = encode_features(f, context), encode_features(larger, other)
     torch.testing.assert_close(a.means * factor, b.means, rtol=1e-5, atol=1e-5 * factor)
 
 
 def test_gradients_reach_every_parameter(scene: Made) -> None:
     networks = noisy().requires_grad_(True)
-    learned = scene.learned(networks)
-    group_features = learned.describe(scene.features)
-    encoded = run_encoder(scene.features, group_features, learned)
+    context = scene.networks(networks)
+    group_features = context.describe(scene.features)
+    encoded = run_encoder(scene.features, group_features, context)
     features = replace(scene.features, latents=torch.tanh(encoded[:, :-3]))
     total = encoded.square().sum()
     for k in (1, 2, 4):
         sizes = np.full(len(features), k)
         parents = np.repeat(np.arange(len(features)), sizes)
         base = feature_to_gaussians(scene.features)[torch.from_numpy(parents)]
-        total = total + run_heads(base, parents, features, group_features, learned).square().sum()
-    merged = merge(features, pairs(features), learned)
-    total = total + refine_features(merged, learned).latents.square().sum()
+        total = total + run_heads(base, parents, features, group_features, context).square().sum()
+    merged = merge(features, pairs(features), context)
+    total = total + refine_features(merged, context).latents.square().sum()
     total.backward()
     for name, parameter in networks.named_parameters():
         assert parameter.grad is not None, name
@@ -266,10 +266,10 @@ def test_gradients_reach_every_parameter(scene: Made) -> None:
 
 
 def test_decode_gaussians_takes_the_frame_of_the_parent(scene: Made) -> None:
-    learned = scene.learned(noisy())
-    encoded = encode_features(scene.features, learned)
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
     base = feature_to_gaussians(encoded)
-    moved = decode_gaussians(base, np.arange(len(base)), encoded, learned)
+    moved = decode_gaussians(base, np.arange(len(base)), encoded, context)
     assert not torch.equal(moved.means, base.means)
     torch.testing.assert_close(moved.quats.norm(dim=1), torch.ones(len(base)), atol=1e-5, rtol=0)
 
@@ -284,33 +284,33 @@ def test_sizes_are_checked() -> None:
 def test_absolute_heads_know_no_children(scene: Made) -> None:
     """Whatever the children are, what is decoded is the same; untrained, a round grey Gaussian at the group's place."""
     absolute = replace(SMALL, outputs="absolute")
-    plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.learned(Networks(absolute).requires_grad_(False))
+    plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.networks(Networks(absolute).requires_grad_(False))
     encoded = encode_features(scene.features, untrained)
     analytic = decode(encoded, scene.members, plain)
-    found = decode(encoded, scene.members, plain, learned=untrained)
+    found = decode(encoded, scene.members, plain, networks=untrained)
     parents = torch.cdist(found.means, encoded.means).argmin(1)
     torch.testing.assert_close(found.means, feature_to_gaussians(encoded).means[parents])
     assert torch.equal(found.scales, found.scales[:, :1].expand(-1, 3))
     assert torch.equal(found.opacities, torch.full((len(found),), 0.5))
     assert not found.sh0.any()
     assert match_geometry(encoded, untrained) is encoded
-    learned = scene.learned(noisy(absolute))
+    context = scene.networks(noisy(absolute))
     rows = np.repeat(np.arange(len(encoded)), 2)
     both = analytic[: 2 * len(encoded)] if len(analytic) >= 2 * len(encoded) else None
     for start in (feature_to_gaussians(encoded)[torch.from_numpy(rows)], both):
         if start is not None:
-            moved = decode_gaussians(start, rows, encoded, learned)
+            moved = decode_gaussians(start, rows, encoded, context)
             assert not torch.equal(moved.means[::2], moved.means[1::2])  # slots tell siblings apart
             assert float(moved.scales.max() / found.scales.max()) < np.exp(6.1)
 
 
 def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
-    learned = scene.learned(noisy(replace(SMALL, outputs="absolute")))
+    context = scene.networks(noisy(replace(SMALL, outputs="absolute")))
     backing = torch.zeros(len(scene.features), dtype=torch.bool)
     backing[0] = True
-    features = encode_features(replace(scene.features, backing=backing), learned)
+    features = encode_features(replace(scene.features, backing=backing), context)
     options = DecodeOptions(k=6, min_opacity=0.0)
-    plain, found = decode(features, scene.members, options), decode(features, scene.members, options, learned=learned)
+    plain, found = decode(features, scene.members, options), decode(features, scene.members, options, networks=context)
     sizes = np.bincount(parents_of(features, scene, 6), minlength=len(features))
     whole = torch.from_numpy(np.repeat((sizes > 4) | backing.numpy(), sizes))
     assert bool(whole.any())

@@ -108,7 +108,7 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     first = replace(crop, k=1, children=everything, scored=example.levels[1].mask)
     with torch.no_grad():
         total = predict_corrections(first, networks, 5)
-    final = decode(refined, example.members, DecodeOptions(min_opacity=0), learned=learned)
+    final = decode(refined, example.members, DecodeOptions(min_opacity=0), networks=learned)
     start = example.levels[1].children
     made = corrections_between(start, final, learned.describe(merge(example.features, example.matches)).frames)
     for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
