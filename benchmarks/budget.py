@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from quality import score
-from shared_scenes import export, read_targets, scene_folders
+from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.moments import Members, scene_members
@@ -54,7 +54,7 @@ def fitted(gaussians: Gaussians, scene: PixelScene, frame: Frame, steps: int) ->
 
 def show(folder: Path, cache: Path, steps: int) -> None:
     world = gsmerge.read_scene(export(folder, cache))
-    targets = read_targets(folder) if steps else None
+    targets = read_held_out(folder) if steps else None
     scene, frame = canonicalise(world)
     assert scene.images is not None
     members, depths, total = scene_members(scene), pixel_depths(scene), len(scene.gaussians)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from quality import score
-from shared_scenes import Targets, exporter, read_targets, scene_folders
+from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.io import Recovery, SceneLoad, load_scene
@@ -93,12 +93,12 @@ def measure(scene: Path, name: str, max_views: int, cache: Path, quality: bool) 
 
 def _targets(scene: Path, recovery: Recovery | None, nested: float) -> Targets:
     """The held-out views in the frame of the Gaussians."""
-    targets = read_targets(scene)
+    targets = read_held_out(scene)
     if recovery is None:
         return targets
     viewmats = targets.cameras.viewmats.numpy().copy()
     viewmats[:, :3, 3] *= nested  # into the world of the exported cameras
-    moved = torch.from_numpy(recovery.best.frame.move_cameras(viewmats))
+    moved = torch.from_numpy(recovery.best.frame.move_viewmats(viewmats))
     return replace(targets, cameras=replace(targets.cameras, viewmats=moved))
 
 

@@ -1,6 +1,6 @@
 """What the trained networks gain on real scenes: learned against analytic at equal counts, and stage by stage.
 
-python benchmarks/networks.py eval                      # the tables of docs/networks.md; what is done is kept
+python benchmarks/networks.py eval                      # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
 
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared_scenes import export, read_targets, scene_folders
+from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
@@ -101,7 +101,7 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
 
 def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, lpips: bool) -> dict[str, Any]:
     """One run on one scene, judged by its held-out views."""
-    scene, targets = gsmerge.read_scene(export(folder, cache)), read_targets(folder)
+    scene, targets = gsmerge.read_scene(export(folder, cache)), read_held_out(folder)
     if condition.views is not None:
         scene = subset(scene, even_views(len(scene), min(condition.views, len(scene))))
     start = time.perf_counter()
@@ -169,9 +169,9 @@ def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse
         gain = paired_difference(pick(after, "psnr"), pick(before, "psnr"))
         worst = min(after[s]["psnr"] - before[s]["psnr"] for s in after)
         lpips = [run["lpips_vgg"] - before[s]["lpips_vgg"] for s, run in after.items() if "lpips_vgg" in run]
-        told = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
+        lpips_gain = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
         first = summary(before) if False in condition.learned else "(whole, no fit) " + summary(before)
-        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {told} |")
+        rows.append(f"| {condition.name} | {first} | {summary(after)} | {words(gain)} | {worst:+.2f} | {lpips_gain} |")
     return "\n".join(rows)
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from many_views import many_views
 from quality import score
-from shared_scenes import Targets, export, exporter, read_targets, scene_folders
+from shared_scenes import Targets, export, exporter, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge import Compactor
@@ -55,7 +55,7 @@ def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[P
 
 def online(args: argparse.Namespace) -> dict:
     """One batch after the other, and what is decoded in the end."""
-    targets = read_targets(scene_folders(args.scenes)[0])
+    targets = read_held_out(scene_folders(args.scenes)[0])
     compactor, steps = Compactor(replay=args.replay), []
     for ply in batches(args.scenes, args.views, args.size, args.order, args.cache):
         scene = gsmerge.read_scene(find_scene_files(ply).ply)
@@ -82,7 +82,7 @@ def online(args: argparse.Namespace) -> dict:
 def whole(args: argparse.Namespace, fit: str) -> dict:
     """All views at once; ``input``: as they are."""
     source = many_views(scene_folders(args.scenes)[0], args.cache / f"{args.scenes}-{args.views}", args.views)
-    scene, targets = gsmerge.read_scene(export(source, args.cache)), read_targets(scene_folders(args.scenes)[0])
+    scene, targets = gsmerge.read_scene(export(source, args.cache)), read_held_out(scene_folders(args.scenes)[0])
     start = time.perf_counter()
     if fit == "input":
         return _scored(scene.gaussians, targets, 0.0, args.lpips)

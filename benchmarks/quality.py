@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from shared_scenes import Targets, export, read_targets, scene_folders
+from shared_scenes import Targets, export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
@@ -55,7 +55,7 @@ def main() -> None:
     settings = {k: setting(v) for k, v in (s.split("=") for s in args.set)}
     own_name, rows = str(settings.get("method", "gsmerge")), []
     for folder in scene_folders(args.scenes):
-        scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_targets(folder)
+        scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_held_out(folder)
         row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
         if args.paper:
             row["paper"] = score(gsmerge.compact(scene, method="paper").gaussians, targets, args.lpips)

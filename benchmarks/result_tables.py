@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from gsmerge.measure.compare import break_even
+from gsmerge.measure.comparison import break_even
 from gsmerge.report import human_bytes
 from gsmerge.research.charts.figures import make_verdicts
 from gsmerge.research.charts.record import INPUT, RunRecord
@@ -37,10 +37,11 @@ def _head(parts: Mapping[str, Sequence[RunRecord]]) -> str:
 
 Everything here is measured by `{COMMAND}`, which is resumable; `--only PART` measures a part. Scenes:
 {", ".join(scenes)}: real photos and cameras with a real network's depth, written as feed-forward backbones write them.
-Figures are means over the scenes of held-out views midway between the input views, over the pixels that the input views
-have seen (the paper's supplement A), unless said otherwise; LPIPS is that of VGG, on two views of each scene. Seconds
-are the wall time of the merge alone: neither reading, writing nor scoring. Intervals are 95 % t
-intervals over the scenes.
+Figures are means over the scenes, of held-out views midway between the input views and over the pixels that the input
+views have seen (the paper's supplement A), unless a section says otherwise. LPIPS is that of VGG, on two views of each
+scene. Seconds are the wall time of the merge alone, without reading, writing and scoring. Intervals are 95 % t
+intervals over the scenes. Settings have their names in Python: `density 0.02` is `--superpixels 2%` on the command
+line, `robust False` is `--no-robust`.
 
 Machine: {machine}."""
 
@@ -83,9 +84,9 @@ QUALITY = ("PSNR", "SSIM", "LPIPS")
 
 def _words(record: RunRecord) -> str:
     """A run's method and settings, for people."""
-    told = [f"{name} {value}" for name, value in record.settings.items() if name != "budget"]
+    settings = [f"{name} {value}" for name, value in record.settings.items() if name != "budget"]
     name = "the input" if record.method == INPUT else record.method
-    return ", ".join([name, *told])
+    return ", ".join([name, *settings])
 
 
 def _grouped(
@@ -100,7 +101,7 @@ def _grouped(
 
 
 def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
-    """Ours and rivals at several sizes."""
+    """gsmerge and the baselines at several sizes."""
     records = parts.get("sizes", ())
     groups = _grouped(records, lambda r: (r.method != INPUT, r.settings.get("budget", ""), r.method, _words(r)))
     if not groups:
@@ -117,12 +118,13 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     head = ("method", "kept", "PSNR (dB)", *QUALITY[1:], "seconds", "ms a frame")
     figures = ("quality-seconds", "quality-ratio", "stages", "break-even")
     words = "`unmerged-fit` is the input after the same fit with fast effort, `paper` the paper's moment matching."
-    return [_section("Ours and rivals", "sizes", words, _table(head, rows), *figures)]
+    return [_section("gsmerge and the baselines", "sizes", words, _table(head, rows), *figures)]
 
 
 def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
-    """Whether a rival's point lies above ours at equal cost."""
+    """Whether a baseline's point lies above gsmerge at equal cost."""
     tables = make_verdicts(list(parts.get("sizes", ())))
+    head = ("baseline", "its value", "gsmerge", "difference", "verdict")
     out = []
     for table in tables:
         rows = []
@@ -133,13 +135,13 @@ def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
             rows.append((f"{verdict.rival}, {label}", f"{verdict.quality:.{d}f}", ours, ahead, verdict.words))
         above = [row[0] for row in rows if row[3] != "-" and float(row[3]) < 0]
         cheaper = sum(row[2] == "-" for row in rows)
-        told = f"Of {len(rows) - cheaper} points none lies above ours on the mean."
+        summary = f"Of {len(rows) - cheaper} points none lies above gsmerge on the mean."
         if above:
-            told = f"Above ours on the mean: {'; '.join(above)}."
+            summary = f"Above gsmerge on the mean: {'; '.join(above)}."
         if cheaper:
-            told += f" {cheaper} points are cheaper than anything of ours, so not compared."
-        out.append(f"### {table.title}\n\n{told}\n\n" + _table(("rival", "rival", "ours", "ahead", "verdict"), rows))
-    return ["## Is any rival above ours at equal cost?", *out] if out else []
+            summary += f" {cheaper} points are cheaper than any of gsmerge, so not compared."
+        out.append(f"### {table.title}\n\n{summary}\n\n" + _table(head, rows))
+    return ["## Is any baseline better than gsmerge at equal cost?", *out] if out else []
 
 
 def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -211,9 +213,9 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         "views",
         "scenes",
         "input",
-        "ours",
+        "gsmerge",
         "input",
-        "ours",
+        "gsmerge",
         "smaller",
         "ms",
         "ms",
@@ -257,7 +259,10 @@ def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not rows:
         return []
     head = ("variant", "kept", "PSNR (dB)", *QUALITY[1:], "seconds")
-    words = "Plain export, all views. What encoder, merger and refiner add each is in [networks.md](networks.md)."
+    words = (
+        "Plain export, all views. [Networks](internals/networks.md#stage-by-stage) says what encoder, merger and"
+        " refiner add."
+    )
     return [_section("Ablation", "ablation", words, _table(head, rows))]
 
 
@@ -272,7 +277,7 @@ def _voxels(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         shares = [r.count / (plain[r.scene].count or 1) for r in some if r.scene in plain and r.count]
         name = "voxelised" if some[0].method == INPUT else f"voxelised, then merged, K = {some[0].settings.get('k', 1)}"
         rows.append((name, f"{100 * np.mean(shares):.1f} %", *_quality(some)))
-    title, words = "Merging what is voxelised already", "Kept is the share of the Gaussians before voxels."
+    title, words = "Merging a scene that is voxelised already", "Kept is the share of the Gaussians before voxels."
     return [_section(title, "ablation anysplat", words, _table(("method", "kept", *QUALITY), rows))]
 
 
@@ -284,7 +289,7 @@ def _proxy(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
 
 
 def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
-    """Scene by scene, ours and the input."""
+    """Scene by scene, gsmerge and the input."""
     records = [r for r in parts.get("ablation", ()) if not r.settings and r.method in (INPUT, OURS)]
     before = {r.scene: r for r in records if r.method == INPUT}
     after = {r.scene: r for r in records if r.method == OURS}
@@ -300,7 +305,7 @@ def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         "views",
         "Gaussians",
         *(f"{q}, input" for q in QUALITY),
-        *(f"{q}, ours" for q in QUALITY),
+        *(f"{q}, gsmerge" for q in QUALITY),
         "seconds",
     )
     return [_section("Scene by scene", "ablation", "Defaults (K = 1, 4.4 %).", _table(head, rows))]
@@ -310,15 +315,15 @@ def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
     """When not to use it: where results lose against their input, or against fewer Gaussians."""
     gains = sorted(_gains(parts), key=lambda row: float(row[-1]))
     lost = [row for row in gains if float(row[-1]) < 0]
-    head = ("scene", "part", "views", "settings", "input (dB)", "ours")
+    head = ("scene", "part", "views", "settings", "input (dB)", "gsmerge")
     shown = lost or gains[:5]
     words = "are below their input" if lost else "gain least (none is below its input)"
-    text = f"## When not to use it\n\nRuns of ours that {words} on held-out views:\n\n{_table(head, shown)}"
+    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{_table(head, shown)}"
     return "\n\n".join(filter(None, [text, _too_many(parts.get("sizes", ())), _without(parts.get("ablation", ()))]))
 
 
 def _gains(parts: Mapping[str, Sequence[RunRecord]]) -> list[Row]:
-    """Every run of ours with the PSNR of its input, and how much it is above it."""
+    """Every run of gsmerge with the PSNR of its input, and how much it is above it."""
     inputs = {(name, r.scene, r.views_asked): r for name, some in parts.items() for r in some if r.method == INPUT}
     rows = []
     for name, some in parts.items():
@@ -329,9 +334,9 @@ def _gains(parts: Mapping[str, Sequence[RunRecord]]) -> list[Row]:
             assert r.psnr_target_visible is not None
             assert before.psnr_target_visible is not None
             views = "all" if r.views_asked is None else str(r.views_asked)
-            told = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
+            changed = ", ".join(f"{k} {v}" for k, v in r.settings.items()) or "defaults"
             gain = r.psnr_target_visible - before.psnr_target_visible
-            rows.append((r.scene, name, views, told, f"{before.psnr_target_visible:.2f}", f"{gain:+.2f}"))
+            rows.append((r.scene, name, views, changed, f"{before.psnr_target_visible:.2f}", f"{gain:+.2f}"))
     return rows
 
 
@@ -353,7 +358,7 @@ def _too_many(records: Sequence[RunRecord]) -> str:
     words = (
         "More Gaussians are not always better. Held-out and input views (dB) by budget: where the input views go on"
         " rising and the held-out ones fall, the photos are learned by heart, because depth or poses do not fit them;"
-        " ask for fewer, or for `--k auto`."
+        " ask for fewer, or for `--budget auto`."
     )
     return f"### More Gaussians than a scene bears\n\n{words}\n\n{_table(('scene', *budgets), rows)}"
 
@@ -366,13 +371,13 @@ def _without(records: Sequence[RunRecord]) -> str:
         return ""
     return (
         "### Without photos\n\nWithout photos nothing can be fitted, and the merge alone has to do: at most"
-        f" {_mean(bare, 'psnr_target_visible')} dB in place of {_mean(plain, 'psnr_target_visible')} dB (the input:"
+        f" {_mean(bare, 'psnr_target_visible')} dB instead of {_mean(plain, 'psnr_target_visible')} dB (the input:"
         f" {_mean([r for r in records if r.method == INPUT], 'psnr_target_visible')} dB)."
     )
 
 
 def _missing() -> str:
-    return """## Of the paper's tables, what has no counterpart yet
+    return """## Tables of the paper without a counterpart
 
-- Online reconstruction (`tab:online`, `fig:online`): on its own page, [online.md](online.md).
-- Posed against unposed Depth Anything 3 (`tab:da3_posed_unposed`), ReSplat, VolSplat: exports that need the models."""
+- Online reconstruction (`tab:online`, `fig:online`): [views in batches](internals/views-in-batches.md).
+- Depth Anything 3 with and without poses (`tab:da3_posed_unposed`), ReSplat, VolSplat: they need the models."""

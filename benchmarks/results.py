@@ -21,11 +21,10 @@ from result_tables import page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
-from gsmerge.research.charts.record import RunRecord
-from gsmerge.research.charts.store import CHARTS, read_runs
+from gsmerge.research.charts.record import CHARTS, RunRecord, read_runs
 
 ROOT = Path(__file__).parents[1]
-FAST_RIVALS = "random,opacity,contribution,blocks,voxel,paper"
+FAST_BASELINES = "random,opacity,contribution,blocks,voxel,paper"
 NO_PROXIES = ("--proxy-views", "0")
 LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
 
@@ -55,7 +54,7 @@ PARTS = (
         "sizes",
         "plain",
         (
-            ("--methods", f"gsmerge,{FAST_RIVALS}", *SIZES),
+            ("--methods", f"gsmerge,{FAST_BASELINES}", *SIZES),
             ("--budgets", "4.4%", "--efforts", "fast,best", *NO_PROXIES),
             ("--budgets", "4.4%", "--fit", "color", *NO_PROXIES),
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),

@@ -67,7 +67,7 @@ class Targets:
     masks: np.ndarray
 
 
-def read_targets(scene: Path) -> Targets:
+def read_held_out(scene: Path) -> Targets:
     """The target views of a scene; a pixel is visible if a context depth sample falls on it or on a neighbour."""
     frames = [f for f in json.loads((scene / "transforms.json").read_text())["frames"] if f["role"] == "target"]
     views = exporter().read_scene(scene)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from quality import score, setting
-from shared_scenes import export, read_targets, scene_folders
+from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge import read_scene
@@ -58,7 +58,7 @@ def compare(folder: Path, cache: Path, settings: dict[str, object]) -> dict[str,
         "loose": loosened(plain),
         "anysplat": read_scene(export(folder, cache, "anysplat"), order="none"),
     }
-    targets, found = read_targets(folder), {}
+    targets, found = read_held_out(folder), {}
     for name, scene in ways.items():
         result = gsmerge.compact(scene, **settings)
         found[name], similarity = score(result.gaussians, targets)

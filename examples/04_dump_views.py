@@ -1,8 +1,8 @@
-"""Cameras for models that save none: a few lines to paste beside the model's own inference, and what they write.
+"""Cameras for models that save none: a few lines to paste next to the model's own inference, and what they write.
 
     python examples/04_dump_views.py demo
 
-``dump_views`` needs numpy alone. Put ``views.npz`` beside the ``.ply``; every command then finds it:
+``dump_views`` needs numpy alone. Put ``views.npz`` next to the ``.ply``; every command then finds it:
 
     gsmerge compact gaussians.ply
 
@@ -26,7 +26,7 @@ Where the values come from:
 
 * Depth Anything 3 writes all there is to know by itself: ``export_format="npz-gs_ply"``. No dump is needed.
 
-Run as a script it dumps the cameras and photos of a made scene, and reads them back.
+Run as a script it dumps the cameras and photos of a synthetic scene, and reads them back.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from gsmerge.errors import UsageError
-from gsmerge.io.formats.ply_layout import LOGIT_COMMENT, MEANS, NORMALS, QUATS, SCALES, SH0
+from gsmerge.io.formats.ply_writer import count_for_bytes
 
 PRESETS = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
@@ -123,29 +123,3 @@ def parse_bytes(size: str | int) -> int:
     if found is None or unit is None:
         raise ValueError(f'max bytes: expected a size as "5MB" or "800KiB", got {text!r}')
     return int(Fraction(found[1]) * unit)
-
-
-def file_bytes(count: int, sh_degree: int) -> int:
-    """Size of the ``.ply`` of that many Gaussians, as :func:`gsmerge.io.write_ply` writes it."""
-    num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
-    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}", f"element vertex {count}"]
-    header += [*(f"property float {name}" for name in names), "end_header", ""]
-    return len("\n".join(header)) + 4 * len(names) * count
-
-
-def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Most Gaussians whose ``.ply`` has at most ``max_bytes``.
-
-    Raises:
-        ValueError: If the degree is not 0 to 4.
-        UsageError: If not even one fits.
-    """
-    if not 0 <= sh_degree <= 4:
-        raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
-    if max_bytes < file_bytes(1, sh_degree):
-        raise UsageError(f"max bytes: expected at least {file_bytes(1, sh_degree)} for one Gaussian, got {max_bytes}")
-    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - file_bytes(1, sh_degree))
-    while file_bytes(count, sh_degree) > max_bytes:  # the count itself stands in the header
-        count -= 1
-    return count

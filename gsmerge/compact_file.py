@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError
 from gsmerge.io import (
     AUTO,
     ReadHints,
@@ -27,7 +27,6 @@ from gsmerge.pipeline import compact
 from gsmerge.report import report_document
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.run_log import Progress
-from gsmerge.stages.segment import SegmentOptions, count_for
 from gsmerge.types import PixelScene, UnalignedScene
 
 NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"
@@ -35,13 +34,13 @@ NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name th
 
 @dataclass(frozen=True, eq=False)
 class SceneInput:
-    """A scene as it is worked on, without what only its reading needs.
+    """A scene that was read, without what only its reading needs.
 
     Args:
         scene: The scene.
         recognised: What the report says about the input.
-        comments: Of its header, those that are passed on.
-        notes: What the reader had to say.
+        comments: Comments of its header that the result keeps.
+        notes: Of the reader.
     """
 
     scene: PixelScene | UnalignedScene
@@ -69,9 +68,9 @@ def compact_files(
         settings: Of all stages.
         out: What to write, in the format that its name asks for; its folder must exist.
         opacity: How opacities are stored.
-        hints: What is told of the file instead of found.
+        hints: What is known of the file and need not be recognised.
         overwrite: Replace files that are there.
-        progress: See :func:`gsmerge.compact`.
+        progress: As of :func:`gsmerge.compact`.
         hashed: Hash the input for the report.
         seconds_before: Wall time by name of what the caller did before.
 
@@ -80,11 +79,11 @@ def compact_files(
 
     Raises:
         SceneError: If the scene cannot be read or the result cannot be written.
-        UsageError: If the settings ask for what the scene does not have, or the name for no format.
+        UsageError: If the settings need what the scene does not have, or the name has no known ending.
     """
     start, ending = perf_counter(), output_format(out)
     with atomic_output(out, overwrite=overwrite) as temporary:
-        given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+        given = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         result = compact(given.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
@@ -110,30 +109,19 @@ def compact_files(
     )
 
 
-def read_input(
-    files: SceneFiles, segment: SegmentOptions, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO
-) -> SceneInput:
-    """Read a scene that is to be cut into superpixels.
-
-    Args:
-        files: The scene.
-        segment: How; not more superpixels than pixels.
-        opacity: How opacities are stored.
-        hints: What is told of the file instead of found.
+def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:
+    """Read a scene, as of :func:`compact_files`.
 
     Raises:
         SceneError: If the scene cannot be read.
-        UsageError: If there are fewer pixels than superpixels.
     """
     loaded = load_files(files, opacity=opacity, hints=hints)
-    bare = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
-    notes = (*loaded.notes, *([NO_PHOTOS] if bare else []))
-    given = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
-    del loaded  # which knows the row of every pixel
+    no_photos = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
+    notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []))
+    scene_input = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
+    del loaded  # its arrays are as large as the scene's
     release_memory()
-    if len(given.scene):
-        superpixels_per_view(segment, given.scene.cameras.width, given.scene.cameras.height)
-    return given
+    return scene_input
 
 
 def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
@@ -141,7 +129,7 @@ def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     names = ("layout", "sh_degree", "opacity_encoding", "num_nonfinite")
     cameras, recovery = loaded.scene.cameras, loaded.recovery
     views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
-    views |= {"dialects": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.words}
+    views |= {"dialects": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
     return views | {name: getattr(loaded.ply, name) for name in names}
 
 
@@ -151,17 +139,3 @@ def level_output(output: Path, level: int) -> Path:
     length = len(".compressed.ply" if compressed else output.suffix)
     cut = len(output.name) - length
     return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
-
-
-def superpixels_per_view(options: SegmentOptions, width: int, height: int) -> int:
-    """Superpixels that each view will get.
-
-    Raises:
-        UsageError: If there are more than pixels.
-    """
-    count = count_for(options, height, width)
-    if count > width * height:
-        raise UsageError(
-            f"--superpixels: expected at most {width * height}, one per pixel of {width} x {height}, got {count}"
-        )
-    return count

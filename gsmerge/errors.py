@@ -49,9 +49,22 @@ class BatchError(GsmergeError):
     exit_code = 5
 
 
+DAMAGED_OPENCV = (
+    "expected a complete OpenCV, found the module cv2 without its parts, as after uninstalling one of several"
+    " opencv packages; run pip install --no-deps --force-reinstall opencv-contrib-python-headless"
+)
+
+
+def is_opencv_damaged(error: BaseException) -> bool:
+    """Whether an error says that the module ``cv2``, whose folder several packages share, is not whole."""
+    return isinstance(error, AttributeError | ImportError) and "cv2" in f"{error} {getattr(error, 'path', '')}"
+
+
 def error_line(error: BaseException) -> str:
     """An error as one line."""
     if isinstance(error, MemoryError):
         return "out of memory; use fewer --threads or --jobs, or a smaller scene"
+    if is_opencv_damaged(error):
+        return DAMAGED_OPENCV
     text = str(error) if isinstance(error, GsmergeError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())

@@ -75,9 +75,22 @@ def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
         ``[c,n,2]`` positions in pixels (pixel centres at +0.5; meaningless where the depth is not positive)
         and ``[c,n]`` depths along z, both in float64.
     """
-    means, viewmats, Ks = means.double(), cameras.viewmats.double(), cameras.Ks.double()
-    camera = means @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
-    image = camera @ Ks.transpose(1, 2)
+    return project_points(means.double(), cameras.viewmats.double(), cameras.Ks.double())
+
+
+def project_points(points: Colors, viewmats: Colors, Ks: Colors) -> tuple[Colors, Colors]:
+    """:func:`project` for NumPy arrays and tensors of any leading shape, in their own precision.
+
+    Args:
+        points: ``[...,n,3]`` world positions.
+        viewmats: ``[...,4,4]`` world to camera.
+        Ks: ``[...,3,3]`` intrinsics, pixels.
+
+    Returns:
+        ``[...,n,2]`` positions in pixels and ``[...,n]`` depths along z.
+    """
+    camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
+    image = camera @ Ks.swapaxes(-1, -2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
 
 

@@ -1,6 +1,6 @@
 """The core types: frozen dataclasses of tensors, and nothing but indexing and moving.
 
-One convention in memory (docs/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
+One convention in memory (docs/reference/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
 rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres at +0.5, sRGB in [0, 1].
 """
 

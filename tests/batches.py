@@ -12,8 +12,8 @@ from typing import Any
 
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch.find import output_name
-from gsmerge.batch.records import RECORDS, SUMMARY, Index
-from gsmerge.batch.task import Task, Work, run_task
+from gsmerge.batch.records import RECORDS, SUMMARY, RecordIndex
+from gsmerge.batch.task import BatchContext, Task, run_task
 from gsmerge.options import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
@@ -73,8 +73,8 @@ def holders(folder: Path) -> list[int]:
 class InlinePool:
     """In place of :class:`gsmerge.batch.local.LocalPool`: one scene after the other in this process."""
 
-    def __init__(self, work: Work, _: int) -> None:
-        self.work, self.index = work, Index(work.folder, work.start)
+    def __init__(self, work: BatchContext, _: int) -> None:
+        self.work, self.index = work, RecordIndex(work.folder, work.start)
         self.ended: list[tuple[Task, dict[str, Any]]] = []
 
     @property
@@ -92,14 +92,14 @@ class InlinePool:
         pass
 
 
-def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, Work, Index]:
+def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, BatchContext, RecordIndex]:
     """What :func:`run_task` takes for a single scene, as a run would have it that begins now."""
     out.mkdir(exist_ok=True)
-    index = Index(out)
+    index = RecordIndex(out)
     index.read_on()
     name = output_name(options, scene, 0)
     return (
         Task(Job(0, str(scene), name, 0), index.known.get(name)),
-        Work(out, options, index.end),
-        Index(out, index.end),
+        BatchContext(out, options, index.end),
+        RecordIndex(out, index.end),
     )

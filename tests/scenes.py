@@ -20,10 +20,9 @@ from gsmerge import Cameras, Gaussians, PixelScene, compact, render
 from gsmerge.geometry import covariances, quat_to_rotmat
 from gsmerge.pipeline import CompactReport, CompactResult
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.research.generate import paths, photograph, shapes
-from gsmerge.research.generate.noise import Seen, pixel_gaussians
+from gsmerge.research.generate import objects, paths, photograph, shapes
+from gsmerge.research.generate.noise import TrueView, pixel_gaussians
 from gsmerge.research.generate.options import Noise
-from gsmerge.research.generate.things import tumbled
 from gsmerge.types import SH_C0, FeatureGaussians
 from gsmerge.views import subset
 
@@ -31,7 +30,7 @@ Texture = Callable[[np.ndarray], np.ndarray]
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 WIDE = 1e7  # half the width of a plane without ends
 NO_ERRORS = Noise(**{**dict.fromkeys((f.name for f in fields(Noise)), 0.0), "sh_degree": 0})  # type: ignore[arg-type]
-UNPAINTED = shapes.Look(0)
+UNPAINTED = shapes.Material(0)
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def views_of(
     """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
     lens = photograph.Lens(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
     assert np.allclose(cameras.Ks.numpy(), lens.intrinsics)
-    packed, found = shapes.packed([surface.shape for surface in surfaces]), []
+    packed, found = shapes.pack([surface.shape for surface in surfaces]), []
     for viewmat in cameras.viewmats.double().numpy():
         c2w = np.linalg.inv(viewmat)
         hits = photograph.trace(packed, c2w, lens, 1)
@@ -174,7 +173,7 @@ def make_scene(
     lens, found = views_of(surfaces, cameras)
     images = [colors.astype(np.float32) for *_, colors in found]
     parts = [
-        pixel_gaussians(Seen(image, hits.depth, hits.normals, c2w), lens, errors, rng)
+        pixel_gaussians(TrueView(image, hits.depth, hits.normals, c2w), lens, errors, rng)
         for image, (c2w, hits, _) in zip(images, found, strict=True)
     ]
     valid = torch.ones((len(cameras), cameras.height, cameras.width), dtype=torch.bool)
@@ -230,7 +229,7 @@ def rotmat_to_quat(rotmats: Tensor) -> Tensor:
 
 def random_rotation(seed: int) -> np.ndarray:
     """``[3,3]``."""
-    return tumbled(np.random.default_rng(seed))
+    return objects.random_rotation(np.random.default_rng(seed))
 
 
 def images_of(gaussians: Gaussians, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:

@@ -42,7 +42,7 @@ def find_baseline(name: str) -> Baseline | None:
 
 
 def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene) -> tuple[Baseline | None, list[str]]:
-    """The baseline that is asked for, fit for the scene, and a note on settings that it does not use.
+    """The baseline of the options, fit for the scene, and a note on changed settings that it does not use.
 
     Raises:
         UsageError: If the scene does not have what it needs, or a program is missing.
@@ -50,23 +50,15 @@ def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene)
     baseline = find_baseline(options.method)
     if baseline is None:
         return None, []
-    check_scene(baseline, scene)
-    return baseline, unused_notes(baseline, options)
-
-
-def check_scene(baseline: Baseline, scene: PixelScene | UnalignedScene) -> None:
-    """Refuse a scene or a machine without what a method needs.
-
-    Raises:
-        UsageError: If the scene has it not, or a program is missing.
-    """
+    method = f"method {baseline.name}"
     if "photos" in baseline.needs and scene.images is None:
-        raise UsageError(f"method {baseline.name}: expected photos, found none; give --images, or another --method")
+        raise UsageError(f"{method}: expected photos, found none; give --images, or another --method")
     if "pixels" in baseline.needs and isinstance(scene, UnalignedScene):
-        raise UsageError(
-            f"method {baseline.name}: expected one Gaussian per pixel, found an unaligned scene; give another --method"
-        )
+        raise UsageError(f"{method}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
     check_program(baseline)
+    default, used = CompactOptions().to_dict(), {*baseline.uses, *COMMON_SETTINGS}
+    unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
+    return baseline, [f"{method} does not use {', '.join(unused)}"] if unused else []
 
 
 def check_program(baseline: Baseline) -> None:
@@ -77,10 +69,3 @@ def check_program(baseline: Baseline) -> None:
     """
     if "node" in baseline.needs:
         find_program()
-
-
-def unused_notes(baseline: Baseline, options: CompactOptions) -> list[str]:
-    """A sentence that names the changed settings that a method does not use, if there are any."""
-    default, used = CompactOptions().to_dict(), {*baseline.uses, *COMMON_SETTINGS}
-    unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
-    return [f"method {baseline.name} does not use {', '.join(unused)}"] if unused else []

@@ -1,4 +1,4 @@
-"""Many scenes: each on its own, kept as soon as it is done, on this machine or on a cluster."""
+"""Many scenes: each on its own, recorded as soon as it is done, on this machine or on a cluster."""
 
 from gsmerge.batch.find import Job, find_jobs
 from gsmerge.batch.options import BatchOptions

@@ -13,7 +13,7 @@ from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_text
 from gsmerge.io.content_hash import stem_of
-from gsmerge.io.formats.ply_file import promised
+from gsmerge.io.formats.ply_file import header_counts
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, named_ply, other_plys
 from gsmerge.runtime.estimate import memory_bytes
 
@@ -28,7 +28,7 @@ class Job:
         index: Its place in the list.
         scene: A ``.ply``, or the folder of one.
         output: Name of the result in the output folder.
-        num_gaussians: That its file promises; 0 where it cannot be read.
+        num_gaussians: By the header of its file; 0 where it cannot be read.
         num_rest: Columns of higher harmonics, likewise.
     """
 
@@ -49,12 +49,12 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
 
     Args:
         given: Folders, which are searched; patterns; ``.ply`` files; text files with one of these per line.
-        out: The output folder, in which no scenes are looked for.
+        out: The output folder, which is not searched.
         options: For the names of the results.
         own: Real paths of results of former runs, which are no scenes.
 
     Raises:
-        SceneError: If something that was named does not exist or holds no scene.
+        SceneError: If something in ``given`` does not exist or holds no scene.
         UsageError: If two scenes would be written to one file, or one over another.
     """
     jobs: list[Job] = []
@@ -66,7 +66,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
         if real in inputs or real in own:
             continue
         inputs.add(real)
-        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *promised(ply))
+        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
         for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
             if name in owners:
                 raise UsageError(
@@ -87,17 +87,17 @@ def further_outputs(output: str, levels: int) -> list[str]:
 
 
 def _ply_of(scene: Path) -> Path:
-    """The file that tells a scene from others; the folder itself where it is not clear which."""
+    """The file that identifies a scene; the folder itself where several files could."""
     if not scene.is_dir():
         return scene
-    found = other_plys(scene)
-    return named_ply(scene) or (found[0] if len(found) == 1 else scene)
+    plys = other_plys(scene)
+    return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     """Name of a scene's result in the output folder."""
     whole = Path(os.path.abspath(scene))
-    stem = stem_of(whole).removesuffix(".compressed")  # which says how the scene is written, not its result
+    stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
     values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": options.settings.decode.k}
     try:
         return os.path.normpath(options.output.format(**values))
@@ -106,7 +106,7 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 
 
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
-    """The scenes that are named, in the order of the arguments and sorted within each; some may come twice.
+    """The scenes of the arguments, in their order and sorted within each; some may come twice.
 
     Raises:
         SceneError: If an argument does not exist or holds no scene.
@@ -118,19 +118,19 @@ def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
-            yield from _some(_walk(path, skip), argument, "in the folder")
+            yield from _require_some(_walk(path, skip), argument, "in the folder")
         elif path.suffix == ".ply" and path.is_file():
             yield path
         elif glob.has_magic(argument) and not path.exists():
-            yield from _some(_matches(argument, skip), argument, "that match")
+            yield from _require_some(_matches(argument, skip), argument, "that match")
         elif path.is_file() and path.suffix != ".ply":
-            yield from _some(_listed(path, skip), argument, "in the list")
+            yield from _require_some(_listed(path, skip), argument, "in the list")
         else:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
 
 
-def _some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
-    """What is found; nothing at all is an error."""
+def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
+    """The scenes; none at all is an error."""
     first = next(scenes, None)
     if first is None:
         raise SceneError(argument, f"expected scenes {where}, found none")
@@ -166,7 +166,7 @@ def _matches(pattern: str, skip: str) -> Iterator[Path]:
 
 
 def _listed(file: Path, skip: str) -> Iterator[Path]:
-    """The lines of a list; paths in it are relative to its folder. What does not exist fails when its turn comes."""
+    """The scenes of a list, relative to its folder. What does not exist fails when the scene is compacted."""
     text = read_text(file)
     if "\0" in text:
         raise SceneError(file, "expected a text file with one path per line, found no text")
@@ -176,7 +176,6 @@ def _listed(file: Path, skip: str) -> Iterator[Path]:
             continue
         path = file.parent / entry
         if path.is_dir() and os.path.realpath(path) != skip:
-            found = list(_walk(path, skip))
-            yield from found or [path]
+            yield from list(_walk(path, skip)) or [path]
         else:
             yield path

@@ -1,7 +1,7 @@
-"""Who works on what: locks that end with the process that holds them, however it ends.
+"""Locks on scenes and on the output folder, which end with the process that holds them, however it ends.
 
-They lie in a folder of their own in the output folder. A lock file that is there and that nobody holds says that a
-process was killed over this scene: what it left half-done may be removed, and its result replaced.
+They are in a folder of their own in the output folder. A lock file without a holder means that a process was killed
+while it worked on the scene: its unfinished files may be removed, and its result replaced.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ except ImportError:  # not a POSIX system
     fcntl = None  # type: ignore[assignment]
 
 LOCKS = ".batch"
-RUN = "run"
-PATIENCE = 10.0  # seconds: a run holds the folder alone for an instant only
+RUN = "run"  # name of the folder's own lock
+LOCK_TIMEOUT = 10.0  # seconds: a run locks the folder exclusively for an instant only
 
 
 class BusyError(Exception):
@@ -45,26 +45,26 @@ class Lock:
         self.path, self.abandoned, self.fresh = path, abandoned, fresh
 
     def finish(self) -> None:
-        """Nothing is left half-done: the file goes, and with it the memory of it."""
+        """Remove the file: nothing is left unfinished."""
         self.path.unlink(missing_ok=True)
-        with suppress(OSError):  # others' locks are in there
+        with suppress(OSError):  # other locks are in the folder
             self.path.parent.rmdir()
 
 
 @contextmanager
 def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
-    """A block in which nobody else works on a result; its file stays unless :meth:`Lock.finish` is called.
+    """A block in which no other process works on a result; the lock's file stays unless :meth:`Lock.finish` is called.
 
     Args:
         folder: The output folder.
         outputs: Names of the result and of its further levels.
 
     Raises:
-        BusyError: If another process does.
+        BusyError: If another process works on it.
         SceneError: If the file cannot be made.
     """
     path = folder / LOCKS / f"{hashlib.sha256(outputs[0].encode(errors='surrogateescape')).hexdigest()[:32]}.lock"
-    descriptor, abandoned = _acquired(path)
+    descriptor, abandoned = _acquire(path)
     try:
         fresh = not any(os.path.lexists(folder / name) for name in outputs)
         if abandoned:
@@ -75,12 +75,12 @@ def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
         os.close(descriptor)
 
 
-def _acquired(path: Path) -> tuple[int, bool]:
+def _acquire(path: Path) -> tuple[int, bool]:
     """The open, locked file, and whether it was there before."""
     while True:
-        descriptor = _opened(path)
+        descriptor = _open(path)
         try:
-            if _locked(descriptor, path, shared=False) and _is_still(descriptor, path):
+            if _lock(descriptor, path, shared=False) and _is_same_file(descriptor, path):
                 return descriptor, os.fstat(descriptor).st_size > 0
         except BaseException:
             os.close(descriptor)
@@ -88,7 +88,7 @@ def _acquired(path: Path) -> tuple[int, bool]:
         os.close(descriptor)
 
 
-def _opened(path: Path) -> int:
+def _open(path: Path) -> int:
     while True:
         try:
             path.parent.mkdir(exist_ok=True)
@@ -99,7 +99,7 @@ def _opened(path: Path) -> int:
             raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --out") from error
 
 
-def _locked(descriptor: int, path: Path, *, shared: bool) -> bool:
+def _lock(descriptor: int, path: Path, *, shared: bool) -> bool:
     """Take the lock.
 
     Raises:
@@ -117,8 +117,8 @@ def _locked(descriptor: int, path: Path, *, shared: bool) -> bool:
     return True
 
 
-def _is_still(descriptor: int, path: Path) -> bool:
-    """Whether the file is the one of that name; who held it before may have removed it."""
+def _is_same_file(descriptor: int, path: Path) -> bool:
+    """Whether the open file still has that name; its last holder may have removed it."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(path))
     except FileNotFoundError:
@@ -141,23 +141,23 @@ def _read(descriptor: int) -> dict[str, object]:
 
 @contextmanager
 def run_lock(folder: Path, name: str) -> Iterator[None]:
-    """A block of a run, beside others that make the same of the same scenes, and no others.
+    """A block of a run, which shares the folder only with runs of the same name.
 
     Args:
         folder: The output folder.
-        name: One for all runs that may share it.
+        name: See :meth:`gsmerge.batch.options.BatchOptions.name`.
 
     Raises:
-        UsageError: If a run of another name is at work.
+        UsageError: If a run of another name uses the folder.
         SceneError: If the file cannot be made.
     """
     path = folder / LOCKS / f"{RUN}.lock"
-    deadline = time.monotonic() + PATIENCE
-    while (found := _joined(path, name)) is None:
+    deadline = time.monotonic() + LOCK_TIMEOUT
+    while (joined := _join_run(path, name)) is None:
         if time.monotonic() > deadline:
             raise UsageError(f"{folder}: another batch is at work there; name another --out")
         time.sleep(0.05)
-    descriptor, holder = found
+    descriptor, holder = joined
     try:
         if holder["what"] != name:
             raise UsageError(
@@ -169,17 +169,17 @@ def run_lock(folder: Path, name: str) -> Iterator[None]:
         _leave(descriptor, path)
 
 
-def _joined(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
-    """The open file, locked together with other runs, and who wrote it; None where it has to be tried again."""
+def _join_run(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
+    """The open file with a shared lock, and its content; None where it has to be tried again."""
     try:
-        descriptor, _ = _acquired(path)
+        descriptor, _ = _acquire(path)
         _write(descriptor, name)
     except BusyError:
-        descriptor = _opened(path)
+        descriptor = _open(path)
     try:
-        _locked(descriptor, path, shared=True)  # between the two locks another run may have had it
+        _lock(descriptor, path, shared=True)  # between the two locks another run may have had it
         holder = _read(descriptor)
-        if _is_still(descriptor, path) and {"what", "pid", "host"} <= holder.keys():
+        if _is_same_file(descriptor, path) and {"what", "pid", "host"} <= holder.keys():
             return descriptor, holder
     except BusyError:
         pass
@@ -188,12 +188,12 @@ def _joined(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
 
 
 def _leave(descriptor: int, path: Path) -> None:
-    """The last run of a folder takes the lock's file with it, and the folder if no scene was left half-done."""
+    """Unlock; the last run removes the lock's file, and the folder of locks if no scene was left unfinished."""
     try:
-        _locked(descriptor, path, shared=False)
+        _lock(descriptor, path, shared=False)
         path.unlink(missing_ok=True)
         path.parent.rmdir()
     except (BusyError, OSError, SceneError):
-        pass  # others are at work, or what they left is still to be seen to
+        pass  # other runs use the folder, or unfinished scenes are left in it
     finally:
         os.close(descriptor)

@@ -1,4 +1,4 @@
-"""How many scenes are worked on."""
+"""Settings of a batch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.io import AUTO, OUTPUT_FORMATS, ReadHints, output_format
 from gsmerge.io.content_hash import digest
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.options import CompactOptions
+from gsmerge.options import CompactOptions, to_schema
 
 FIELDS = ("stem", "parent", "index", "k")
 ENGINES = ("local", "ray")
@@ -22,17 +22,17 @@ class BatchOptions:
     Args:
         settings: Of every scene. ``threads``: those of one scene; None: processors by jobs.
         opacity: How all files store opacity.
-        hints: What is told of all files instead of found.
+        hints: What is known of all files and need not be recognised.
         cameras: Cameras of a scene: one path for all, or with ``{scene}``, ``{parent}`` and ``{stem}`` in it; None:
-            found beside each.
+            next to each scene.
         images: The same for the folder of photos.
         output: Name of a result in the output folder, made of ``{stem}`` (the scene's name), ``{parent}`` (name of
             the folder it is in), ``{index}`` (its place in the list, from 0) and ``{k}``; its ending says the format.
-        jobs: Scenes that are worked on at once; None: as many as processors and memory allow.
-        max_memory: Bytes that they may take together; None: what is free. Ray knows that of its nodes.
+        jobs: Scenes at once; None: as many as processors and memory allow.
+        max_memory: Bytes that they may take together; None: what is free. Ray knows the memory of its nodes.
         timeout: Seconds that a scene may take; None: any.
-        retries: How often a scene is tried again whose process died or took too long.
-        rerun: Do what is done already again.
+        retries: How often a scene is tried again if its process died or took too long.
+        rerun: Compact scenes again that are done.
         overwrite: Replace files in the output folder that no batch wrote.
         engine: ``"local"``: processes on this machine; ``"ray"``: a Ray cluster.
         address: Of the Ray cluster; None: one of this machine alone, started for the run.
@@ -75,19 +75,19 @@ class BatchOptions:
         if self.max_memory is not None and self.engine == "ray":
             raise ValueError("max memory: expected engine local; Ray knows the memory of its nodes")
 
-    def told(self) -> dict[str, Any]:
-        """Everything that the bytes of a result hang on beside the scene's files, as plain values."""
-        settings = self.settings.to_dict()
+    def result_settings(self) -> dict[str, Any]:
+        """Everything that a result depends on besides the scene's files, as plain values."""
+        settings = to_schema(self.settings.to_dict())
         del settings["threads"]
         return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
-        """One for all runs that may share an output folder: they make the same of the same scenes."""
-        return digest({**self.told(), "output": self.output, "cameras": self.cameras, "images": self.images})
+        """The same for all runs that may share an output folder, as they make the same results of the same scenes."""
+        return digest({**self.result_settings(), "output": self.output, "cameras": self.cameras, "images": self.images})
 
 
 def check_template(template: str) -> None:
-    """Refuse a name for results that is none.
+    """Refuse a template that gives no valid names for results.
 
     Raises:
         ValueError: If it holds another field than those in ``FIELDS``, does not end as one of the formats that
@@ -95,13 +95,13 @@ def check_template(template: str) -> None:
     """
     try:
         names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]
-        shown = template.format(**dict.fromkeys(FIELDS, 1))
+        example = template.format(**dict.fromkeys(FIELDS, 1))
     except (ValueError, LookupError, AttributeError, TypeError):
-        names, shown = [""], ""
+        names, example = [""], ""
     if any(name not in FIELDS for name in names):
         known = ", ".join(f"{{{name}}}" for name in FIELDS)
         raise ValueError(f"output: expected {known} in braces, got {template!r}")
-    if not shown.lower().endswith(tuple(OUTPUT_FORMATS)):
+    if not example.lower().endswith(tuple(OUTPUT_FORMATS)):
         raise ValueError(f"output: expected a name that ends in {', '.join(OUTPUT_FORMATS)}, got {template!r}")
-    if shown.startswith(("/", "~", ".")) or ".." in shown.split("/") or "\\" in shown or "\0" in shown:
+    if example.startswith(("/", "~", ".")) or ".." in example.split("/") or "\\" in example or "\0" in example:
         raise ValueError(f"output: expected a name inside the output folder, not hidden, got {template!r}")

@@ -1,4 +1,4 @@
-"""How many scenes at once with how many threads each, and what a batch will take."""
+"""How many scenes at once with how many threads each, and how long a batch will take."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.content_hash import cameras_of
 from gsmerge.report import human_bytes
-from gsmerge.runtime.estimate import COST_FIXED, work_seconds
+from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.threads import available_threads
 
-SHARE = 0.8  # of the memory that is free, where no limit is told
+FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 
 
 @dataclass(frozen=True)
-class Shape:
-    """How a batch is spread.
+class Schedule:
+    """How many scenes are compacted at once.
 
     Args:
         jobs: Scenes at once; 0: as many as the cluster has processors for.
         threads: Of each.
         memory: Bytes that the largest of them may take together.
-        notes: What was not as asked for.
+        notes: Where it differs from the options.
     """
 
     jobs: int
@@ -38,20 +38,20 @@ class Shape:
     notes: tuple[str, ...] = ()
 
 
-def make_shape(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Shape:
-    """Spread scenes over processors: one thread each where there are enough of them and memory allows.
+def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
+    """Distribute scenes over processors: one thread each where there are enough scenes and memory allows.
 
     Args:
         jobs: All scenes, of which the largest may come together.
-        options: What was asked for.
+        options: Of the batch.
         processors: To use; None: all.
     """
     processors = available_threads() if processors is None else processors
-    told = options.settings.threads
+    threads = options.settings.threads
     if options.engine == "ray":
-        return Shape(options.jobs or 0, told or 1, max((job.memory for job in jobs), default=0))
-    wanted = options.jobs or max(1, processors // (told or 1))
-    sums = list(accumulate(nlargest(max(1, min(wanted, len(jobs))), (job.memory for job in jobs)))) or [0]
+        return Schedule(options.jobs or 0, threads or 1, max((job.memory for job in jobs), default=0))
+    count = options.jobs or max(1, processors // (threads or 1))
+    sums = list(accumulate(nlargest(max(1, min(count, len(jobs))), (job.memory for job in jobs)))) or [0]
     limit = free_memory() if options.max_memory is None else options.max_memory
     count, notes = len(sums), []
     if limit is not None and (options.jobs is None or options.max_memory is not None):
@@ -60,32 +60,32 @@ def make_shape(jobs: Sequence[Job], options: BatchOptions, *, processors: int | 
             notes.append(f"{count} at once instead of {len(sums)}: more may take {human_bytes(sums[count])}")
         if sums[0] > limit:
             notes.append(f"the largest scene alone may take {human_bytes(sums[0])}, the limit is {human_bytes(limit)}")
-    return Shape(count, told or max(1, processors // count), sums[count - 1], tuple(notes))
+    return Schedule(count, threads or max(1, processors // count), sums[count - 1], tuple(notes))
 
 
 def free_memory() -> int | None:
-    """Bytes that a run may take by default: most of what is free; None where the system does not tell."""
+    """Bytes that a run may take by default: most of the free memory; None where the system does not report it."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             values = dict(line.split(":", 1) for line in file)
-        return int(SHARE * int(values["MemAvailable"].split()[0]) * 1024)
+        return int(FREE_MEMORY_SHARE * int(values["MemAvailable"].split()[0]) * 1024)
     except (OSError, KeyError, ValueError):
         pass
     try:
-        return int(SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        return int(FREE_MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, OSError, ValueError):
         return None
 
 
-def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, shape: Shape) -> float:
+def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:
     """Wall time of scenes, within a factor of about two."""
     settings, steps = options.settings.resolved(photos=True), options.settings.fit.steps
     total = 0.0
     for job in jobs:
         views = max(1, _num_views(job))
         seconds = work_seconds(job.num_gaussians, job.num_gaussians / views, settings, photos=True, fit_steps=steps)
-        total += seconds / min(shape.threads, views)
-    return COST_FIXED * bool(jobs) + total / max(1, min(shape.jobs, len(jobs)))
+        total += seconds / min(schedule.threads, views)
+    return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
 
 
 def _num_views(job: Job) -> int:

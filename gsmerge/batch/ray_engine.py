@@ -1,8 +1,7 @@
-"""The same work on a Ray cluster. Ray is an extra: nothing imports it before it is asked for.
+"""A batch on a Ray cluster. Ray is an extra: it is imported only for ``engine="ray"``.
 
-Ray schedules, with a scene's threads and memory as what it needs, and says which tasks were lost with a process or a
-node; trying them again, records and locks are those of any other run. Scenes and output folder have to be at the same
-paths on all nodes.
+Ray schedules by a scene's threads and memory, and reports which tasks were lost with a process or a node; retries,
+records and locks are those of any other run. Scenes and output folder must have the same paths on all nodes.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from types import ModuleType
 from typing import Any
 
 from gsmerge.batch.options import BatchOptions
-from gsmerge.batch.records import LOST, Index, record
-from gsmerge.batch.task import Task, Work, run_task
+from gsmerge.batch.records import LOST, RecordIndex, record
+from gsmerge.batch.task import BatchContext, Task, run_task
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.options import CHECKPOINTS
 
-SCENES = 200  # that a process works on before it makes way for a new one
-WAITING = 2  # scenes that Ray is given beyond those that it has processors for
-KNOCK = 10.0  # seconds to reach a cluster
-COUNT_AGAIN = 5.0  # seconds until the cluster is asked for its size again
+SCENES_PER_PROCESS = 200  # then it is replaced by a new one
+EXTRA_TASKS = 2  # submitted beyond those that the cluster has processors for
+CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
+CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
 
 
 def require_ray() -> ModuleType:
-    """Ray.
+    """The module of Ray.
 
     Raises:
         UsageError: If it is not installed.
@@ -49,7 +48,7 @@ class RayPool:
     """Scenes as tasks of a Ray cluster.
 
     Args:
-        work: What all tasks share.
+        context: What all tasks share.
         jobs: Scenes at once; 0: as many as the cluster has processors for.
 
     Raises:
@@ -57,12 +56,12 @@ class RayPool:
         SceneError: If there is no cluster at the address.
     """
 
-    def __init__(self, work: Work, jobs: int) -> None:
+    def __init__(self, context: BatchContext, jobs: int) -> None:
         self.ray = require_ray()
-        self.work, self.jobs = work, jobs
-        _join(self.ray, work.options)
-        self.shared = self.ray.put(work)
-        self.function = self.ray.remote(max_retries=0, max_calls=SCENES)(run_remote)
+        self.context, self.jobs = context, jobs
+        _join(self.ray, context.options)
+        self.shared = self.ray.put(context)
+        self.function = self.ray.remote(max_retries=0, max_calls=SCENES_PER_PROCESS)(run_remote)
         self.tasks: dict[Any, Task] = {}
         self.counted, self.capacity = float("-inf"), 1
 
@@ -71,17 +70,17 @@ class RayPool:
         """Whether another scene can be taken."""
         if self.jobs:
             return len(self.tasks) < self.jobs
-        if time.monotonic() > self.counted + COUNT_AGAIN:
+        if time.monotonic() > self.counted + CLUSTER_SIZE_SECONDS:
             processors = self.ray.cluster_resources().get("CPU", 1.0)
-            self.capacity = max(1, int(processors // self._threads())) + WAITING
+            self.capacity = max(1, int(processors // self._threads())) + EXTRA_TASKS
             self.counted = time.monotonic()
         return len(self.tasks) < self.capacity
 
     def _threads(self) -> int:
-        return self.work.options.settings.threads or 1
+        return self.context.options.settings.threads or 1
 
     def _largest(self, resource: str) -> float:
-        """What the largest node has of a resource: a task that asks for more would wait for ever."""
+        """The most of a resource that a node has: a task that needs more would wait for ever."""
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
         return max((node.get(resource, 0.0) for node in nodes), default=0.0)
 
@@ -93,7 +92,7 @@ class RayPool:
         self.tasks[ref] = task
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """What has ended, after at most so many seconds: records, or that the process or its node was lost."""
+        """Scenes that ended, after at most so many seconds: records, or that the process or its node was lost."""
         ready, rest = self.ray.wait(list(self.tasks), num_returns=1, timeout=seconds)
         if ready and rest:
             ready += self.ray.wait(rest, num_returns=len(rest), timeout=0)[0]
@@ -104,13 +103,13 @@ class RayPool:
         try:
             return self.ray.get(ref)
         except self.ray.exceptions.RayError as error:
-            limit = self.work.options.timeout
-            why = f"its process or node was lost ({type(error).__name__})"
-            why += "" if limit is None else f", or it took longer than {limit:g} s (--timeout)"
-            return record(LOST, task.job.scene, task.job.output, error=why)
+            limit = self.context.options.timeout
+            reason = f"its process or node was lost ({type(error).__name__})"
+            reason += "" if limit is None else f", or it took longer than {limit:g} s (--timeout)"
+            return record(LOST, task.job.scene, task.job.output, error=reason)
 
     def close(self) -> None:
-        """End everything that is under way, and leave the cluster."""
+        """End unfinished scenes, and disconnect from the cluster."""
         for ref in self.tasks:
             with contextlib.suppress(self.ray.exceptions.RayError, ValueError):
                 self.ray.cancel(ref, force=True)
@@ -126,41 +125,41 @@ def _join(ray: ModuleType, options: BatchOptions) -> None:
         ray.init(address="local", include_dashboard=False, object_store_memory=100 << 20, **quiet)
         return
     try:
-        _knock(options.address)
+        _check_connection(options.address)
         ray.init(address=options.address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
-        told = " ".join(str(error).split())[:200]
+        reason = " ".join(str(error).split())[:200]
         raise SceneError(
-            options.address, f"no Ray cluster answers there ({told})", "start one with ray start --head"
+            options.address, f"no Ray cluster answers there ({reason})", "start one with ray start --head"
         ) from error
 
 
-def _knock(address: str) -> None:
-    """See that somebody listens there; Ray itself would wait for minutes.
+def _check_connection(address: str) -> None:
+    """Check that something listens at the address; Ray itself would wait for minutes.
 
     Raises:
-        OSError: If nobody does.
+        OSError: If nothing does.
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
-        socket.create_connection((host.strip("[]"), int(port)), timeout=KNOCK).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT).close()
 
 
-def run_remote(task: Task, work: Work) -> dict[str, Any]:
-    """One scene in a process of the cluster; one that takes too long takes its process with it."""
-    with _limited(work.options.timeout):
-        return run_task(task, work, _later(work.folder, work.start))
+def run_remote(task: Task, context: BatchContext) -> dict[str, Any]:
+    """One scene in a process of the cluster, which ends with a scene that takes too long."""
+    with _limited(context.options.timeout):
+        return run_task(task, context, _new_records(context.folder, context.start))
 
 
 @lru_cache(maxsize=1)
-def _later(folder: Path, start: int) -> Index:
-    """What was recorded since the run began, kept from task to task."""
-    return Index(folder, start)
+def _new_records(folder: Path, start: int) -> RecordIndex:
+    """Records since the run began, shared by the tasks of a process."""
+    return RecordIndex(folder, start)
 
 
 @contextlib.contextmanager
 def _limited(seconds: float | None) -> Iterator[None]:
-    """A block that may take so long; the watch needs nothing of Python, whatever the block is doing."""
+    """A block that ends the process after ``seconds``, even while it runs compiled code."""
     if seconds is None:
         yield
         return

@@ -1,4 +1,4 @@
-"""What a batch leaves of each scene: one JSON line, on the disk before the next scene begins."""
+"""The records of a batch: one JSON line for each scene, on the disk before the next scene begins."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from gsmerge.runtime.jsonl import each_line
 
 RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
 DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
-BUSY, LOST, STUCK = "busy", "lost", "stuck"  # of what is no record: another's, its process died, nothing can be kept
+# Of outcomes that are not recorded: another process has the scene, its process died, records cannot be written.
+BUSY, LOST, STUCK = "busy", "lost", "stuck"
 
 
 @dataclass(frozen=True)
-class Known:
+class DoneResult:
     """A result that is done.
 
     Args:
         key: Of the scene's content, the settings and the version.
         files: Name in the output folder and SHA-256 of each file.
-        failed_since: Whether the scene failed when it was to be done again.
+        failed_since: Whether the scene failed when it was compacted again.
     """
 
     key: str
@@ -33,7 +34,7 @@ class Known:
     failed_since: bool = False
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Whether it was made of the same, and every file still is what was written."""
+        """Whether it was made from the same content and settings, and every file is unchanged since."""
         try:
             return self.key == key and all(file_sha256(folder / name) == sha256 for name, sha256 in self.files)
         except OSError:
@@ -41,8 +42,8 @@ class Known:
 
 
 @dataclass
-class Index:
-    """The results of a folder, read on as lines are added by whichever process.
+class RecordIndex:
+    """The results in a folder, updated by reading the lines that any process has added.
 
     Args:
         folder: The output folder.
@@ -53,48 +54,48 @@ class Index:
 
     folder: Path
     end: int = 0
-    known: dict[str, Known] = field(default_factory=dict)
+    known: dict[str, DoneResult] = field(default_factory=dict)
     damaged: int = 0
 
     def read_on(self) -> None:
-        """Take in what was added since."""
+        """Read the lines that were added since."""
         for end, value in each_line(self.folder / RECORDS, self.end):
             self.end = end
             if value is None:
                 self.damaged += 1
                 continue
-            output, found = value.get("output"), _known(value)
-            if found is not None:
-                self.known[str(output)] = found
+            output, result = value.get("output"), _done_result(value)
+            if result is not None:
+                self.known[str(output)] = result
             elif value.get("status") == FAILED and output in self.known:
                 self.known[output] = replace(self.known[output], failed_since=True)
 
-    def results(self) -> set[str]:
+    def result_paths(self) -> set[str]:
         """Real paths of all results."""
         names = [name for known in self.known.values() for name, _ in known.files]
         return {os.path.realpath(self.folder / name) for name in names}
 
 
-def _known(value: Mapping[str, Any]) -> Known | None:
+def _done_result(value: Mapping[str, Any]) -> DoneResult | None:
     """The result of a record; None for one of another kind."""
     if value.get("status") != DONE:
         return None
     try:
         files = tuple((str(file["path"]), str(file["sha256"])) for file in value["files"])
-        return Known(str(value["key"]), files) if "output" in value else None
+        return DoneResult(str(value["key"]), files) if "output" in value else None
     except (KeyError, TypeError):
         return None
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
-    """A record: what every line has, with ``facts`` in place of nothing."""
+    """A record: the keys that every line has, and ``facts``."""
     blank: dict[str, Any] = {"key": None, "files": [], "attempt": 1, "error": None, "report": None}
     place = {"host": socket.gethostname(), "pid": os.getpid()}
     return {**document_head(), "status": status, "scene": scene, "output": output, **blank, **place, **facts}
 
 
 def written_files(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """What a record says of the files that were written."""
+    """The files of a result, as in its record."""
     return [
         {"path": name, "sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size} for name in names
     ]
@@ -108,10 +109,10 @@ def each_record(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def check_folder(folder: Path) -> None:
-    """Make the output folder, and see that records can be added to it.
+    """Make the output folder, and check that records can be written to it.
 
     Raises:
-        SceneError: If that is not so.
+        SceneError: If they cannot.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The batch: scenes are handed out, tried again where their process died, and told of as they are done."""
+"""The batch: scenes are dispatched to a pool, tried again if their process died, and reported as they end."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from gsmerge.batch.find import Job
 from gsmerge.batch.local import LocalPool
 from gsmerge.batch.locks import run_lock
 from gsmerge.batch.options import BatchOptions
-from gsmerge.batch.plan import Shape, make_shape
-from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, Index, check_folder
-from gsmerge.batch.task import Task, Work, give_up, with_threads
+from gsmerge.batch.plan import Schedule, make_schedule
+from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
+from gsmerge.batch.task import BatchContext, Task, record_failure, with_threads
 from gsmerge.errors import SceneError
 
-LOOK = 0.5  # seconds until the pool is asked again
-AGAIN = 1.0  # seconds until a scene that another run works on is looked at again
+POLL_SECONDS = 0.5  # between two queries of the pool
+BUSY_RETRY_SECONDS = 1.0  # until a scene that another run works on is tried again
 
 
 class Pool(Protocol):
-    """Where scenes are worked on."""
+    """Where scenes are compacted."""
 
     @property
     def has_room(self) -> bool:
@@ -34,96 +34,101 @@ class Pool(Protocol):
         """Take a scene."""
 
     def wait(self, seconds: float) -> list[tuple[Task, dict[str, Any]]]:
-        """What has ended, after at most so many seconds."""
+        """Scenes that ended, after at most so many seconds, and their outcomes."""
 
     def close(self) -> None:
-        """End everything; scenes that are under way are left as they were."""
+        """End all processes; unfinished scenes are left as they were."""
 
 
 def run_batch(
-    jobs: Sequence[Job], folder: Path, options: BatchOptions, *, index: Index | None = None, shape: Shape | None = None
+    jobs: Sequence[Job],
+    folder: Path,
+    options: BatchOptions,
+    *,
+    index: RecordIndex | None = None,
+    schedule: Schedule | None = None,
 ) -> Generator[dict[str, Any], None, None]:
-    """Compact scenes, each on its own; what is done already is skipped.
+    """Compact scenes, each on its own; those that are done are skipped.
 
-    Each is recorded in ``folder/batch.jsonl`` before it is told of here, so that a run that ends at any moment goes
-    on where it was. Runs with the same settings may share a folder: what one works on, the others leave to it.
+    Each is recorded in ``folder/batch.jsonl`` before it is yielded, so that a run that ends at any moment can be
+    continued. Runs with the same settings may share a folder: each scene is compacted by one of them.
 
     Args:
         jobs: See :func:`find_jobs`.
         folder: For the results; made where it does not exist.
-        options: How.
-        index: What the folder holds, if it is read already.
-        shape: How the scenes are spread, if that is settled already.
+        options: Of the batch.
+        index: The folder's records, if they are read already.
+        schedule: Of :func:`make_schedule`, if it is made already.
 
     Yields:
         One record for each scene as it ends, in any order: ``status`` done, failed or skipped.
 
     Raises:
         SceneError: If the folder cannot be written.
-        UsageError: If a batch with other settings is at work there, or the engine is not installed.
+        UsageError: If a batch with other settings uses the folder, or the engine is not installed.
     """
-    shape = shape or make_shape(jobs, options)
+    schedule = schedule or make_schedule(jobs, options)
     check_folder(folder)
     if index is None:
-        index = Index(folder)
+        index = RecordIndex(folder)
         index.read_on()
     with ExitStack() as stack:
         stack.enter_context(run_lock(folder, options.name()))
-        pool, work = _pool(folder, options, shape, index.end)
+        pool, context = _pool(folder, options, schedule, index.end)
         stack.callback(pool.close)
-        yield from hand_out((Task(job, index.known.get(job.output)) for job in jobs), pool, work)
+        yield from dispatch((Task(job, index.known.get(job.output)) for job in jobs), pool, context)
 
 
-def _pool(folder: Path, options: BatchOptions, shape: Shape, start: int) -> tuple[Pool, Work]:
-    """Where the scenes are worked on, and what they share."""
-    options = with_threads(options, shape.threads)
+def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -> tuple[Pool, BatchContext]:
+    """Where the scenes are compacted, and what they share."""
+    options = with_threads(options, schedule.threads)
     if options.engine == "ray":
         from gsmerge.batch.ray_engine import RayPool, with_whole_paths
 
-        work = Work(folder.absolute(), with_whole_paths(options), start)
-        return RayPool(work, shape.jobs), work
-    work = Work(folder, options, start)
-    return LocalPool(work, shape.jobs), work
+        context = BatchContext(folder.absolute(), with_whole_paths(options), start)
+        return RayPool(context, schedule.jobs), context
+    context = BatchContext(folder, options, start)
+    return LocalPool(context, schedule.jobs), context
 
 
-def hand_out(tasks: Iterator[Task], pool: Pool, work: Work) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until nothing is left; see :func:`run_batch`.
+def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
+    """Keep a pool busy until every scene has ended; see :func:`run_batch`.
 
     Raises:
         SceneError: If nothing can be recorded any more.
     """
-    again: deque[Task] = deque()  # their process died
-    later: deque[tuple[float, Task]] = deque()  # another run works on them
+    retried: deque[Task] = deque()  # their process died
+    busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0
     while True:
-        while pool.has_room and (task := _next(tasks, again, later)) is not None:
+        while pool.has_room and (task := _next(tasks, retried, busy)) is not None:
             pool.submit(task)
             active += 1
-        if not active and not later:
+        if not active and not busy:
             return
         if not active:
-            time.sleep(max(0.0, min(LOOK, later[0][0] - time.monotonic())))
+            time.sleep(max(0.0, min(POLL_SECONDS, busy[0][0] - time.monotonic())))
             continue
-        for task, found in pool.wait(LOOK):
+        for task, outcome in pool.wait(POLL_SECONDS):
             active -= 1
-            if found["status"] == LOST and task.attempt <= work.options.retries:
-                again.append(replace(task, attempt=task.attempt + 1))
+            if outcome["status"] == LOST and task.attempt <= context.options.retries:
+                retried.append(replace(task, attempt=task.attempt + 1))
                 continue
-            if found["status"] == LOST:
-                found = give_up(task, work, found["error"])
-            if found["status"] == BUSY:
-                later.append((time.monotonic() + AGAIN, task))
-            elif found["status"] == STUCK:
-                raise SceneError(work.folder / RECORDS, f"the batch cannot go on: {found['error']}")
+            if outcome["status"] == LOST:
+                outcome = record_failure(task, context, outcome["error"])
+            if outcome["status"] == BUSY:
+                busy.append((time.monotonic() + BUSY_RETRY_SECONDS, task))
+            elif outcome["status"] == STUCK:
+                raise SceneError(context.folder / RECORDS, f"the batch cannot go on: {outcome['error']}")
             else:
-                yield found
+                yield outcome
 
 
-def _next(tasks: Iterator[Task], again: deque[Task], later: deque[tuple[float, Task]]) -> Task | None:
-    """What to do next: first what was lost, then what is new, then what others were at; None while there is nothing."""
-    if again:
-        return again.popleft()
+def _next(tasks: Iterator[Task], retried: deque[Task], busy: deque[tuple[float, Task]]) -> Task | None:
+    """The next task: first the lost ones, then new ones, then those that other runs had; None if there is none yet."""
+    if retried:
+        return retried.popleft()
     task = next(tasks, None)
-    if task is None and later and later[0][0] <= time.monotonic():
-        return later.popleft()[1]
+    if task is None and busy and busy[0][0] <= time.monotonic():
+        return busy.popleft()[1]
     return task

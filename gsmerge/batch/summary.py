@@ -1,4 +1,4 @@
-"""What a batch came to: totals, a table, and a CSV file of all scenes."""
+"""The summary of a batch: totals, a table, and a CSV file of all scenes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsmerge.batch.locks import PATIENCE, BusyError, scene_lock
+from gsmerge.batch.locks import LOCK_TIMEOUT, BusyError, scene_lock
 from gsmerge.batch.records import DONE, FAILED, SKIPPED, SUMMARY, each_record
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
@@ -20,12 +20,12 @@ COLUMNS = (
     "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
     "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
 )  # fmt: skip
-SHOWN = 20  # scenes in the table, and failures below it
+MAX_LISTED = 20  # scenes in the table, and failures below it
 
 
 @dataclass
 class Totals:
-    """What is known of a run so far; its size does not grow with the number of scenes.
+    """A run so far, in a size that does not grow with the number of scenes.
 
     Args:
         total: Scenes.
@@ -34,7 +34,7 @@ class Totals:
         num_output: Gaussians in their results.
         bytes_input: Bytes of the same.
         bytes_output: Bytes of the same.
-        unmet: Results that do not meet the target that was asked for.
+        unmet: Results that miss their target.
         rows: The first ones done, as in the CSV file.
         failures: The first scenes that failed, and why.
     """
@@ -59,18 +59,18 @@ class Totals:
             self.bytes_input += row["bytes_input"]
             self.bytes_output += row["bytes_output"]
             self.unmet += bool(row["unmet"])
-            self.rows += [row] if len(self.rows) < SHOWN else []
-        elif record["status"] == FAILED and len(self.failures) < SHOWN:
+            self.rows += [row] if len(self.rows) < MAX_LISTED else []
+        elif record["status"] == FAILED and len(self.failures) < MAX_LISTED:
             self.failures.append((str(record["scene"]), str(record["error"])))
 
     @property
     def ended(self) -> int:
-        """Scenes that are done with."""
+        """Scenes that have ended."""
         return sum(self.counts.values())
 
 
 def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A record as a row of the CSV file; None for what is not known."""
+    """A record as a row of the CSV file, with None for unknown values."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {name: record.get(name) for name in ("scene", "output", "status", "attempt", "error")}
     report = record.get("report")
@@ -93,13 +93,13 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_summary(folder: Path) -> Path:
-    """Write the newest state of every scene in the folder, after other runs that are at it.
+    """Write the newest state of every scene in the folder, after other runs that are writing it.
 
     Raises:
         SceneError: If the file cannot be written.
     """
     path = folder / SUMMARY
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + LOCK_TIMEOUT
     while True:
         try:
             with scene_lock(folder, [SUMMARY]) as lock:
@@ -143,9 +143,9 @@ def summary_lines(totals: Totals, path: Path | None) -> list[str]:
     lines += [f"failed: {scene}: {error}" for scene, error in totals.failures]
     more = totals.counts[FAILED] - len(totals.failures)
     lines += [f"... and {more:,} more failed"] if more > 0 else []
-    said = [f"{count:,} {status}" for status, count in totals.counts.items() if count or status == DONE]
+    counts = [f"{count:,} {status}" for status, count in totals.counts.items() if count or status == DONE]
     left = totals.total - totals.ended
-    line = f"{totals.total:,} scenes: {', '.join(said)}" + (f", {left:,} left" if left else "")
+    line = f"{totals.total:,} scenes: {', '.join(counts)}" + (f", {left:,} left" if left else "")
     if totals.num_input:
         share = 100 * totals.num_output / totals.num_input
         line += (

@@ -1,4 +1,4 @@
-"""One scene: skipped if it is done, else compacted and recorded, and nothing in between that a kill could spoil."""
+"""One scene: skipped if it is done, otherwise compacted and recorded, safe against a kill at any moment."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gsmerge.batch.records import (
     RECORDS,
     SKIPPED,
     STUCK,
-    Index,
-    Known,
+    DoneResult,
+    RecordIndex,
     record,
     written_files,
 )
@@ -36,27 +36,27 @@ from gsmerge.runtime.jsonl import append_line
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to be worked on.
+    """A scene to be compacted.
 
     Args:
         job: The scene.
-        known: What former runs left of it; None: nothing.
+        known: Its result of former runs; None without one.
         attempt: From 1.
     """
 
     job: Job
-    known: Known | None
+    known: DoneResult | None
     attempt: int = 1
 
 
 @dataclass(frozen=True)
-class Work:
+class BatchContext:
     """What all tasks of a run share.
 
     Args:
         folder: The output folder.
-        options: Of the run; the threads of a scene are settled.
-        start: Byte of the records up to which the tasks know them.
+        options: Of the run, with the threads of a scene.
+        start: Byte of the records up to which ``Task.known`` was read.
     """
 
     folder: Path
@@ -64,77 +64,77 @@ class Work:
     start: int
 
 
-def run_task(task: Task, work: Work, later: Index) -> dict[str, Any]:
-    """Work on a scene.
+def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dict[str, Any]:
+    """Compact a scene, unless it is done.
 
     Args:
         task: The scene.
-        work: How.
-        later: What was recorded since the run began, kept by the process from task to task.
+        context: What all tasks share.
+        new_records: Records since the run began, shared by the tasks of a process.
 
     Returns:
-        Its record; of what is not recorded the ``status`` tells: skipped, busy (another process works on it), or
+        Its record; one that is not written has the ``status`` skipped, busy (another process has the scene), or
         stuck (records cannot be written).
     """
     job = task.job
     try:
-        with scene_lock(work.folder, _outputs(job, work.options)) as lock:
+        with scene_lock(context.folder, _output_names(job, context.options)) as lock:
             try:
-                later.read_on()
-                found = _worked(task, work, later, lock)
+                new_records.read_on()
+                outcome = _process(task, context, new_records, lock)
             except Exception as error:  # a bad scene must not end the batch
-                found = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
-            known = later.known.get(job.output, task.known)
-            if found["status"] != SKIPPED or (known is not None and known.failed_since):
-                append_line(work.folder / RECORDS, found)
+                outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
+            known = new_records.known.get(job.output, task.known)
+            if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
+                append_line(context.folder / RECORDS, outcome)
             lock.finish()
-            return found
+            return outcome
     except BusyError:
         return record(BUSY, job.scene, job.output)
-    except SceneError as error:  # locks or records cannot be written: no scene can be done
+    except SceneError as error:  # locks or records cannot be written, whatever the scene
         return record(STUCK, job.scene, job.output, error=str(error))
 
 
-def _worked(task: Task, work: Work, later: Index, lock: Lock) -> dict[str, Any]:
+def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: Lock) -> dict[str, Any]:
     """The scene's record, with its files in place."""
-    job, options = task.job, work.options
+    job, options = task.job, context.options
     if lock.abandoned:
-        _clean(job, work)
+        _clean(job, context)
     files = _files_of(job, options)
     key = scene_key(files, options)
-    before, since = task.known, later.known.get(job.output)
+    before, since = task.known, new_records.known.get(job.output)
     for known in (since, None if options.rerun else before):
-        if known is not None and known.holds(work.folder, key):
-            return record(SKIPPED, job.scene, job.output, key=key, files=_as_written(work.folder, known))
+        if known is not None and known.holds(context.folder, key):
+            return record(SKIPPED, job.scene, job.output, key=key, files=_as_written(context.folder, known))
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
-    for name in _outputs(job, options):
-        if os.path.lexists(work.folder / name) and name not in own and not (lock.fresh or options.overwrite):
+    for name in _output_names(job, options):
+        if os.path.lexists(context.folder / name) and name not in own and not (lock.fresh or options.overwrite):
             problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
-            raise UsageError(f"{work.folder / name}: {problem}")
-    return _compacted(task, work, files, key)
+            raise UsageError(f"{context.folder / name}: {problem}")
+    return _compact(task, context, files, key)
 
 
-def _compacted(task: Task, work: Work, files: SceneFiles, key: str) -> dict[str, Any]:
-    job, options = task.job, work.options
-    out = work.folder / job.output
+def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> dict[str, Any]:
+    job, options = task.job, context.options
+    out = context.folder / job.output
     out.parent.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         document = compact_files(
             files, options.settings, out, opacity=options.opacity, hints=options.hints, overwrite=True, hashed=True
         )
-    document["notes"] += list(dict.fromkeys(str(warning.message) for warning in told))
-    names = [job.output, *(os.path.relpath(level["path"], work.folder) for level in document["levels"])]
-    facts = {"key": key, "files": written_files(work.folder, names), "report": finite(document)}
+    document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
+    names = [job.output, *(os.path.relpath(level["path"], context.folder) for level in document["levels"])]
+    facts = {"key": key, "files": written_files(context.folder, names), "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
 
 
-def _outputs(job: Job, options: BatchOptions) -> list[str]:
+def _output_names(job: Job, options: BatchOptions) -> list[str]:
     """Names of the result and of its further levels."""
     return [job.output, *further_outputs(job.output, options.settings.target.levels)]
 
 
-def _as_written(folder: Path, known: Known) -> list[dict[str, Any]]:
+def _as_written(folder: Path, known: DoneResult) -> list[dict[str, Any]]:
     return [{"path": name, "sha256": sha, "bytes": (folder / name).stat().st_size} for name, sha in known.files]
 
 
@@ -144,38 +144,38 @@ def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
-    """What a result is known by: everything that is read, all settings, and the version."""
-    told: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.told()}
+    """Digest of everything that a result depends on: what is read, all settings, and the version."""
+    content: dict[str, Any] = {"scene": content_hash(read_files(files)), **options.result_settings()}
     checkpoint = Path(options.settings.checkpoint)
-    if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by what is in it, wherever it lies
-        told["settings"]["checkpoint"] = file_sha256(checkpoint)
-    return digest({**told, "tool_version": __version__, "schema_version": SCHEMA_VERSION})
+    if options.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
+        content["settings"]["checkpoint"] = file_sha256(checkpoint)
+    return digest({**content, "tool_version": __version__, "schema_version": SCHEMA_VERSION})
 
 
-def is_done(job: Job, known: Known, work: Work) -> bool:
+def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
     """Whether a result would be skipped."""
     try:
-        return known.holds(work.folder, scene_key(_files_of(job, work.options), work.options))
+        return known.holds(context.folder, scene_key(_files_of(job, context.options), context.options))
     except SceneError:
         return False
 
 
-def _clean(job: Job, work: Work) -> None:
-    """Remove what a killed process left beside a result and its further levels."""
-    for path in (work.folder / name for name in _outputs(job, work.options)):
+def _clean(job: Job, context: BatchContext) -> None:
+    """Remove what a killed process left next to a result and its further levels."""
+    for path in (context.folder / name for name in _output_names(job, context.options)):
         if path.parent.is_dir():
             remove_leftovers(path)
 
 
-def give_up(task: Task, work: Work, error: str) -> dict[str, Any]:
-    """The record of a scene whose process died or took too long, as often as may be."""
+def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
+    """The record of a scene whose process died or took too long, after all retries."""
     job = task.job
     failed = record(FAILED, job.scene, job.output, error=error, attempt=task.attempt)
     try:
-        with scene_lock(work.folder, _outputs(job, work.options)) as lock:
-            _clean(job, work)
-            append_line(work.folder / RECORDS, failed)
-            _finish(lock, task, work)
+        with scene_lock(context.folder, _output_names(job, context.options)) as lock:
+            _clean(job, context)
+            append_line(context.folder / RECORDS, failed)
+            _finish(lock, task, context)
     except BusyError:
         return record(BUSY, job.scene, job.output)
     except SceneError as stuck:
@@ -183,25 +183,25 @@ def give_up(task: Task, work: Work, error: str) -> dict[str, Any]:
     return failed
 
 
-def tidy(task: Task, work: Work) -> None:
-    """Remove what is left of a scene whose process was ended on purpose."""
+def clean_up(task: Task, context: BatchContext) -> None:
+    """Remove unfinished files of a scene whose process was ended on purpose."""
     try:
-        with scene_lock(work.folder, _outputs(task.job, work.options)) as lock:
-            _clean(task.job, work)
-            _finish(lock, task, work)
+        with scene_lock(context.folder, _output_names(task.job, context.options)) as lock:
+            _clean(task.job, context)
+            _finish(lock, task, context)
     except (BusyError, SceneError):
-        return  # somebody else sees to it, or the next run does
+        return  # another process removes them, or the next run does
 
 
-def _finish(lock: Lock, task: Task, work: Work) -> None:
-    """The lock's file goes, unless it is all that says that a result is ours."""
-    later = Index(work.folder, work.start)
-    later.read_on()
-    recorded = task.known is not None or task.job.output in later.known
-    if recorded or not os.path.lexists(work.folder / task.job.output):
+def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
+    """Remove the lock's file, unless only it shows that a batch wrote the result."""
+    new_records = RecordIndex(context.folder, context.start)
+    new_records.read_on()
+    recorded = task.known is not None or task.job.output in new_records.known
+    if recorded or not os.path.lexists(context.folder / task.job.output):
         lock.finish()
 
 
 def with_threads(options: BatchOptions, threads: int) -> BatchOptions:
-    """The options with the threads of a scene settled."""
+    """The options with the threads of a scene."""
     return replace(options, settings=replace(options.settings, threads=threads))

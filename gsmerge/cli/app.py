@@ -27,7 +27,7 @@ from gsmerge.cli.report import report
 from gsmerge.cli.segment import segment
 from gsmerge.cli.stress import stress
 from gsmerge.cli.train import train
-from gsmerge.errors import GsmergeError
+from gsmerge.errors import DAMAGED_OPENCV, GsmergeError, is_opencv_damaged
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
@@ -91,6 +91,8 @@ def run(args: Sequence[str] | None = None) -> int:
     except Exception as error:
         if isinstance(error, _UsageErrors):
             return _fail(_usage_message(error), 2)
+        if is_opencv_damaged(error):
+            return _fail(DAMAGED_OPENCV, 1)
         told = f"{type(error).__name__}: {error}".splitlines()[0]
         return _fail(f"unexpected error: {told}; run again with --debug", 1)
 

@@ -21,8 +21,8 @@ from gsmerge.errors import BatchError, TargetError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
-    from gsmerge.batch.plan import Shape
-    from gsmerge.batch.records import Index
+    from gsmerge.batch.plan import Schedule
+    from gsmerge.batch.records import RecordIndex
     from gsmerge.batch.summary import Totals
 
 RUNNING = "Running"
@@ -146,8 +146,8 @@ def batch(
         raise UsageError(f"--out: expected a folder, found the file {out}")
     hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.batch import BatchOptions, find_jobs
-    from gsmerge.batch.plan import make_shape
-    from gsmerge.batch.records import Index
+    from gsmerge.batch.plan import make_schedule
+    from gsmerge.batch.records import RecordIndex
 
     names = ("output", "timeout", "retries", "address", "cameras", "images", "overwrite")
     given = {name: context.params[name] for name in names} | {"jobs": context.params["jobs"] or None}
@@ -160,15 +160,15 @@ def batch(
         from gsmerge.batch.ray_engine import require_ray
 
         require_ray()
-    index = Index(out)
+    index = RecordIndex(out)
     index.read_on()
-    found = find_jobs(scenes, out, options, index.results())
-    shape = make_shape(found, options)
+    found = find_jobs(scenes, out, options, index.result_paths())
+    schedule = make_schedule(found, options)
     if dry_run:
-        _print_plan(found, out, options, index, shape, as_json=json)
+        _print_plan(found, out, options, index, schedule, as_json=json)
         return
-    say_notes(_notes(index, shape), quiet=quiet or json)
-    _run(found, out, options, index, shape, as_json=json, quiet=quiet)
+    say_notes(_notes(index, schedule), quiet=quiet or json)
+    _run(found, out, options, index, schedule, as_json=json, quiet=quiet)
 
 
 def _bytes(text: str | None) -> int | None:
@@ -180,17 +180,17 @@ def _bytes(text: str | None) -> int | None:
         raise UsageError(f'--max-memory: expected a size such as 8GB, got "{text}"') from None
 
 
-def _notes(index: Index, shape: Shape) -> list[str]:
+def _notes(index: RecordIndex, schedule: Schedule) -> list[str]:
     damaged = [f"{index.damaged} damaged line(s) of the records were passed over"] if index.damaged else []
-    return [*damaged, *shape.notes]
+    return [*damaged, *schedule.notes]
 
 
 def _run(
     found: Sequence[Job],
     out: Path,
     options: BatchOptions,
-    index: Index,
-    shape: Shape,
+    index: RecordIndex,
+    schedule: Schedule,
     *,
     as_json: bool,
     quiet: bool,
@@ -206,14 +206,14 @@ def _run(
 
     totals, path = Totals(len(found)), None
     silent = quiet or as_json
-    spread = f"{shape.jobs or 'all it has room for'} at once, {shape.threads} thread(s) each"
+    spread = f"{schedule.jobs or 'all it has room for'} at once, {schedule.threads} thread(s) each"
     say(f"{len(found):,} scenes, {spread}", quiet=silent)
     interrupted = False
     try:
         lines = sys.stdout
         with (
             _apart(options, quiet=silent),
-            closing(run_batch(found, out, options, index=index, shape=shape)) as records,
+            closing(run_batch(found, out, options, index=index, schedule=schedule)) as records,
         ):
             _follow(records, totals, lines if as_json else None, quiet=silent)
     except KeyboardInterrupt:
@@ -255,19 +255,19 @@ def _follow(records: Iterable[dict[str, Any]], totals: Totals, lines: TextIO | N
 
 
 def _print_plan(
-    found: Sequence[Job], out: Path, options: BatchOptions, index: Index, shape: Shape, *, as_json: bool
+    found: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex, schedule: Schedule, *, as_json: bool
 ) -> None:
     from gsmerge.batch.plan import estimate_seconds
-    from gsmerge.batch.task import Work, is_done
+    from gsmerge.batch.task import BatchContext, is_done
     from gsmerge.report import document_head, human_bytes, to_json
 
-    work = Work(out, options, 0)
+    shared = BatchContext(out, options, 0)
     done = set()
     if not options.rerun:
-        done = {job.output for job in found if (known := index.known.get(job.output)) and is_done(job, known, work)}
+        done = {job.output for job in found if (known := index.known.get(job.output)) and is_done(job, known, shared)}
     pending = [job for job in found if job.output not in done]
-    seconds = estimate_seconds(pending, options, shape)
-    notes = _notes(index, shape)
+    seconds = estimate_seconds(pending, options, schedule)
+    notes = _notes(index, schedule)
     if as_json:
         document = {
             **document_head(),
@@ -275,9 +275,9 @@ def _print_plan(
             "output": str(out),
             "num_scenes": len(found),
             "num_pending": len(pending),
-            "jobs": shape.jobs,
-            "threads": shape.threads,
-            "estimate": {"seconds": round(seconds, 1), "memory_bytes": shape.memory},
+            "jobs": schedule.jobs,
+            "threads": schedule.threads,
+            "estimate": {"seconds": round(seconds, 1), "memory_bytes": schedule.memory},
             "scenes": [
                 {
                     "scene": job.scene,
@@ -287,7 +287,7 @@ def _print_plan(
                 }
                 for job in found
             ],
-            "options": options.told()["settings"],
+            "options": options.result_settings()["settings"],
             "notes": notes,
         }
         sys.stdout.write(to_json(document))
@@ -295,6 +295,8 @@ def _print_plan(
     lines = [f"{job.scene} -> {out / job.output}" for job in pending]
     lines += [f"note: {note}" for note in notes]
     lines.append(f"would write {out}: {len(pending):,} of {len(found):,} scenes to do")
-    lines.append(f"at once     {shape.jobs or 'as many as the cluster has room for'}, {shape.threads} thread(s) each")
-    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(shape.memory)} of memory")
+    lines.append(
+        f"at once     {schedule.jobs or 'as many as the cluster has room for'}, {schedule.threads} thread(s) each"
+    )
+    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(schedule.memory)} of memory")
     print("\n".join(map(one_line, lines)))

@@ -183,11 +183,11 @@ def _planned(
     scenes: Sequence[Path], grid: Grid, out: Path, targets: str | None, target_images: str | None, options: RunOptions
 ) -> tuple[Plan, dict[str, RunRecord], list[str]]:
     from gsmerge.research.charts.experiment import make_experiments
-    from gsmerge.research.charts.places import find_places
     from gsmerge.research.charts.run import make_plan
+    from gsmerge.research.charts.scenes import find_scenes
 
     experiments, notes = make_experiments(scenes, grid)
-    plan, stored = make_plan(experiments, find_places(scenes, targets, target_images), out, options)
+    plan, stored = make_plan(experiments, find_scenes(scenes, targets, target_images), out, options)
     return plan, stored, [*notes, *plan.notes]
 
 
@@ -204,8 +204,7 @@ def _print_plan(
     plan: Plan, stored: dict[str, RunRecord], options: RunOptions, out: Path, notes: Sequence[str], *, as_json: bool
 ) -> None:
     from gsmerge.report import document_head, to_json
-    from gsmerge.research.charts.estimate import estimate_seconds
-    from gsmerge.research.charts.run import describe
+    from gsmerge.research.charts.run import describe, estimate_seconds
     from gsmerge.runtime.threads import available_threads
 
     runs = [run for run in plan.runs if run[0] in plan.pending]
@@ -241,18 +240,18 @@ def _drawn(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     from gsmerge.io import atomic_output
     from gsmerge.report import document_head
     from gsmerge.research.charts.draw import draw_figures
-    from gsmerge.research.charts.figures import make_figures, make_verdicts
+    from gsmerge.research.charts.figures import make_figures, make_verdict_tables
     from gsmerge.research.charts.page import make_page
     from gsmerge.research.charts.proxies import read_proxies
+    from gsmerge.research.charts.record import CHARTS, PAGE, read_runs
     from gsmerge.research.charts.series import newest
-    from gsmerge.research.charts.store import CHARTS, PAGE, read_runs
 
     stored, told = read_runs(out)
     proxies, more = read_proxies(out)
     if not stored:
         raise UsageError(f"{out}: expected finished runs, found none; name scenes to run")
     records, passed = newest(list(stored.values()))
-    figures, verdicts = make_figures(records, list(proxies.values())), make_verdicts(records)
+    figures, verdicts = make_figures(records, list(proxies.values())), make_verdict_tables(records)
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "chart", "--draw-only", "--out", str(out)])
     page = make_page(records, figures, drawings, verdicts, out, command=command)

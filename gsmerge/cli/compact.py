@@ -97,11 +97,11 @@ def compact(
 
 def warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
     """Say so before anything is read if the scene is not likely to fit into this machine's memory."""
-    from gsmerge.io.formats.ply_file import promised
+    from gsmerge.io.formats.ply_file import header_counts
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
     from gsmerge.runtime.memory import machine_memory
 
-    count, num_rest = promised(files.ply)
+    count, num_rest = header_counts(files.ply)
     problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
@@ -166,11 +166,13 @@ def print_plan(
     """Say what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
-    from gsmerge.report import plan_document, plan_lines, to_json
+    from gsmerge.options import to_schema
+    from gsmerge.report import document_head, to_json
+    from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
 
-    given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+    given = read_input(files, opacity=opacity, hints=hints)
     scene, cameras = given.scene, given.scene.cameras
     with told_as_usage():
         wanted = budget_count(scene, settings)
@@ -184,13 +186,14 @@ def print_plan(
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
-        usual=default_count(scene, settings),
-        wanted=wanted,
+        default_count=default_count(scene, settings),
+        budget=wanted,
         notes=[*given.notes, *unused],
         count=scene.num_gaussians,
         num_rest=3 * scene.gaussians.shN.shape[1],
     )
     if as_json:
-        sys.stdout.write(to_json(document))
+        options = {"options": to_schema(document["options"])}
+        sys.stdout.write(to_json({**document_head(), **document, **options}))
     else:
         print("\n".join(map(one_line, plan_lines(document))))

@@ -120,7 +120,7 @@ def _run(
 
     imported = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        given = read_input(files, settings.segment, opacity=opacity, hints=hints)
+        given = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress:
             encoded = encode_scene(given.scene, settings, max_k=max_k, progress=progress)

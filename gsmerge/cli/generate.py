@@ -17,7 +17,7 @@ from gsmerge.cli.settings import told_as_usage
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.research.generate import Generated, GenerateOptions
+    from gsmerge.research.generate import GenerateOptions, SceneFolder
 
 SCENE, ERRORS = "Scenes", "Errors"
 
@@ -48,7 +48,7 @@ def generate(
     ranges: Annotated[
         Path | None,
         typer.Option(
-            help="TOML or JSON file with ranges of the errors, as in docs/generator.md.",
+            help="TOML or JSON file with ranges of the errors, as in docs/internals/generator.md.",
             show_default="the built-in ones",
             rich_help_panel=ERRORS,
         ),
@@ -89,7 +89,7 @@ def _made(
     threads: int | None,
     dry_run: bool,
     quiet: bool,
-) -> list[Generated]:
+) -> list[SceneFolder]:
     """Make the scenes, or say which there would be."""
     from gsmerge.research.generate import generate as make_scenes
     from gsmerge.research.generate import plan

@@ -49,13 +49,13 @@ def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[PixelScene | UnalignedScene, Views | None, tuple[str, ...]]:
     """The scene with the context views that were asked for, the held-out ones, and notes about those."""
-    from gsmerge.io import read_targets
+    from gsmerge.io import read_held_out
     from gsmerge.measure.evaluate import Views
     from gsmerge.views import even_views, midpoint_views, subset
 
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
-    read = None if targets is None else read_targets(load, targets, target_images)
+    read = None if targets is None else read_held_out(load, targets, target_images)
     found = None if read is None else Views(read.cameras, read.images, read.names)
     notes = () if read is None else read.notes
     if views is None:

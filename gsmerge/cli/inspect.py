@@ -26,7 +26,8 @@ def inspect(
     """Say what a scene holds: layout, count, bytes, cameras, images, and whether the pixels line up."""
     hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.measure.inspect import inspect as inspect_scene
-    from gsmerge.report import document_head, inspection_lines, to_json
+    from gsmerge.measure.inspection_lines import inspection_lines
+    from gsmerge.report import document_head, to_json
 
     found = inspect_scene(scene, cameras=cameras, images=images, opacity=opacity.value, **vars(hints)).to_dict()
     if json:

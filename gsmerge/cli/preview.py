@@ -35,7 +35,7 @@ def preview(
 ) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
     hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
-    from gsmerge.io import find_scene_files, place_views, ply_notes, read_ply, read_ply_with_hints
+    from gsmerge.io import find_scene_files, place_cameras_in_scene, ply_notes, read_ply, read_ply_with_hints
     from gsmerge.measure.preview import contact_sheet
     from gsmerge.runtime.threads import use_threads
     from gsmerge.views import pick_views
@@ -46,7 +46,7 @@ def preview(
     check_cameras(files)
     plys = [read_ply_with_hints(files.ply, opacity=opacity.value, hints=hints)]
     plys += [read_ply(path, opacity=opacity.value) for path in scenes[1:]]
-    placed = place_views(plys[0], files, hints=hints)
+    placed = place_cameras_in_scene(plys[0], files, hints=hints)
     used = list(placed.views.used)
     seen_from, photos = placed.views.cameras[used], placed.views.images
     photos = None if photos is None else photos[used]
@@ -57,7 +57,7 @@ def preview(
         shown = [placed.gaussians, *(ply.gaussians for ply in plys[1:])]
         parts = [(path.name, gaussians) for path, gaussians in zip(scenes, shown, strict=True)]
         with use_threads(threads), announce_compilation(quiet=quiet or json):
-            sheet = contact_sheet(parts, seen_from, photos, most_views=views)
+            sheet = contact_sheet(parts, seen_from, photos, max_views=views)
         write_picture(output, sheet, overwrite=overwrite)
     ids = pick_views(len(seen_from), views)
     facts = {

@@ -17,7 +17,7 @@ from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 
 if TYPE_CHECKING:
-    from gsmerge.io import Placed, PlyScene, SceneFiles
+    from gsmerge.io import CamerasInScene, PlyScene, SceneFiles
     from gsmerge.types import Cameras, Gaussians
 
 
@@ -72,14 +72,14 @@ def render(
     tell_pictures(output, pictures, facts, line, dry_run=dry_run, as_json=json, quiet=quiet)
 
 
-def _placed(ply: PlyScene, like: SceneFiles) -> Placed:
+def _placed(ply: PlyScene, like: SceneFiles) -> CamerasInScene:
     """The Gaussians, and the cameras as they stand for the scene of ``like``."""
-    from gsmerge.io import ReadHints, place_views, ply_notes, read_ply
+    from gsmerge.io import ReadHints, place_cameras_in_scene, ply_notes, read_ply
 
     hints = ReadHints(max_side=MAX_SIDE)
     if str(like.ply) == ply.info.path:
-        return place_views(ply, like, hints=hints, photos=False)
-    placed = place_views(read_ply(like.ply), like, hints=hints, photos=False)
+        return place_cameras_in_scene(ply, like, hints=hints, photos=False)
+    placed = place_cameras_in_scene(read_ply(like.ply), like, hints=hints, photos=False)
     return replace(placed, gaussians=ply.gaussians, notes=(*ply_notes(ply.info), *placed.notes))
 
 

@@ -18,7 +18,7 @@ from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.io import PlyInfo
-    from gsmerge.measure.compare import Storage
+    from gsmerge.measure.comparison import Storage
     from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 SUFFIXES = (".md", ".html", ".json")
@@ -81,8 +81,8 @@ def report(
     """Compare a scene with its compact versions: bytes, render time, overdraw, quality, break-even frames."""
     hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import find_scene_files, load_files, read_ply
-    from gsmerge.measure.before_after import comparison_document
-    from gsmerge.measure.compare import compare
+    from gsmerge.measure.comparison import compare
+    from gsmerge.measure.comparison_page import comparison_document
     from gsmerge.measure.evaluate import INPUT, EvaluateOptions
     from gsmerge.runtime.run_log import RunLog
     from gsmerge.stages.place_cameras import add_views
@@ -140,7 +140,7 @@ def _seconds_of(path: Path) -> float:
 
 
 def _storage(info: PlyInfo) -> Storage:
-    from gsmerge.measure.compare import Storage
+    from gsmerge.measure.comparison import Storage
 
     return Storage(info.path, info.count, info.file_bytes, info.bytes_by_attribute)
 
@@ -155,14 +155,14 @@ def _write(
 ) -> None:
     from gsmerge.cli.pictures import png_bytes
     from gsmerge.io import atomic_output
-    from gsmerge.measure.before_after import comparison_html, comparison_markdown
+    from gsmerge.measure.comparison_page import comparison_html, comparison_markdown
     from gsmerge.measure.evaluate import near_plane
     from gsmerge.measure.preview import contact_sheet
     from gsmerge.report import to_json
 
     if path.suffix == ".html":
         parts = [("before", scene.file_gaussians), *gaussians.items()]
-        sheet = contact_sheet(parts, scene.cameras, scene.images, most_views=2, near=near_plane(scene))
+        sheet = contact_sheet(parts, scene.cameras, scene.images, max_views=2, near=near_plane(scene))
         text = comparison_html(document, png_bytes(sheet))
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)
@@ -171,7 +171,7 @@ def _write(
 
 
 def _tell(document: Mapping[str, Any], notes: Sequence[str], *, written: bool, as_json: bool, quiet: bool) -> None:
-    from gsmerge.measure.before_after import comparison_markdown
+    from gsmerge.measure.comparison_page import comparison_markdown
     from gsmerge.report import to_json
 
     if as_json:

@@ -46,10 +46,9 @@ def segment(
 ) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
     hints = reading_of(exporter, quats.value, order.value, scene_scale)
-    from gsmerge.compact_file import superpixels_per_view
     from gsmerge.io import find_scene_files, load_files
     from gsmerge.runtime.threads import use_threads
-    from gsmerge.stages.segment import SegmentOptions
+    from gsmerge.stages.segment import SegmentOptions, count_for
 
     chosen: dict[str, Any] = {"superpixels": superpixels, "density": density}
     chosen |= {"segmentation": segmentation and segmentation.value, "effort": effort and effort.value}
@@ -59,7 +58,7 @@ def segment(
     check_folder(output, input_files(files), overwrite=overwrite)
     loaded = load_files(files, opacity=opacity.value, hints=hints)
     pixel_scene = loaded.pixel_scene()
-    per_view = superpixels_per_view(options, pixel_scene.cameras.width, pixel_scene.cameras.height)
+    per_view = count_for(options, pixel_scene.cameras.height, pixel_scene.cameras.width)
     say_notes(loaded.notes, quiet=quiet or json)
     stems = picture_stems(pixel_scene.names)
     pictures = [output / f"{stem}.{kind}.png" for stem in stems for kind in KINDS]

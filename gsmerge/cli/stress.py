@@ -52,6 +52,7 @@ def stress(
     """Compact a scene under bad conditions, and say of each whether the result is what it should be."""
     hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
     from gsmerge.io import atomic_output, find_scene_files, load_files
+    from gsmerge.options import to_schema
     from gsmerge.report import document_head, to_json
     from gsmerge.research.stress import stress as stress_scene
 
@@ -70,10 +71,10 @@ def stress(
     document = {
         **document_head(),
         "input": str(files.ply),
-        "options": settings.to_dict(),
-        "cases": [vars(outcome) for outcome in found],
-        "held": sum(outcome.held is True for outcome in found),
-        "failed": sum(outcome.held is False for outcome in found),
+        "options": to_schema(settings.to_dict()),
+        "cases": [outcome.to_dict() for outcome in found],
+        "held": sum(outcome.passed is True for outcome in found),
+        "failed": sum(outcome.passed is False for outcome in found),
         "notes": notes,
     }
     if report is not None:
@@ -83,7 +84,7 @@ def stress(
         sys.stdout.write(to_json(document))
     elif not quiet:
         print("\n".join(map(one_line, _lines(found))))
-    failed = [outcome.case for outcome in found if outcome.held is False]
+    failed = [outcome.case for outcome in found if outcome.passed is False]
     if failed:
         raise TargetError(f"{len(failed)} of {len(found)} cases failed: {', '.join(failed)}")
 
@@ -91,8 +92,8 @@ def stress(
 def _lines(found: Sequence[StressOutcome]) -> list[str]:
     """One line for each case, and how many held."""
     marks = {True: "held", False: "FAILED", None: "-"}
-    width = max((len(outcome.words) for outcome in found), default=0)
-    lines = [f"{marks[o.held]:<7} {o.words:<{width}}  {o.found}" for o in found]
-    lines += [f"        wanted of '{o.words}': {o.wanted}" for o in found if o.held is False]
-    tried = [outcome for outcome in found if outcome.held is not None]
-    return [*lines, f"{sum(o.held is True for o in tried)} of {len(tried)} held"]
+    width = max((len(outcome.change) for outcome in found), default=0)
+    lines = [f"{marks[o.passed]:<7} {o.change:<{width}}  {o.measured}" for o in found]
+    lines += [f"        wanted of '{o.change}': {o.expected}" for o in found if o.passed is False]
+    tried = [outcome for outcome in found if outcome.passed is not None]
+    return [*lines, f"{sum(o.passed is True for o in tried)} of {len(tried)} held"]

@@ -72,7 +72,7 @@ def train(
 ) -> None:
     """Train networks on what the fit changes in scenes and on photos; interrupted, the same call goes on."""
     from gsmerge.report import document_head, to_json
-    from gsmerge.research.training import network_device, preset_options, read_config
+    from gsmerge.research.training import choose_device, preset_options, read_config
     from gsmerge.research.training import train as train_networks
     from gsmerge.runtime.threads import use_threads
 
@@ -81,7 +81,7 @@ def train(
         options = read_config(config, options)
     changes: dict[str, Any] = {name: value for name, value in (("steps", steps), ("seed", seed)) if value is not None}
     with told_as_usage():
-        options, chosen = replace(options, **changes), network_device(device.value)
+        options, chosen = replace(options, **changes), choose_device(device.value)
     quiet = quiet or json
     with announce_compilation(quiet=quiet), stage_progress(quiet=quiet) as progress, use_threads(threads):
         folder, apart = cache or out / "examples", find_training_scenes(validation or [], out)

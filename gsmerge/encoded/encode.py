@@ -12,7 +12,7 @@ from gsmerge import __version__
 from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
-from gsmerge.options import CompactOptions
+from gsmerge.options import CompactOptions, to_schema
 from gsmerge.pipeline import build, merge_views
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
@@ -114,7 +114,7 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
 
 def _about(options: CompactOptions, log: RunLog) -> dict[str, Any]:
     """Version, options, choices and notes; nothing that depends on the machine."""
-    settings = options.to_dict() | {"checkpoint": Path(options.checkpoint).name}
+    settings = to_schema(options.to_dict()) | {"checkpoint": Path(options.checkpoint).name}
     del settings["threads"]
     choices = {name: value for name, value in log.choices.items() if name != "networks"}
     return {"gsmerge": __version__, "options": settings, "choices": choices, "notes": list(log.notes)}

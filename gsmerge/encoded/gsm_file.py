@@ -2,19 +2,9 @@
 
 A safetensors file with one metadata entry, whose name says the kind of content and whose text is a header in JSON.
 Nothing in a file is ever executed; every tensor and every entry is checked before it is used. Within one major schema
-tensors and entries are only ever added, and unknown ones are ignored. Keys that differ from the names in the code:
-
-    key                     name
-    settings.most           StoredSettings.max_k
-    settings.prune          StoredSettings.min_contribution
-    settings.wanted         StoredSettings.target_count
-    settings.places         StoredSettings.num_slots
-    settings.knee           StoredSettings.knee_count
-    division.whole          Division.uniform
-    division.deals          Division.growth_order
-    features.solved         GroupSet.fitted_sh0
-    features.held           GroupSet.color_precision
-    heads.group             StoredHeads.group (the tokens that describe each group)
+tensors and entries are only ever added, and unknown ones are ignored. Keys that differ from the names in the code are
+in SETTING_KEYS, and these: division.whole (Division.uniform), division.deals (Division.growth_order), features.solved
+(GroupSet.fitted_sh0), features.held (GroupSet.color_precision), kept (Gaussians that no view sees).
 """
 
 from __future__ import annotations
@@ -142,6 +132,7 @@ def save_encoded(
     entries = {
         "networks": None if heads is None else asdict(heads.networks.options),
         "about": {**encoded.about, **({} if source is None else {"source": dict(source)})},
+        "precision": "float32",  # of the networks' arithmetic: earlier versions had others and expect the key
     }
     tensors = {
         "division.splits": division.splits,

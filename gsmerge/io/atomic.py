@@ -18,7 +18,7 @@ _DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS}
 
 @contextmanager
 def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary file beside ``path``, renamed to it when the block ends well and removed when it does not.
+    """A temporary file next to ``path``, renamed to it when the block succeeds and removed when it fails.
 
     Args:
         path: The file to be written. Its folder must exist.
@@ -44,7 +44,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     except SceneError as error:
         if error.path != str(temporary):
             raise
-        raise SceneError(path, error.problem, error.remedy) from error  # nobody knows the other name
+        raise SceneError(path, error.problem, error.remedy) from error  # the temporary name means nothing to the caller
     except OSError as error:
         if error.errno not in _DISK_ERRORS and error.filename != str(temporary):
             raise
@@ -58,9 +58,9 @@ def remove_leftovers(path: Path) -> None:
     name = re.compile(rf"\.+{re.escape(path.stem)}(-[0-9a-f]{{8}})+{re.escape(path.suffix)}")  # also one's own one
     try:
         with os.scandir(path.parent) as entries:
-            left = [entry.path for entry in entries if name.fullmatch(entry.name)]
-        for one in left:
-            os.unlink(one)
+            leftovers = [entry.path for entry in entries if name.fullmatch(entry.name)]
+        for leftover in leftovers:
+            os.unlink(leftover)
     except OSError as error:
         raise SceneError(path, f"its temporary files cannot be removed ({error.strerror})") from error
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsmerge.errors import SceneError
 
-MAX_TEXT_BYTES = 32 << 20  # of a camera file: some hundred thousand numbers a view would not fill it
+MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any has
 MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which lists the points of every image as well
 MAX_VIEWS = 10_000
 MAX_PIXELS = 1 << 26  # of one image

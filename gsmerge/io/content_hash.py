@@ -10,12 +10,18 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import CameraFile, SceneFiles, read_cameras
-from gsmerge.io.cameras.long_lrm import CHOSEN, MOVED, SCALED
+from gsmerge.io.cameras.long_lrm import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.trajectory import INTRINSICS
 from gsmerge.io.scene_files import IMAGE_PLACES
 
-BESIDE = (DATAPARSER, *INTRINSICS, CHOSEN, MOVED, SCALED)  # small files that some camera files are read with
+EXTRA_FILES = (
+    DATAPARSER,
+    *INTRINSICS,
+    FRAMES_FILE,
+    POSE_FILE,
+    SCALE_FILE,
+)  # small files that are read with some camera files
 
 
 def digest(value: Mapping[str, Any]) -> str:
@@ -43,24 +49,24 @@ def content_hash(files: Sequence[Path]) -> str:
 
 def read_files(files: SceneFiles) -> list[Path]:
     """Everything that is read of a scene, each once: files, and folders of which everything is."""
-    read = [path for path in (files.ply, files.cameras, files.images) if path is not None]
+    paths = [path for path in (files.ply, files.cameras, files.images) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
-        read += [root / name for name in BESIDE if (root / name).is_file()]
-        read += photos_of(files.cameras)
-    return list(dict.fromkeys(read))
+        paths += [root / name for name in EXTRA_FILES if (root / name).is_file()]
+        paths += photos_of(files.cameras)
+    return list(dict.fromkeys(paths))
 
 
 def photos_of(cameras: Path) -> list[Path]:
-    """Where the photos of a camera file may be found by its names or beside it."""
-    read = cameras_of(cameras)
+    """Where the photos of a camera file may be, by its names or next to it."""
+    camera_file = cameras_of(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
-    named = [root / name for name in (() if read is None else read.names) if (root / name).is_file()]
+    named = [root / name for name in (() if camera_file is None else camera_file.names) if (root / name).is_file()]
     return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
 
 
 def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
-    """The cameras of a file; None where it cannot be read, which is told when the scene is."""
+    """The cameras of a file; None where it cannot be read, which is reported when the scene is read."""
     try:
         return read_cameras(path, scene=scene)
     except SceneError:

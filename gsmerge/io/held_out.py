@@ -1,4 +1,4 @@
-"""Held-out photos with their cameras, in the frame of a scene: what its renders are judged by."""
+"""Held-out photos with their cameras, in the frame of a scene: what its renders are compared with."""
 
 from __future__ import annotations
 
@@ -10,28 +10,26 @@ import numpy as np
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.grid import as_pinholes, photo_size
-from gsmerge.io.alignment.poses import reread, with_poses
-from gsmerge.io.alignment.similarity import SAME, Frame
+from gsmerge.io.alignment.similarity import IDENTITY, Similarity
 from gsmerge.io.cameras import read_cameras, to_cameras
-from gsmerge.io.cameras.camera_file import CameraFile, select_views
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, with_convention, with_poses
+from gsmerge.io.cameras.lens import as_pinholes
 from gsmerge.io.hints import AUTO
-from gsmerge.io.photo_size import lighter_photos
-from gsmerge.io.photos import as_tensor, find_image
+from gsmerge.io.photos import as_tensor, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
-from gsmerge.io.views import stored_photos
+from gsmerge.io.views import limit_photo_size, stored_photos
 from gsmerge.types import Cameras, PixelScene, UnalignedScene
 
-_MAX_TURN = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
+_MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other
 _MAX_SHIFT = 0.005  # of the distance between the views
-_MIN_SHARED = 3  # views that tell how two worlds lie to one another
+_MIN_SHARED = 3  # views that determine how two worlds lie to one another
 _SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotation: the very same view
 
 
 @dataclass(frozen=True)
-class Targets:
-    """Views that were no input.
+class HeldOutViews:
+    """t views that were no input.
 
     Args:
         cameras: Their cameras, in the frame of the scene's Gaussians.
@@ -53,17 +51,17 @@ class Targets:
         return len(self.cameras)
 
 
-def read_targets(
+def read_held_out(
     load: SceneLoad, cameras: str | os.PathLike[str], images: str | os.PathLike[str] | None = None
-) -> Targets:
+) -> HeldOutViews:
     """Read held-out photos and their cameras.
 
-    Views that the scene was made of are left out. Where the file has those too, under the same names, their poses tell
-    how its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras. Poses
-    that the scene's cameras have in another convention than their format are read in that one here, too.
+    Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
+    determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's own
+    cameras. If the poses of the scene's cameras had to be read in another convention than their format's, so are these.
 
     Args:
-        load: The scene, with what was found on reading it.
+        load: The scene.
         cameras: Any camera file or folder that scenes may have.
         images: Folder of the photos; None: where the camera file says.
 
@@ -73,24 +71,26 @@ def read_targets(
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    read = read_cameras(path, scene=load.files.ply.stem)
-    tried = [(one, *_world(one, _shared_views(one, load.scene.names), load)) for one in _readings(read, load)]
-    read, world, shared = next((found for found in tried if found[2]), tried[0])
-    moved = world.move_cameras(read.viewmats.numpy())
+    camera_file = read_cameras(path, scene=load.files.ply.stem)
+    readings = [
+        (one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in _readings(camera_file, load)
+    ]
+    camera_file, world, shared = next((reading for reading in readings if reading[2]), readings[0])
+    moved = world.move_viewmats(camera_file.viewmats.numpy())
     shared |= _repeated(moved, load.scene)
-    places = [i for i in range(len(read)) if i not in shared]
+    places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
         raise SceneError(path, "expected views that the scene was not made of, found none")
-    chosen = select_views(read, places)
+    chosen = select_views(camera_file, places)
     photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
     if photos is None:
         raise SceneError(path, f"no photo found for {_missing(path, chosen)}", "name their folder with --target-images")
-    straight, photos, _ = as_pinholes(chosen, photos)
-    photos, notes = lighter_photos(photos, 0, AUTO.max_side, loose=False)
+    pinholes, photos, _ = as_pinholes(chosen, photos)
+    photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
     assert photos is not None
-    at_size = to_cameras(straight, photo_size(photos))
+    at_size = to_cameras(pinholes, photo_size(photos))
     inverse = {view: place for place, view in shared.items()}
-    return Targets(
+    return HeldOutViews(
         with_poses(at_size, moved[places]),
         as_tensor(photos),
         chosen.names,
@@ -100,12 +100,12 @@ def read_targets(
     )
 
 
-def _readings(read: CameraFile, load: SceneLoad) -> list[CameraFile]:
+def _readings(camera_file: CameraFile, load: SceneLoad) -> list[CameraFile]:
     """The file as it may be meant, the likeliest first: as the scene's cameras of the same format had to be read."""
     own = load.cameras
-    if own is None or own.source != read.source or own.convention == read.convention:
-        return [read]
-    return [reread(read, own.convention), read]
+    if own is None or own.source != camera_file.source or own.convention == camera_file.convention:
+        return [camera_file]
+    return [with_convention(camera_file, own.convention), camera_file]
 
 
 def _missing(path: Path, cameras: CameraFile) -> str:
@@ -115,7 +115,7 @@ def _missing(path: Path, cameras: CameraFile) -> str:
 
 
 def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | None) -> Path | None:
-    """Where the photos are: as told, or in a folder beside cameras that do not say it."""
+    """Where the photos are: as given, or in a folder next to cameras that do not say it."""
     if images is not None:
         if not Path(images).is_dir():
             raise SceneError(images, "expected a folder of photos")
@@ -128,9 +128,9 @@ def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | No
     return next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
 
 
-def _shared_views(read: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
+def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
     """Index in the file -> view of the scene, for views that both name; empty if stems are not unique."""
-    stems = [PurePosixPath(name.replace("\\", "/")).stem for name in read.names]
+    stems = [PurePosixPath(name.replace("\\", "/")).stem for name in camera_file.names]
     own = [PurePosixPath(name.replace("\\", "/")).stem for name in names]
     if len(set(stems)) < len(stems) or len(set(own)) < len(own):
         return {}
@@ -138,38 +138,38 @@ def _shared_views(read: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
     return {place[stem]: view for view, stem in enumerate(own) if stem in place}
 
 
-def _world(read: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Frame, dict[int, int]]:
+def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
     """How the file's world lies to that of the Gaussians, and which of its views are the scene's by name and pose."""
-    stored = SAME if load.recovery is None else load.recovery.best.frame
+    stored = IDENTITY if load.recovery is None else load.recovery.best.frame
     if not named:
         return stored, {}
-    theirs = read.viewmats.numpy()[list(named)]
+    theirs = camera_file.viewmats.numpy()[list(named)]
     ours = load.scene.cameras.viewmats.double().numpy()[list(named.values())]
-    frames = [stored] + [similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
+    frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
     for frame in frames:
-        turn, shift = _disagreement(frame.move_cameras(theirs), ours)
-        if turn <= _MAX_TURN and shift <= _MAX_SHIFT:
+        angle, shift = _disagreement(frame.move_viewmats(theirs), ours)
+        if angle <= _MAX_ANGLE and shift <= _MAX_SHIFT:
             return frame, dict(named)
     return stored, {}
 
 
-def similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Frame:
-    """The frame that moves cameras onto their poses in another world, least squares.
+def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
+    """The similarity that moves cameras onto their poses in another world, least squares.
 
     Args:
         theirs: ``[c,4,4]`` world to camera.
         ours: The same cameras in the other world.
-        scale: Of the worlds, for cameras that all stand in one place and do not tell it.
+        scale: Of the worlds, for cameras that all stand in one place and do not determine it.
     """
-    turns = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
-    u, _, vt = np.linalg.svd(turns)
+    rotations = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
+    u, _, vt = np.linalg.svd(rotations)
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     a, b = _centres(theirs) @ rotation.T, _centres(ours)
     a0, b0 = a - a.mean(0), b - b.mean(0)
     spread = float((a0**2).sum())
     if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(ours) > 1:
         scale = float((a0 * b0).sum()) / spread
-    return Frame(rotation, scale, b.mean(0) - scale * a.mean(0))
+    return Similarity(rotation, scale, b.mean(0) - scale * a.mean(0))
 
 
 def _centres(viewmats: np.ndarray) -> np.ndarray:

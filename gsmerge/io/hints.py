@@ -1,4 +1,4 @@
-"""What a caller tells about a file instead of leaving it to be found out."""
+"""What a caller may say about a file instead of having it detected."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ QUATS: tuple[str, ...] = get_args(QuatChoice)
 
 @dataclass(frozen=True)
 class ReadHints:
-    """How to read a file where its values do not tell, or tell something wrong.
+    """How to read a file where its values do not show it, or mislead.
 
     Args:
-        exporter: Which exporter wrote it, a name of :data:`gsmerge.io.exporters.EXPORTERS`; "auto": found out.
-        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are taken,
-            where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
+        exporter: Which exporter wrote it, a name of :data:`gsmerge.io.exporters.EXPORTERS`; "auto": recognised.
+        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are
+            used, where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
             "auto": as the exporter says, and checked against the surface where the pixels are known.
         order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
             pixels.
-        scene_scale: Size of the Gaussians' world in units of the cameras'; None: found out.
-        max_side: Longest side, pixels, at which views are worked on whose Gaussians belong to no pixels.
+        scene_scale: Size of the Gaussians' world in units of the cameras'; None: solved for.
+        max_side: Longest side of the views of unaligned Gaussians, pixels; larger ones are resized.
 
     Raises:
         ValueError: If a value is none of the possible ones.
@@ -50,7 +50,7 @@ AUTO = ReadHints()
 
 
 def make_hints(values: Mapping[str, Any]) -> ReadHints:
-    """A reading from keyword arguments.
+    """Hints from keyword arguments.
 
     Raises:
         ValueError: If one is unknown or none of its possible values.
@@ -63,5 +63,5 @@ def make_hints(values: Mapping[str, Any]) -> ReadHints:
 
 
 def _listed(names: Any) -> str:
-    *most, last = (repr(name) for name in names)
-    return f"{', '.join(most)} or {last}"
+    *first, last = (repr(name) for name in names)
+    return f"{', '.join(first)} or {last}"

@@ -1,26 +1,39 @@
-"""Photos of a scene, found by name and decoded in parallel."""
+"""Photos of a scene: found by name, decoded in parallel, resized and cropped."""
 
 from __future__ import annotations
 
 import io
 import os
 import re
+import struct
+import warnings
+import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io.image_header import stored_size, told_size
-from gsmerge.io.png import SIGNATURE, checked_png
+from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels
 from gsmerge.runtime.threads import parallel_map
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
+_FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
+_WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
+_MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
+ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
+_PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 ImageSource = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+Photos = Sequence[np.ndarray] | np.ndarray  # c of [h,w,3], uint8 sRGB
+Size = tuple[int, int]  # width, height, pixels
 
 
 def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
@@ -28,8 +41,8 @@ def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
 
     Args:
         source: A folder (with its sub-folders), or the image files themselves.
-        names: One name per view, as camera files give them: with or without folders and extension. If no name is
-            found but there are as many images as names, the images are taken in order (of their names with numbers
+        names: One name per view, as camera files give them: with or without folders and extension. If no name
+            matches but there are as many images as names, the images are taken in order (of their names with numbers
             counted as numbers, or of the list).
 
     Returns:
@@ -44,19 +57,36 @@ def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
 def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]:
     """:func:`read_images` as c arrays ``[h,w,3]`` uint8."""
     paths = match_images(source, names)
-    sizes = [stored_size(path) for path in paths]
+    sizes = [image_size(path) for path in paths]
     for path, (w, h) in zip(paths, sizes, strict=True):
         if (w, h) != sizes[0]:
             w0, h0 = sizes[0]
             raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
-    return parallel_map(_decode, paths)
+
+    def read(item: tuple[Path, Size]) -> np.ndarray:
+        try:
+            return _decode(item[0], np.fromfile(item[0], np.uint8), item[1])
+        except OSError as error:
+            raise SceneError(item[0], f"cannot be read ({error.strerror})") from error
+
+    return parallel_map(read, list(zip(paths, sizes, strict=True)))
 
 
-def as_tensor(images: Sequence[np.ndarray] | np.ndarray) -> Tensor:
+def as_tensor(images: Photos) -> Tensor:
     """``[c,h,w,3]`` float32 in [0, 1] from c uint8 images of one size."""
     out = np.empty((len(images), *images[0].shape), np.float32)
     parallel_map(lambda i: np.multiply(images[i], np.float32(1 / 255), out=out[i]), range(len(images)))
     return torch.from_numpy(out)
+
+
+def photo_size(photos: Photos | None) -> Size | None:
+    """(width, height) of the photos; None without any."""
+    return None if photos is None else (photos[0].shape[1], photos[0].shape[0])
+
+
+def same_shape(one: Size, other: Size) -> bool:
+    """Whether two sizes have the same shape, except for rounding."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
@@ -71,21 +101,21 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         files = [Path(p) for p in source]
         root = files[0].parent if files else Path()
     keys = _index([f.relative_to(root) if f.is_relative_to(root) else f for f in files], files)
-    found = [_lookup(root, keys, name) for name in names]
-    if all(f is None for f in found) and len(files) == len(names):
+    matched = [_lookup(root, keys, name) for name in names]
+    paths = [path for path in matched if path is not None]
+    if not paths and len(files) == len(names):
         return files
-    missing = [name for name, f in zip(names, found, strict=True) if f is None]
-    if missing:
+    if len(paths) < len(names):
+        missing = names[matched.index(None)]
         raise SceneError(
             root,
-            f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing[0]}",
+            f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}",
             "add what is missing, or name the right folder with --images",
         )
-    matched = [f for f in found if f is not None]
-    if len(set(matched)) < len(matched):
-        twice = next(f for f in matched if matched.count(f) > 1)
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
         raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
-    return matched
+    return paths
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -102,24 +132,18 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """The image that a camera file beside it names, with or without its extension; None where there is none."""
+    """The image that a camera file next to it names, with or without its extension; None where there is none."""
     path = os.path.join(folder, name)
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
     return next((Path(c) for c in candidates if os.path.isfile(c)), None)
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) of an image, pixels."""
-    return stored_size(path)
 
 
 def _index(relative: Sequence[Path], files: Sequence[Path]) -> dict[str, list[Path]]:
     """Files by every ending of their path, with and without extension."""
     keys: dict[str, list[Path]] = {}
     for short, file in zip(relative, files, strict=True):
-        parts = short.parts
-        for i in range(len(parts)):
-            ending = PurePosixPath(*parts[i:])
+        for i in range(len(short.parts)):
+            ending = PurePosixPath(*short.parts[i:])
             for key in {str(ending), str(ending.with_suffix(""))}:
                 keys.setdefault(key, []).append(file)
     return keys
@@ -138,8 +162,46 @@ def _lookup(root: Path, keys: dict[str, list[Path]], name: str) -> Path | None:
     return None
 
 
-def decode_photos(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
-    """Images that lie in another file.
+def image_size(path: Path) -> Size:
+    """(width, height) that the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file says; its orientation is ignored.
+
+    Raises:
+        SceneError: If it is no such file, cannot be read, or says a size that no image of Gaussians has.
+    """
+    num_bytes = check_file(path)
+    try:
+        with path.open("rb") as file:
+            width, height = _header_size(path, file)
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
+        raise SceneError(path, f"expected an image of {width} x {height}, found {num_bytes >> 20} MiB for it")
+    return width, height
+
+
+def _header_size(path: Path, file: BinaryIO) -> Size:
+    start = file.read(24)
+    file.seek(0)
+    try:
+        if start[:8] == _PNG:  # Pillow refuses a PNG for damage outside its pixels as well
+            width, height = struct.unpack(">II", start[16:24])
+        else:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                image = Image.open(file, formats=_FORMATS)
+            tags = getattr(image, "tag_v2", None)
+            width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
+    except Image.DecompressionBombError as error:
+        problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels an image, found more"
+        raise SceneError(path, problem) from error
+    except Exception as error:  # whatever a damaged header makes the library raise
+        raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
+    check_pixels(path, width, height)
+    return width, height
+
+
+def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
+    """Images that are stored in another file.
 
     Args:
         path: That file, for messages.
@@ -153,7 +215,7 @@ def decode_photos(path: Path, names: Sequence[str], files: Sequence[np.ndarray],
     Raises:
         SceneError: If one cannot be decoded, two differ in size, or they are too many.
     """
-    sizes = [told_size(path, io.BytesIO(data.tobytes())) for data in files]
+    sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
     width, height = sizes[0]
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
@@ -163,27 +225,17 @@ def decode_photos(path: Path, names: Sequence[str], files: Sequence[np.ndarray],
             path, f"expected images of at most {limit >> 20} MiB, found {len(files)} of {width} x {height}"
         )
     out = np.empty((len(files), height, width, 3), np.uint8)
-    parallel_map(lambda i: np.copyto(out[i], _decoded(path, files[i], sizes[i])), range(len(files)))
+    parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
     return out
 
 
-def _decode(path: Path) -> np.ndarray:
-    """``[h,w,3]`` uint8 sRGB of an image file."""
-    size = stored_size(path)
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
-    return _decoded(path, data, size)
-
-
-def _decoded(path: Path, data: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:
     """``[h,w,3]`` uint8 sRGB. The orientation tag is ignored, as camera solvers do."""
     width, height = size
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    sound = checked_png(data) if data[: len(SIGNATURE)].tobytes() == SIGNATURE else data
+    pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data
     try:
-        image = cv2.imdecode(sound, flags) if sound is not None and len(sound) else None
+        image = cv2.imdecode(pixels, flags) if pixels is not None and len(pixels) else None
     except cv2.error:
         image = None
     if image is None:
@@ -191,3 +243,86 @@ def _decoded(path: Path, data: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if image.shape != (height, width, 3):
         raise SceneError(path, f"expected {width} x {height} pixels as its header says, found others", "replace it")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+
+
+def _png_pixels(data: np.ndarray) -> np.ndarray | None:
+    """A PNG file ``[b]`` uint8 without all that does not change its pixels; None where it is damaged.
+
+    The decoder prints lines of its own about damage, in colour profiles and texts as well.
+    """
+    view, start = np.ascontiguousarray(data).data, len(_PNG)
+    parts: list[bytes | memoryview] = [_PNG]
+    while start + 12 <= len(view):
+        length, kind = struct.unpack_from(">I4s", view, start)
+        end = start + 12 + length
+        if kind == b"IEND":
+            return np.frombuffer(b"".join([*parts, _PNG_END]), np.uint8)
+        if end > len(view) or (kind[:1].isupper() and kind not in _PNG_CHUNKS):
+            return None
+        if kind in _PNG_CHUNKS:
+            if zlib.crc32(view[start + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+                return None
+            parts.append(view[start:end])
+        start = end
+    return None
+
+
+@dataclass(frozen=True)
+class PhotoTransform:
+    """A photo is resized, then cropped: ``u' = scale_x u - left`` and ``v' = scale_y v - top``, pixels.
+
+    Args:
+        width: Of the result, pixels.
+        height: The same.
+        scale_x: Along the width.
+        scale_y: Along the height.
+        left: Columns cut off at the left.
+        top: Rows cut off at the top.
+    """
+
+    width: int
+    height: int
+    scale_x: float
+    scale_y: float
+    left: int = 0
+    top: int = 0
+
+    @property
+    def crops(self) -> bool:
+        """Whether anything is cut off."""
+        return bool(self.left or self.top)
+
+    @property
+    def description(self) -> str:
+        """What is done to a photo."""
+        return f"resized{' and centre-cropped' if self.crops else ''} to {self.width} x {self.height}"
+
+    def intrinsics(self, Ks: Tensor) -> Tensor:
+        """``[c,3,3]`` intrinsics of the result, float64."""
+        matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
+        return torch.tensor(matrix, dtype=torch.float64) @ Ks.double()
+
+    def photos(self, images: Photos) -> list[np.ndarray]:
+        """The results for c uint8 photos ``[h,w,3]``."""
+
+        def one(image: np.ndarray) -> np.ndarray:
+            height, width = image.shape[:2]
+            size = round(width * self.scale_x), round(height * self.scale_y)
+            shrinks = size[0] * size[1] < width * height
+            whole = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+            return np.ascontiguousarray(whole[self.top : self.top + self.height, self.left : self.left + self.width])
+
+        return parallel_map(one, list(images))
+
+
+def resize_to(size: Size, to: Size) -> PhotoTransform:
+    """Each side is scaled by itself."""
+    return PhotoTransform(*to, to[0] / size[0], to[1] / size[1])
+
+
+def resize_and_crop(size: Size, to: Size, scale: float | None = None) -> PhotoTransform:
+    """Both sides are scaled alike, rounded to whole pixels, and centre-cropped; None scales until ``to`` is covered."""
+    if scale is None:
+        scale = max(to[0] / size[0], to[1] / size[1])
+    width, height = (max(side, round(whole * scale)) for side, whole in zip(to, size, strict=True))
+    return PhotoTransform(*to, width / size[0], height / size[1], (width - to[0]) // 2, (height - to[1]) // 2)

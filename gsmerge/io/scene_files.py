@@ -17,7 +17,7 @@ from gsmerge.io.photos import list_images
 # The first that exists wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
-_NO_GAUSSIANS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # point clouds that others put there
+_POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 
 
@@ -27,8 +27,8 @@ class SceneFiles:
 
     Args:
         ply: The Gaussians.
-        cameras: Camera file or COLMAP folder; None if none was found.
-        images: Folder of images, or the ``.npz`` or ``.torch`` that holds them; None if none was found.
+        cameras: Camera file or COLMAP folder; None without any.
+        images: Folder of images, or the ``.npz`` or ``.torch`` that holds them; None without any.
     """
 
     ply: Path
@@ -44,14 +44,14 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files.
 
-    Looked through are the given folder, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above
+    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/`` and two above
     it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``, ``CAMERA_PLACES`` and
     ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
     are those that the model saw.
 
     Args:
         path: A ``.ply`` or a folder.
-        cameras: Named by the user: taken instead of what would be found.
+        cameras: Named by the user: used instead of searching.
         images: The same.
 
     Raises:
@@ -99,17 +99,17 @@ def _find_ply(folder: Path) -> Path:
     named = named_ply(folder)
     if named is not None:
         return named
-    found = other_plys(folder)
-    if not found:
+    others = other_plys(folder)
+    if not others:
         raise SceneError(folder, "expected a .ply file in the folder, found none")
-    if len(found) > 1:
-        names = ", ".join(p.name for p in found[:4])
-        raise SceneError(folder, f"expected one .ply file in the folder, found {len(found)} ({names})", "name one")
-    return found[0]
+    if len(others) > 1:
+        names = ", ".join(p.name for p in others[:4])
+        raise SceneError(folder, f"expected one .ply file in the folder, found {len(others)} ({names})", "name one")
+    return others[0]
 
 
 def named_ply(folder: Path) -> Path | None:
-    """The file in a folder that is the scene whatever lies beside it; None without one."""
+    """The file in a folder that is the scene whatever else is in it; None without one."""
     for place in PLY_PLACES:
         if (folder / place).is_file():
             return folder / place
@@ -118,9 +118,9 @@ def named_ply(folder: Path) -> Path | None:
 
 
 def other_plys(folder: Path) -> list[Path]:
-    """The other files right in a folder that may be scenes: no results of ours, no point clouds."""
+    """The other files directly in a folder that may be scenes: no results of gsmerge, no point clouds."""
     return sorted(
         p
         for p in folder.glob("*.ply")
-        if not p.name.startswith(".") and not _RESULT.search(p.name) and p.name not in _NO_GAUSSIANS
+        if not p.name.startswith(".") and not _RESULT.search(p.name) and p.name not in _POINT_CLOUDS
     )

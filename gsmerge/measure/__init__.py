@@ -1,1 +1,1 @@
-"""What is measured: quality, size, speed, and pictures to look at."""
+"""Measuring: quality, size, speed, and pictures for people."""

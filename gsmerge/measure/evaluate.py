@@ -1,10 +1,11 @@
-"""What compact scenes are worth: their renders against photos, view by view, beside the input's own."""
+"""The quality of compact scenes: their renders compared with photos, view by view, next to the input's own."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -23,8 +24,8 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
-LITTLE = 0.1  # share of the held-out pixels that input views have seen; less is odd
-INPUT = "input"  # what the scene itself is called among the results
+MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
+INPUT = "input"  # name of the scene itself among the results
 Progress = Callable[[str, int, int], None]
 
 
@@ -59,7 +60,7 @@ class EvaluateOptions:
 
 @dataclass(frozen=True)
 class Views:
-    """Views with what they should look like.
+    """Views with their photos.
 
     Args:
         cameras: v cameras, in the scene's world.
@@ -74,12 +75,12 @@ class Views:
 
 @dataclass(frozen=True)
 class Quality:
-    """How near a picture is to another one; None where it was not measured.
+    """How close an image is to another one; None where it was not measured.
 
     Args:
         psnr: dB; inf for equal pictures.
         ssim: At most 1.
-        lpips_vgg: At least 0, lower is nearer.
+        lpips_vgg: At least 0, lower is closer.
         lpips_alex: The same with AlexNet.
     """
 
@@ -109,7 +110,7 @@ class ViewScore:
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class ResultScores:
     """One result.
 
     Args:
@@ -141,10 +142,10 @@ class Evaluation:
         reference: "photos"; "renders of the input" where there are none, "photos, and renders of the input in its own
             views" where there are none of those alone.
         num_views: Views by split.
-        notes: Things worth telling, one sentence each.
+        notes: Warnings, one sentence each.
     """
 
-    results: tuple[Evaluated, ...]
+    results: tuple[ResultScores, ...]
     reference: str
     num_views: dict[str, int]
     notes: tuple[str, ...]
@@ -161,9 +162,9 @@ def evaluate(
     """Measure compact results, and the scene itself, on its input views and on held-out ones.
 
     Args:
-        scene: The input. Without photos its own renders are what results are compared with.
+        scene: The input. Without photos, results are compared with its own renders.
         results: Gaussians by name, in the scene's world.
-        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_targets`; None: input views alone.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_held_out`; None: input views alone.
         options: What is measured.
         progress: Called with ("evaluate", done, total) after each result.
 
@@ -181,18 +182,16 @@ def evaluate(
         near = near_plane(scene)
         points = context_points(scene, near)
         splits = _splits(scene, own, targets, options, near)
-        judged = [
-            (name, views, visible_pixels(points, views.cameras, near, scene.cameras)) for name, views in splits.items()
-        ]
-        out = []
-        every = {INPUT: own, **results} if options.own else dict(results)
-        _image(own[:1], scene.cameras, 0, near)  # loads the kernels, which is no one's time
-        for i, (name, gaussians) in enumerate(every.items()):
-            out.append(_evaluated(name, gaussians, len(own), judged, options, near))
+        visible = {name: visible_pixels(points, views.cameras, near, scene.cameras) for name, views in splits.items()}
+        scores = []
+        named = {INPUT: own, **results} if options.own else dict(results)
+        _image(own[:1], scene.cameras, 0, near)  # loads the kernels, so that no result's time contains that
+        for i, (name, gaussians) in enumerate(named.items()):
+            scores.append(_score_result(name, gaussians, len(own), splits, visible, options, near))
             if progress:
-                progress("evaluate", i + 1, len(every))
+                progress("evaluate", i + 1, len(named))
     counts = {name: len(views.names) for name, views in splits.items()}
-    return Evaluation(tuple(out), _reference(scene, counts), counts, _notes(judged))
+    return Evaluation(tuple(scores), _reference(scene, counts), counts, _notes(visible))
 
 
 def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) -> str:
@@ -203,7 +202,7 @@ def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) ->
 
 
 def near_plane(scene: PixelScene | UnalignedScene) -> float:
-    """Nearest depth that is drawn where a scene and its results are compared, world units.
+    """Near plane where a scene and its results are compared, world units.
 
     Raises:
         ValueError: If there is no valid Gaussian or no view.
@@ -211,12 +210,11 @@ def near_plane(scene: PixelScene | UnalignedScene) -> float:
     return NEAR * scene_frame(scene).unit
 
 
-def _notes(judged: Sequence[tuple[str, Views, NDArray[np.bool_]]]) -> tuple[str, ...]:
-    shares = {split: float(visible.mean()) for split, _, visible in judged}
-    if "target" not in shares:
+def _notes(visible: Mapping[str, NDArray[np.bool_]]) -> tuple[str, ...]:
+    if "target" not in visible:
         return ("no held-out views were given: input views flatter what was fitted to them",)
-    if shares["target"] < LITTLE:
-        share = f"{100 * shares['target']:.0f} %"
+    if visible["target"].mean() < MIN_SEEN_SHARE:
+        share = f"{100 * visible['target'].mean():.0f} %"
         return (f"the input views have seen {share} of the held-out views: are those of the same world?",)
     return ()
 
@@ -224,7 +222,7 @@ def _notes(judged: Sequence[tuple[str, Views, NDArray[np.bool_]]]) -> tuple[str,
 def _splits(
     scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, near: float
 ) -> dict[str, Views]:
-    """The views by split, with what they should look like."""
+    """The views by split, with their photos or the input's renders."""
     splits = {}
     if options.context or targets is None:
         images = scene.images
@@ -236,29 +234,32 @@ def _splits(
     return splits
 
 
-def _evaluated(
+def _score_result(
     name: str,
     gaussians: Gaussians,
     num_input: int,
-    judged: Sequence[tuple[str, Views, NDArray[np.bool_]]],
+    splits: Mapping[str, Views],
+    visible: Mapping[str, NDArray[np.bool_]],
     options: EvaluateOptions,
     near: float,
-) -> Evaluated:
+) -> ResultScores:
     scores: list[ViewScore] = []
     seconds, count = 0.0, 0
-    for split, views, visible in judged:
+    for split, views in splits.items():
         perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
         for i, view in enumerate(views.names):
             start = time.perf_counter()
             image = _image(gaussians, views.cameras, i, near)
             seconds, count = seconds + time.perf_counter() - start, count + 1
             nets = options.lpips if i in perceptual else ()
-            scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[i], nets))
-    return Evaluated(name, len(gaussians), len(gaussians) / max(num_input, 1), seconds / max(count, 1), tuple(scores))
+            scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[split][i], nets))
+    return ResultScores(
+        name, len(gaussians), len(gaussians) / max(num_input, 1), seconds / max(count, 1), tuple(scores)
+    )
 
 
 def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
-    """``[h,w,3]``: one view, as every view is drawn here, so that equal Gaussians give equal pictures."""
+    """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
     return render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
 
 
@@ -272,22 +273,17 @@ def _score(
 
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
-    found = Quality(psnr=psnr(image, photo, mask), ssim=_ssim(image, photo, mask))
-    large = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
-    return replace(found, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in large})
+    similarity: float | None = None
+    with suppress(ValueError):  # no window lies inside the image
+        similarity = ssim(image, photo, mask)
+    side = min(image.shape[:2])
+    distances = {f"lpips_{net}": lpips(image, photo, net, mask) for net in nets if side >= min_size(net)}
+    return Quality(psnr(image, photo, mask), similarity, **distances)
 
 
-def _ssim(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None) -> float | None:
-    """None where no window of it is inside of the picture."""
-    try:
-        return ssim(image, photo, mask)
-    except ValueError:
-        return None
-
-
-def _mean(found: Sequence[Quality]) -> Quality:
+def _mean(scores: Sequence[Quality]) -> Quality:
     means = {}
     for field in fields(Quality):
-        values = [v for q in found if (v := getattr(q, field.name)) is not None]
+        values = [value for score in scores if (value := getattr(score, field.name)) is not None]
         means[field.name] = float(np.mean(values)) if values else None
     return Quality(**means)

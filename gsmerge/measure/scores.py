@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from gsmerge.measure.evaluate import Evaluated, Evaluation, Quality
+from gsmerge.measure.evaluate import Evaluation, Quality, ResultScores
 from gsmerge.report import document_head, human_bytes
 
 METRICS = tuple(field.name for field in fields(Quality))
@@ -42,7 +42,7 @@ def evaluation_document(
     }
 
 
-def _result(one: Evaluated, splits: Mapping[str, int], file: Mapping[str, Any]) -> dict[str, Any]:
+def _result(one: ResultScores, splits: Mapping[str, int], file: Mapping[str, Any]) -> dict[str, Any]:
     means = {}
     for split in splits:
         full, masked = one.mean(split)

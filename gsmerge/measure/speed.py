@@ -1,4 +1,4 @@
-"""How long scenes take to draw, and how many Gaussians a pixel of theirs costs."""
+"""Render time of scenes, and how many Gaussians are blended into a pixel."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
 from gsmerge.views import pick_views
 
-VIEWS, REPEATS = 3, 3  # that are drawn: evenly spread, each so many times
-_MOST_REPEATED = 2.0  # seconds; what takes longer is drawn once
+NUM_VIEWS, REPEATS = 3, 3  # evenly spread views that are rendered, each so many times
+MAX_REPEATED_SECONDS = 2.0  # what takes longer is rendered once
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Time to draw one view of a scene.
+    """Time to render one view of a scene.
 
     Args:
         device: "cpu" or "cuda".
         width: Of the picture, pixels.
         height: The same.
-        threads: Processor threads that drew it; 0 on a GPU.
-        seconds: Mean over some views of the quickest of some tries.
+        threads: Processor threads that rendered it; 0 on a GPU.
+        seconds: Mean over some views of the shortest of some repetitions.
     """
 
     device: str
@@ -40,7 +40,7 @@ class Speed:
 
 
 def resized(cameras: Cameras, long_side: int) -> Cameras:
-    """The same cameras with pictures whose longer side has so many pixels."""
+    """The same cameras with images whose longer side has ``long_side`` pixels."""
     factor = long_side / max(cameras.width, cameras.height)
     size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
     scale = torch.tensor([size[0] / cameras.width, size[1] / cameras.height, 1.0], dtype=cameras.Ks.dtype)
@@ -55,43 +55,42 @@ def measure_speeds(
     *,
     threads: int | None = None,
 ) -> dict[str, tuple[Speed, ...]]:
-    """Draw scenes from the same views at several sizes.
+    """Render scenes from the same views at several sizes, also with CUDA where it can be used.
 
-    The scenes take turns, so that a machine that slows down slows all of them. Where CUDA can be used, it is measured
-    too.
+    The scenes take turns, so that a machine that slows down slows all of them.
 
     Args:
         scenes: Gaussians by name.
-        cameras: Views; some of them are drawn.
+        cameras: Views; some of them are rendered.
         long_sides: Pixels along the longer side.
-        near: Nearest depth that is drawn, world units.
-        threads: To draw with on the processor; None: all.
+        near: Near plane, world units.
+        threads: Threads on the processor; None: all.
     """
-    few = cameras[pick_views(len(cameras), VIEWS)]
-    found: dict[str, list[Speed]] = {name: [] for name in scenes}
+    few = cameras[pick_views(len(cameras), NUM_VIEWS)]
+    speeds: dict[str, list[Speed]] = {name: [] for name in scenes}
     with use_threads(threads) as used:
         for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
             placed = {name: gaussians.to(device) for name, gaussians in scenes.items()}
             for side in long_sides:
                 views = resized(few, side)
-                for name, seconds in _turns(placed, views.to(device), near).items():
+                for name, seconds in _time_in_turns(placed, views.to(device), near).items():
                     count = used if device == "cpu" else 0
-                    found[name].append(Speed(device, views.width, views.height, count, seconds))
-    return {name: tuple(speeds) for name, speeds in found.items()}
+                    speeds[name].append(Speed(device, views.width, views.height, count, seconds))
+    return {name: tuple(measured) for name, measured in speeds.items()}
 
 
-def _turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
+def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
     """Seconds per view of each scene, one after the other and again."""
-    quickest = {name: np.full(len(views), np.inf) for name in scenes}
+    shortest = {name: np.full(len(views), np.inf) for name in scenes}
     for gaussians in scenes.values():  # compiles, and fills caches
         _draw(gaussians, views[[0]], near)
     for turn in range(REPEATS):
         for name, gaussians in scenes.items():
-            if turn and quickest[name].max() > _MOST_REPEATED:
+            if turn and shortest[name].max() > MAX_REPEATED_SECONDS:
                 continue
             for view in range(len(views)):
-                quickest[name][view] = min(quickest[name][view], _draw(gaussians, views[[view]], near))
-    return {name: float(seconds.mean()) for name, seconds in quickest.items()}
+                shortest[name][view] = min(shortest[name][view], _draw(gaussians, views[[view]], near))
+    return {name: float(seconds.mean()) for name, seconds in shortest.items()}
 
 
 def _draw(gaussians: Gaussians, view: Cameras, near: float) -> float:
@@ -103,10 +102,10 @@ def _draw(gaussians: Gaussians, view: Cameras, near: float) -> float:
 
 
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Gaussians that are blended into a pixel, on average over some of the views: what drawing is made of."""
+    """Gaussians blended into a pixel, on average over some of the views: what render time depends on."""
     splats, entries, pixels = prepare(gaussians), 0, 0
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
-    for view in pick_views(len(cameras), VIEWS):
+    for view in pick_views(len(cameras), NUM_VIEWS):
         plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
         entries += len(view_weights(plan).lanes)
         pixels += cameras.width * cameras.height

@@ -1,4 +1,4 @@
-"""Which pixels of a view show what the input views have seen: the rest is extrapolation (supplement A)."""
+"""Which pixels of a view show what the input views have seen; the rest is extrapolation (supplement A)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
-_ROWS = 1 << 18  # points at a time: all of them, in every thread, would not fit
+_CHUNK = 1 << 18  # points at a time: all of them, in every thread, would take too much memory
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
 
 
@@ -42,14 +42,14 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """Pixels on which, or beside which, at least one of the points falls, whatever lies before it.
+    """Pixels on which, or next to which, at least one of the points falls, whatever occludes it.
 
     Args:
         points: ``[n,3]`` depth samples of the input views, see :func:`context_points`.
-        cameras: The views to be judged.
+        cameras: The views to be scored.
         near: Samples nearer than this do not count, world units.
-        sources: The input views: where those that are judged have pixels that are so much smaller, a sample marks so
-            many more, since samples would leave gaps otherwise; None: pixels of the same size.
+        sources: The input views: where the scored views have smaller pixels, a sample marks proportionally more of
+            them, as there would be gaps otherwise; None: pixels of the same size.
 
     Returns:
         ``[c,h,w]`` bool.
@@ -59,8 +59,8 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 
     def one_view(view: int) -> NDArray[np.bool_]:
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
-        for first in range(0, len(points), _ROWS):
-            some = points[first : first + _ROWS]
+        for first in range(0, len(points), _CHUNK):
+            some = points[first : first + _CHUNK]
             image = (some @ viewmats[view, :3, :3].T + viewmats[view, :3, 3]) @ Ks[view].T
             image = image[image[:, 2] > near]
             pixels = np.floor(image[:, :2] / image[:, 2:])

@@ -30,19 +30,12 @@ RunTable = Callable[[np.ndarray, int], Tensor]  # rows and width of a table -> [
 
 @dataclass(frozen=True, eq=False)
 class NetworkContext:
-    """The networks, and what they read besides the Feature Gaussians.
+    """The networks, and what they read besides the Feature Gaussians."""
 
-    Args:
-        networks: Encoder, merger, refiner and decoder heads.
-        members: The scene's Gaussians.
-        cameras: Its views.
-        seed: Chooses the members of groups that are too large to read whole.
-    """
-
-    networks: Networks
-    members: Members
-    cameras: Cameras
-    seed: int = 0
+    networks: Networks  # encoder, merger, refiner and decoder heads
+    members: Members  # the scene's Gaussians
+    cameras: Cameras  # its views
+    seed: int = 0  # chooses the members of groups that are too large to read whole
 
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """The inputs of the networks for Feature Gaussians."""
@@ -74,12 +67,7 @@ def run_tables(sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -
 
 
 def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Feature Gaussians with latents, and with means moved by the encoder (paper section 4.2).
-
-    Args:
-        features: g analytic Feature Gaussians.
-        context: The networks and the scene.
-    """
+    """Feature Gaussians with latents, and with means moved by the encoder (paper section 4.2)."""
     group_features = context.describe(features)
     encoded = run_encoder(features, group_features, context)
     return apply_encoding(features, group_features, encoded, context.networks)[0]

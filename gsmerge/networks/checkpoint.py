@@ -28,19 +28,12 @@ SHIPPED = Path(__file__).with_name("shipped.safetensors")
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Networks from a file.
+    """Networks from a file."""
 
-    Args:
-        networks: Ready for use, without gradients.
-        path: The file.
-        version: The gsmerge that wrote it.
-        training: Facts about the training, as the trainer wrote them.
-    """
-
-    networks: Networks
-    path: Path
-    version: str
-    training: Mapping[str, Any]
+    networks: Networks  # ready for use, without gradients
+    path: Path  # the file
+    version: str  # the gsmerge that wrote it
+    training: Mapping[str, Any]  # facts about the training, as the trainer wrote them
 
     def facts(self) -> dict[str, Any]:
         """Entry of a report."""
@@ -86,13 +79,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
 def build_networks(
     path: Path, options: Mapping[str, Any], tensors: Mapping[str, Tensor], remedy: str = REMEDY
 ) -> Networks:
-    """Networks from sizes and weights, ready for use.
-
-    Args:
-        path: The file that they are from.
-        options: Sizes, from ``asdict``.
-        tensors: Weights by name.
-        remedy: For the message, if they do not fit.
+    """Networks from sizes (as of ``asdict``) and weights by name; ``path`` and ``remedy`` are for the error.
 
     Raises:
         SceneError: If the sizes are out of range, or the weights do not fit them.

@@ -28,23 +28,14 @@ TINY = 1e-12  # world units; lengths are clamped to it before a division or loga
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians as the networks read them.
+    """Feature Gaussians as the networks read them."""
 
-    Args:
-        base: ``g`` Gaussians without corrections.
-        frames: ``[g,3,3]`` axes (right, down, away) as columns, world.
-        sizes: ``[g]`` geometric mean of the two largest scales, world units.
-        footprints: ``[g]`` size of one pixel, world units.
-        views: ``[g]`` int64 view that the frame belongs to.
-        group: ``[g,GROUP]`` numbers that describe the whole group.
-    """
-
-    base: Gaussians
-    frames: Tensor
-    sizes: Tensor
-    footprints: Tensor
-    views: Tensor
-    group: Tensor
+    base: Gaussians  # g Gaussians without corrections
+    frames: Tensor  # [g,3,3] axes (right, down, away) as columns, world
+    sizes: Tensor  # [g] geometric mean of the two largest scales, world units
+    footprints: Tensor  # [g] size of one pixel, world units
+    views: Tensor  # [g] int64 view that the frame belongs to
+    group: Tensor  # [g,GROUP] numbers that describe the whole group
 
 
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
@@ -122,13 +113,7 @@ def _image_tangents(means: Tensor, views: Tensor, cameras: Cameras) -> Tensor:
 
 
 def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor) -> Tensor:
-    """``[n,PART]``: Gaussians relative to the Feature Gaussians that they belong to.
-
-    Args:
-        parts: n Gaussians.
-        group_features: Of the Feature Gaussians.
-        owners: ``[n]`` the Feature Gaussian of each.
-    """
+    """``[n,PART]``: n Gaussians relative to the Feature Gaussians ``owners [n]`` that they belong to."""
     g = group_features
     frames = g.frames[owners].transpose(1, 2)
     normals = quat_to_rotmat(parts.quats)[torch.arange(len(parts)), :, parts.scales.argmin(1)]
@@ -147,14 +132,7 @@ def part_tokens(parts: Gaussians, group_features: GroupFeatures, owners: Tensor)
 
 
 def member_tokens(members: Members, ids: np.ndarray, group_features: GroupFeatures, owners: Tensor) -> Tensor:
-    """``[n,MEMBER]``: members of groups, relative to their Feature Gaussians.
-
-    Args:
-        members: The scene's Gaussians.
-        ids: ``[n]`` rows of them.
-        group_features: Of the Feature Gaussians.
-        owners: ``[n]`` the group of each.
-    """
+    """``[n,MEMBER]``: rows ``ids [n]`` of the members, relative to their Feature Gaussians ``owners [n]``."""
     columns = (members.means, members.quats, members.scales, members.opacities, members.sh0, members.shN[:, :0])
     picked = Gaussians(*(torch.from_numpy(column[ids]) for column in columns))
     tokens = part_tokens(picked, group_features, owners)

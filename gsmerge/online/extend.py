@@ -36,7 +36,7 @@ from gsmerge.online.state import (
     select_groups,
     with_fitted_colors,
 )
-from gsmerge.options import CompactOptions
+from gsmerge.options import CompactOptions, to_schema
 from gsmerge.pipeline import build, merge_views
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import Progress, RunLog
@@ -64,7 +64,7 @@ class BatchReport:
         seconds: Wall time of each stage.
         choices: What the stages decided.
         notes: Warnings, one sentence each.
-        options: All settings by flat name.
+        options: All settings, by their names in reports.
     """
 
     num_views: int
@@ -116,7 +116,7 @@ def extend(
         merged = merge_views(prepared, count, log)
         state, counts = _add_batch(state, prepared, merged, online, log)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
-    settings = options.to_dict() | asdict(online)
+    settings = to_schema(options.to_dict()) | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
     about = {"gsmerge": __version__, "options": stored, "batches": [*state.about.get("batches", []), numbers]}
     report = BatchReport(

@@ -142,7 +142,7 @@ def extend_file(
         raise UsageError(str(error)) from error
     with atomic_output(path, overwrite=identity is not None) as temporary:
         loaded = perf_counter()
-        given = read_input(files, options.segment, opacity=opacity, hints=hints)
+        given = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         state, report = extend(state, given.scene, options, online, progress=progress)
         done = perf_counter()

@@ -19,14 +19,16 @@ def _as_array(image: Array | Tensor) -> Array:
     return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
 
 
-def _pair(image: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+def image_pair(image: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+    """Two images ``[h,w,c]`` of one shape as arrays; a ValueError otherwise."""
     first, second = _as_array(image), _as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
     return first, second
 
 
-def _mask(mask: Array | Tensor, image: Array) -> Array:
+def pixel_mask(mask: Array | Tensor, image: Array) -> Array:
+    """``[h,w]`` bool of an image ``[h,w,c]``, at least one pixel; a ValueError otherwise."""
     chosen = _as_array(mask).astype(bool)
     if chosen.ndim == 3 and chosen.shape[2] == 1:
         chosen = chosen[..., 0]
@@ -51,9 +53,9 @@ def psnr(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor 
     Raises:
         ValueError: If the shapes differ or no pixel counts.
     """
-    first, second = _pair(image, reference)
+    first, second = image_pair(image, reference)
     squares = np.subtract(first, second, dtype=np.float64) ** 2
-    error = float(squares.mean() if mask is None else squares[_mask(mask, first)].mean())
+    error = float(squares.mean() if mask is None else squares[pixel_mask(mask, first)].mean())
     return -10 * float(np.log10(error)) if error > 0 else float("inf")
 
 
@@ -76,12 +78,12 @@ def ssim(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor 
     Raises:
         ValueError: If the shapes differ, the image is too small or no window counts.
     """
-    first, second = _pair(image, reference)
+    first, second = image_pair(image, reference)
     if min(first.shape[:2]) < WINDOW:
         raise ValueError(f"expected at least {WINDOW} x {WINDOW} pixels, got {list(first.shape[:2])}")
     border = WINDOW // 2
     inner = slice(border, -border), slice(border, -border)
-    chosen = None if mask is None else _mask(_mask(mask, first)[inner], first[inner])
+    chosen = None if mask is None else pixel_mask(pixel_mask(mask, first)[inner], first[inner])
     # Variances are small differences of large numbers: float32 does when values are centred first.
     x, y = first.astype(np.float32) - np.float32(0.5), second.astype(np.float32) - np.float32(0.5)
 

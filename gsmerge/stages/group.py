@@ -55,9 +55,7 @@ def count_limits(scene: PixelScene | UnalignedScene, options: CompactOptions) ->
     Raises:
         UsageError: If more superpixels are asked for than there are pixels, or fewer Gaussians than views.
     """
-    per_view, pixels = superpixels_per_view(scene, options), scene.pixels_per_view
-    if per_view > pixels:
-        raise UsageError(f"superpixels: expected at most {pixels}, one per pixel, got {per_view}")
+    per_view = superpixels_per_view(scene, options)
     default, max_count, exact = _counts(scene, options)
     photos = scene.images is not None
     return CountLimits(

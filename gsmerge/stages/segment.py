@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.errors import UsageError
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.sweeps import refine
@@ -73,8 +74,15 @@ def _check(segmentation: str, effort: str, compactness: float) -> None:
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Superpixels that ``options`` ask for in a view of this size."""
+    """Superpixels that ``options`` ask for in a view of this size.
+
+    Raises:
+        UsageError: If there are more than pixels.
+    """
     if options.superpixels is not None:
+        if options.superpixels > height * width:
+            limit = f"{height * width}, one per pixel of {width} x {height}"
+            raise UsageError(f"superpixels: expected at most {limit}, got {options.superpixels}")
         return options.superpixels
     return max(1, int(options.density * height * width))
 

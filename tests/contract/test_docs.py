@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import re
+import runpy
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +22,19 @@ import gsmerge
 from gsmerge.cli.app import app
 from gsmerge.io import ReadHints
 from gsmerge.options import METHODS
+from gsmerge.report import report_document
 
+ROOT = Path(__file__).parents[2]
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+
+
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
+GENERATED = {
+    page for page in PAGES if page.startswith(("docs/reference/commands/", "docs/reference/training-settings"))
+}
+WRITTEN = [page for page in PAGES if page not in GENERATED]
+# options of tools that pages name beside our own
+OTHER_OPTIONS = {"--version", "--help", "--install-completion", "--only", "--no-deps", "--force-reinstall", "--check"}
 
 
 def options(command: Any) -> set[str]:
@@ -26,9 +43,13 @@ def options(command: Any) -> set[str]:
     return {name for name in names if name.startswith("--")} - {"--help"}
 
 
-def readme_commands(root: Path) -> list[str]:
-    """Every ``gsmerge ...`` call in the README's shell blocks."""
-    blocks = re.findall(r"```bash\n(.*?)```", (root / "README.md").read_text(), re.DOTALL)
+def read(page: str) -> str:
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def calls_in(page: str) -> list[str]:
+    """Every ``gsmerge ...`` call in a page's shell blocks."""
+    blocks = re.findall(r"```(?:bash|console)\n(.*?)```", read(page), re.DOTALL)
     calls = (part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&"))
     return [re.sub(r"^\S*/", "", call) for call in calls if re.match(r"(\S*/)?gsmerge ", call)]
 
@@ -53,30 +74,82 @@ def test_commands_are_the_documented_ones() -> None:
     }
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_readme_shows_every_command(name: str, root: Path) -> None:
-    assert any(call.split()[1] == name for call in readme_commands(root))
+def test_generated_pages_are_up_to_date() -> None:
+    """The reference of the commands says what their help says."""
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "docs" / "generate_reference.py"), "--check"],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, f"run python docs/generate_reference.py to renew\n{done.stdout}{done.stderr}"
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_readme_names_every_option(name: str, root: Path) -> None:
-    text = (root / "README.md").read_text()
-    assert {option for option in options(COMMANDS[name]) if f"`{option}`" not in text} == set()
+def test_a_page_shows_every_command(name: str) -> None:
+    assert any(call.split()[1] == name for page in WRITTEN for call in calls_in(page))
 
 
-def test_readme_names_no_option_that_is_not_there(root: Path) -> None:
-    known = set().union(*(options(command) for command in COMMANDS.values()))
-    known |= {"--version", "--help", "--install-completion"}
-    named = set(re.findall(r"`(--[a-z-]+)`", (root / "README.md").read_text()))
+@pytest.mark.parametrize("page", WRITTEN)
+def test_pages_name_only_options_that_exist(page: str) -> None:
+    known = OTHER_OPTIONS.union(*(options(command) for command in COMMANDS.values()))
+    if page == "CHANGELOG.md":  # which names what was renamed, too
+        return
+    named = set(re.findall(r"`(--[a-z-]+)", read(page)))
     assert named - known == set()
 
 
-def test_readme_calls_parse(root: Path) -> None:
-    calls = readme_commands(root)
-    assert len(calls) >= 7
-    for call in calls:
+@pytest.mark.parametrize("page", [page for page in WRITTEN if calls_in(page)])
+def test_calls_parse(page: str) -> None:
+    for call in calls_in(page):
         _, name, *arguments = shlex.split(call, comments=True)
-        COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
+        if name not in ("--help", "--version", "COMMAND"):
+            COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
+
+
+@pytest.mark.parametrize("page", [page for page in WRITTEN if "```python" in read(page)])
+def test_python_uses_public_names(page: str) -> None:
+    for block in re.findall(r"```python\n(.*?)```", read(page), re.DOTALL):
+        compile(block, page, "exec")
+        for module, names in re.findall(r"^from (gsmerge[\w.]*) import ([\w, ]+)$", block, re.MULTILINE):
+            assert all(hasattr(import_module(module), name.strip()) for name in names.split(","))
+        for name in re.findall(r"\bgsmerge\.(\w+)", block):
+            assert hasattr(gsmerge, name) or name in ("io", "measure"), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page: str) -> None:
+    """Files and pictures exist, and sections have the headings that links name."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", read(page), flags=re.DOTALL)):
+        if "://" in target:
+            continue
+        name, _, section = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
+        assert path.exists(), target
+        if section:
+            headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert section in {re.sub(r"[^\w -]", "", h.lower()).strip().replace(" ", "-") for h in headings}, target
+
+
+def test_index_links_every_page() -> None:
+    index = read("docs/README.md")
+    pages = [page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")]
+    listed = [page for page in pages if page != "README.md" and not page.startswith("reference/commands/")]
+    assert [page for page in (*listed, "reference/commands/README.md") if f"]({page})" not in index] == []
+
+
+def test_readme_is_a_front_page() -> None:
+    """At most 8 KB, and a picture below 300 KB."""
+    assert len((ROOT / "README.md").read_bytes()) <= 8192
+    (picture,) = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", read("README.md"))
+    assert (ROOT / picture).stat().st_size < 300_000
+
+
+@pytest.mark.parametrize("folder", ["gsmerge", "docs", "examples", "benchmarks"])
+def test_plain_words(folder: str) -> None:
+    """Words that readers stumbled over do not come back."""
+    odd = re.compile(r"\b(told|rival|foreseen|dealt_out|hangs on|look_around)\b")
+    files = [path for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md", ".js", ".css")]
+    hits = [f"{path.relative_to(ROOT)}: {match[0]}" for path in files for match in odd.finditer(path.read_text())]
+    assert hits == []
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
@@ -87,7 +160,7 @@ def test_every_option_has_help(name: str) -> None:
 
 
 def cli_defaults() -> Iterator[tuple[str, str]]:
-    """Name and told default of those options of ``compact`` that leave the default to the library."""
+    """Name and default in help of those options of ``compact`` that leave the default to the library."""
     for param in COMMANDS["compact"].params:
         if isinstance(getattr(param, "show_default", None), str) and param.name not in (
             "output",
@@ -98,12 +171,12 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
             yield param.name, param.show_default
 
 
-def test_told_defaults_are_the_library_s() -> None:
+def test_defaults_in_help_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
-    told = dict(cli_defaults())
+    in_help = dict(cli_defaults())
     known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
     known |= {"levels", "device", "checkpoint", "geometry"}
-    assert set(told) == known
+    assert set(in_help) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None
     worded = {
@@ -111,25 +184,17 @@ def test_told_defaults_are_the_library_s() -> None:
         "fit_steps": "by effort",
         "match": "overlap, none for a draft",
     }
-    real = {name: worded.get(name, str(library[name])) for name in told}
-    assert told == real
+    real = {name: worded.get(name, str(library[name])) for name in in_help}
+    assert in_help == real
 
 
-def test_told_sizes_are_the_readers_own(root: Path) -> None:
+def test_default_of_max_side_is_the_reader_s() -> None:
     (param,) = (p for p in COMMANDS["compact"].params if p.name == "max_side")
     assert param.show_default == str(ReadHints().max_side)
-    assert f"| `--max-side` | {ReadHints().max_side} |" in (root / "README.md").read_text()
 
 
-def test_readme_s_defaults_are_the_library_s(root: Path) -> None:
-    rows = re.findall(r"^\| `--([a-z-]+)`[^|]*\| ([^|]*) \|", (root / "README.md").read_text(), re.MULTILINE)
-    told = dict(rows)
-    for name, default in cli_defaults():
-        assert told[name.replace("_", "-")].replace("`", "") == default
-
-
-def test_readme_lists_every_method(root: Path) -> None:
-    text = (root / "README.md").read_text()
+def test_every_method_is_described() -> None:
+    text = read("docs/guide/baselines.md")
     assert [method for method in METHODS if f"| `{method}` |" not in text] == []
 
 
@@ -140,6 +205,20 @@ def test_every_option_is_a_field_of_the_api() -> None:
     own |= {"exporter", "quats", "order", "scene-scale", "max-side"}
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
     assert {name.replace("-", "_") for name in names} - fields == set()
+
+
+def test_every_key_of_the_report_is_described() -> None:
+    """Keys of the JSON report of ``compact`` that the program names, see :func:`gsmerge.report.report_document`."""
+    source = inspect.getsource(report_document)
+    keys = set(re.findall(r'^ {8}"(\w+)":', source, re.MULTILINE)) | {f.name for f in fields(gsmerge.CompactReport)}
+    text = read("docs/reference/report.md")
+    assert {key for key in keys if f"`{key}`" not in text} == set()
+
+
+def test_contributing_names_every_task() -> None:
+    tasks = runpy.run_path(str(ROOT / "tasks.py"))["TASKS"]
+    text = read("CONTRIBUTING.md")
+    assert [name for name in tasks if f"python tasks.py {name}" not in text] == []
 
 
 def test_changelog_starts_with_unreleased(root: Path) -> None:
@@ -160,14 +239,14 @@ def test_constraints_pin_every_dependency(root: Path) -> None:
 
 
 def test_architecture_names_every_module(root: Path) -> None:
-    text = (root / "docs" / "architecture.md").read_text()
+    text = (root / "docs" / "internals" / "architecture.md").read_text()
     modules = {path.stem for path in (root / "gsmerge").iterdir() if not path.name.startswith("_")} - {"py"}
     assert {name for name in modules if f"`{name}`" not in text and f"`{name}/`" not in text} == set()
 
 
 def stability_rows(root: Path) -> list[tuple[str, str]]:
     """Number and test column of every case."""
-    rows = [line.split("|") for line in (root / "docs" / "stability.md").read_text().splitlines()]
+    rows = [line.split("|") for line in (root / "docs" / "internals" / "stability.md").read_text().splitlines()]
     return [(row[1].strip(), row[4]) for row in rows if len(row) > 5 and row[1].strip()[:1].isdigit()]
 
 
@@ -193,6 +272,6 @@ def test_generator_names_every_range_style_and_path(root: Path) -> None:
     from gsmerge.research.generate.paths import PATHS
     from gsmerge.research.generate.styles import STYLES
 
-    text = (root / "docs" / "generator.md").read_text()
+    text = (root / "docs" / "internals" / "generator.md").read_text()
     names = [f.name for f in fields(NoiseOptions)] + [*STYLES, *PATHS]
     assert [name for name in names if f"`{name}`" not in text] == []

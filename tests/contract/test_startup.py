@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -41,7 +43,7 @@ def test_import_loads_nothing_heavy() -> None:
     assert loaded_after("import gsmerge") == set()
 
 
-def test_missing_file_is_told_without_torch_loading_twice() -> None:
+def test_missing_file_is_one_line() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "gsmerge", "compact", "nowhere.ply"], capture_output=True, text=True, check=False
     )
@@ -59,3 +61,17 @@ def test_submodule_imports_do_not_hide_functions() -> None:
         "function",
     ]
     assert run_python(f"import gsmerge.pipeline\n{print_kinds}").split() == ["function", "function"]
+
+
+def test_a_damaged_opencv_names_the_remedy(tmp_path: Path, made_scene: Path) -> None:
+    """Uninstalling one of several opencv packages leaves a module cv2 without its parts."""
+    (tmp_path / "cv2").mkdir()
+    (tmp_path / "cv2" / "__init__.py").touch()
+    done = subprocess.run(
+        [sys.executable, "-m", "gsmerge", "inspect", str(made_scene)],
+        capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}"},
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "--force-reinstall opencv-contrib-python-headless" in done.stderr

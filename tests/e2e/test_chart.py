@@ -11,7 +11,7 @@ import pytest
 
 import gsmerge
 from gsmerge.research.charts import run as running
-from gsmerge.research.charts.store import read_runs
+from gsmerge.research.charts.record import read_runs
 
 from .conftest import Outcome, Run, listing
 

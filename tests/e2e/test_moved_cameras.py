@@ -83,4 +83,4 @@ def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run:
     path.write_text(json.dumps(data))
     outcome = run("render", scene_copy, "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
-    assert "the cameras do not fit the Gaussians and stand as their file has them" in outcome.err
+    assert "the cameras do not fit the Gaussians and stay as their file has them" in outcome.err

@@ -14,7 +14,7 @@ from learned import SMALL, noisy, written
 from gsmerge.cli.train import find_training_scenes
 from gsmerge.networks import load_checkpoint
 from gsmerge.research.training import TrainOptions, read_examples
-from gsmerge.research.training.photometric import window_psnr
+from gsmerge.research.training.losses import window_psnr
 from gsmerge.research.training.windows import whole_photo
 
 from .conftest import Run, listing

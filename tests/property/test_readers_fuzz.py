@@ -25,7 +25,7 @@ from gsmerge.io import read_cameras, read_images, read_ply
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.da3 import read_depths
 from gsmerge.io.cameras.sharp import read_sharp
-from gsmerge.io.formats.ply_layout import REQUIRED
+from gsmerge.io.formats.ply_file import REQUIRED
 
 EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "40"))
 ROWS = 3
@@ -238,10 +238,10 @@ def arrays(draw: st.DrawFn) -> np.ndarray:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if draw(st.booleans()) and dtype[0] in "fui":
         return (np.eye(*shape[-2:]) if len(shape) > 1 else np.ones(1)).astype(dtype) * np.ones(shape, dtype)
-    filled = (raw * (size // len(raw) + 1))[:size]
+    fill_template = (raw * (size // len(raw) + 1))[:size]
     if dtype == "U3":
         return np.full(shape, "1a")
-    return np.frombuffer(bytes(b & 1 for b in filled) if dtype == "?" else filled, dtype).reshape(shape)
+    return np.frombuffer(bytes(b & 1 for b in fill_template) if dtype == "?" else fill_template, dtype).reshape(shape)
 
 
 def check_npz(path: Path) -> None:

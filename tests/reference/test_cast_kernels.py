@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET, cast, light_seen
-from gsmerge.research.generate.shapes import NO_WAVES, Look, Packed, Shape, packed
+from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, SHEET, add_light, cast
+from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack
 
 FAR, STEPS = 12.0, 60_000
 KINDS = {"quad": QUAD, "box": BOX, "ellipsoid": ELLIPSOID, "cone": CONE, "leaf": LEAF, "blob": BLOB, "sheet": SHEET}
@@ -25,7 +25,7 @@ def random_shape(kind: int, rng: np.random.Generator) -> Shape:
         numbers = rng.normal(0, 2, (4, 3)) * ([1, 1, 1] if kind == BLOB else [1, 1, 0])
         waves = np.concatenate([numbers, rng.uniform(0, 6, (4, 1)), rng.uniform(0.02, 0.06, (4, 1))], 1)
     size = (*rng.uniform(0.5, 1.2, 3), rng.uniform(0.3, 1.6))
-    return Shape(kind, size, Look(0), np.array([0, 0, 4.0]) + rng.normal(0, 0.2, 3), rotation(rng), waves)
+    return Shape(kind, size, Material(0), np.array([0, 0, 4.0]) + rng.normal(0, 0.2, 3), rotation(rng), waves)
 
 
 def sides(shape: Shape, points: np.ndarray) -> np.ndarray:
@@ -58,18 +58,18 @@ def within(shape: Shape, point: np.ndarray) -> bool:
 
 def slow_depth(shape: Shape, ray: np.ndarray) -> float:
     t = np.linspace(1e-4, FAR, STEPS)
-    points = (t[:, None] * ray - shape.centre) @ shape.turn
+    points = (t[:, None] * ray - shape.centre) @ shape.rotation
     changes = np.flatnonzero(np.diff(sides(shape, points)))
     hits = [t[i] for i in changes if within(shape, points[i])]
     return float(hits[0]) if hits else np.inf
 
 
-def run(shapes: Packed, width: int, height: int, focal: float) -> tuple[np.ndarray, ...]:
+def run(shapes: ShapeArrays, width: int, height: int, focal: float) -> tuple[np.ndarray, ...]:
     depth, ids = np.full((height, width), 1e6), np.full((height, width), -1, np.int32)
     points, normals = np.zeros((2, height, width, 3), np.float32)
     lens = np.array([focal, focal, width / 2, height / 2])
     rects = np.tile(np.array([0, 0, width, height], np.int32), (len(shapes.kinds), 1))
-    table = shapes.kinds, shapes.turns, shapes.centres, shapes.sizes, shapes.waves
+    table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
     cast(np.zeros(3), np.eye(3), lens, 1.0, *table, rects, depth, ids, points, normals)
     return depth, ids, points, normals
 
@@ -82,7 +82,7 @@ def ray(i: int, j: int, width: int, height: int, focal: float) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
     shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng([seed, KINDS[name]])), (11, 9, 18.0)
-    depth, ids, points, _ = run(packed([shape]), w, h, f)
+    depth, ids, points, _ = run(pack([shape]), w, h, f)
     slow = np.array([[slow_depth(shape, ray(i, j, w, h, f)) for j in range(w)] for i in range(h)])
     hit = np.isfinite(slow)
     assert hit.sum() >= 8
@@ -91,7 +91,7 @@ def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
     both = hit & ~disagree
     np.testing.assert_allclose(depth[both], slow[both], atol=2 * FAR / STEPS + 1e-4)
     for i, j in zip(*np.nonzero(both), strict=True):
-        there = (depth[i, j] * ray(i, j, w, h, f) - shape.centre) @ shape.turn
+        there = (depth[i, j] * ray(i, j, w, h, f) - shape.centre) @ shape.rotation
         np.testing.assert_allclose(points[i, j], there, atol=1e-5)
 
 
@@ -99,7 +99,7 @@ def test_depth_is_where_the_side_changes(name: str, seed: int) -> None:
 def test_normals_are_those_of_the_depth(name: str) -> None:
     """A step along the surface is at right angles to the normal, which looks at the camera."""
     shape, (w, h, f) = random_shape(KINDS[name], np.random.default_rng(KINDS[name])), (120, 90, 120.0)
-    depth, ids, _, normals = run(packed([shape]), w, h, f)
+    depth, ids, _, normals = run(pack([shape]), w, h, f)
     rays = np.stack([[ray(i, j, w, h, f) for j in range(w)] for i in range(h)])
     world = rays * np.where(ids == 0, depth, np.nan)[..., None]
     seen = ids == 0
@@ -117,8 +117,8 @@ def test_normals_are_those_of_the_depth(name: str) -> None:
 def test_the_nearest_of_several_shapes_is_seen() -> None:
     rng = np.random.default_rng(3)
     shapes = [random_shape(kind, rng) for kind in (BOX, ELLIPSOID, CONE, BLOB, QUAD)]
-    alone = np.stack([run(packed([shape]), 24, 18, 20.0)[0] for shape in shapes])
-    depth, ids, _, _ = run(packed(shapes), 24, 18, 20.0)
+    alone = np.stack([run(pack([shape]), 24, 18, 20.0)[0] for shape in shapes])
+    depth, ids, _, _ = run(pack(shapes), 24, 18, 20.0)
     np.testing.assert_allclose(
         depth, alone.min(0), rtol=1e-4
     )  # where a blob's search ends depends on what is before it
@@ -133,7 +133,7 @@ def test_light_reaches_what_nothing_is_before() -> None:
     points, normals = rng.uniform(-1.2, 1.2, (2, 200, 3)).astype(np.float32)
     centre, radius, bias, weights = np.array([0.1, 0.0, -0.1]), 1.1, 0.02, np.array([0.5, 1.0, 0.25])
     out = np.zeros(200, np.float32)
-    light_seen(points, normals, axes, centre, radius, maps, bias, weights, out)
+    add_light(points, normals, axes, centre, radius, maps, bias, weights, out)
     slow = np.zeros(200)
     for k in range(3):
         u, v, forward = ((points - centre) @ axes[k].T).T

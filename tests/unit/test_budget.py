@@ -8,7 +8,8 @@ import pytest
 import scenes
 
 from gsmerge import write_ply
-from gsmerge.budget import PRESETS, count_for_bytes, file_bytes, parse_budget, parse_bytes
+from gsmerge.budget import PRESETS, parse_budget, parse_bytes
+from gsmerge.io.formats.ply_writer import count_for_bytes, file_bytes
 
 
 @pytest.mark.parametrize(

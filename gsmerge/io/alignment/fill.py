@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsmerge.types import SH_C0, PixelScene
+from gsmerge.geometry import rgb_to_sh0
+from gsmerge.types import PixelScene
 
-_MAX_SPREAD = 0.15  # of the Gaussians' depth over the map's: more, and the map is not that of the Gaussians
+_MAX_SPREAD = 0.15  # of the Gaussians' depth over the map's: above it the map is not that of the Gaussians
 
 
 def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     """The scene with a Gaussian for each pixel that the file has no row for.
 
-    It lies on the pixel's ray at the depth of the map, in units that the other pixels tell (as depth along z or as
-    distance, whichever they follow); its colour is the photo's, its opacity, rotation and size in pixels those of the
-    pixel before it in the same row.
+    It lies on the pixel's ray at the depth of the map, in units that follow from the other pixels (as depth along z or
+    as distance, whichever they agree with). Its colour is the photo's; its opacity, rotation and size in pixels are
+    those of the pixel before it in the same row.
 
     Args:
         scene: With photos; on the full grid.
@@ -45,12 +46,11 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     spread, unit, along = min(_agreement(ratio, 0), _agreement(ratio * length[usable], 1))
     if spread > _MAX_SPREAD:
         return scene
-    wanted = ~valid & (maps > 0) & np.isfinite(maps)
     new_z = unit * maps / (length if along else 1)
     ranks = np.arange(usable.size).reshape(usable.shape)
     before = np.maximum.accumulate(np.where(usable, ranks, 0), axis=1).reshape(-1)
     before = np.where(usable.reshape(-1)[before], before, np.flatnonzero(usable)[0])
-    rows = np.flatnonzero(wanted)
+    rows = np.flatnonzero(~valid & (maps > 0) & np.isfinite(maps))
     view = rows // (height * width)
     local = rays.reshape(-1, 3)[rows] * new_z.reshape(-1)[rows, None]
     world = np.einsum("tji,tj->ti", V[view, :3, :3], local - V[view, :3, 3])
@@ -60,7 +60,7 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     growth = torch.from_numpy(new_z.reshape(-1)[rows] / z.reshape(-1)[before[rows]]).float()
     columns["scales"][at] = g.scales[source] * growth[:, None]
     columns["quats"][at], columns["opacities"][at] = g.quats[source], g.opacities[source]
-    columns["sh0"][at] = (scene.images.reshape(-1, 1, 3)[at] - 0.5) / SH_C0
+    columns["sh0"][at] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[at])
     kept = scene.valid.reshape(-1).clone()
     kept[at] = True
     return replace(scene, gaussians=type(g)(**columns), valid=kept.reshape(scene.valid.shape))

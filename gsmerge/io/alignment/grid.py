@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-import torch
-
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.crop import Mapping, Size, counted, cover, patched, stretch
-from gsmerge.io.alignment.mismatch import ASPECT_TOLERANCE
+from gsmerge.io.alignment.layouts import PER_PIXEL, TRIM
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
-from gsmerge.io.cameras.lens import undistorted
 from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.photos import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
 from gsmerge.types import Cameras
 
-_MOST_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
-
-Photos = Sequence[np.ndarray] | np.ndarray
+PATCH = 14  # sides of vision transformers' inputs are multiples of it
+SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
+_ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
+_MIN_KEPT = 0.5  # of a photo's area, when it is cropped
+_MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
 
 
 @dataclass(frozen=True)
-class Fit:
-    """One way in which cameras and photos may be brought to the grid.
+class GridFit:
+    """One way to bring cameras and photos to the grid.
 
     Args:
         cameras: At the grid's size.
-        mapping: What is done to the photos; None: nothing.
+        transform: What is done to the photos; None: nothing.
         notes: What it is, for people.
         rank: What speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
-            of rows alone (2); a network's habit (3).
+            of rows alone (2); a network's usual sizes (3).
     """
 
     cameras: Cameras
-    mapping: Mapping | None
+    transform: PhotoTransform | None
     notes: tuple[str, ...]
     rank: int = 0
 
@@ -44,22 +42,17 @@ class Fit:
         return self.rank in (1, 2)
 
 
-def photo_size(photos: Photos | None) -> Size | None:
-    """(width, height) of the photos; None without any."""
-    return None if photos is None else (photos[0].shape[1], photos[0].shape[0])
-
-
-def as_is(camera_file: CameraFile, size: Size | None) -> Fit:
+def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     """The grid has the photos' size, or that of the cameras where there are no photos.
 
     Raises:
         SceneError: If the cameras' size is not the photos' or a multiple of it.
     """
     if size is None:
-        return Fit(to_cameras(camera_file), None, ())
+        return GridFit(to_cameras(camera_file), None, ())
     width, height = size
     for w, h in sizes_of(camera_file):
-        if not _alike((w, h), size):
+        if not same_shape((w, h), size):
             swapped = (w, h) == (height, width)
             raise SceneError(
                 camera_file.path,
@@ -68,14 +61,14 @@ def as_is(camera_file: CameraFile, size: Size | None) -> Fit:
             )
     other = [s for s in sizes_of(camera_file) if s != size]
     notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
-    return Fit(to_cameras(camera_file, size), None, notes)
+    return GridFit(to_cameras(camera_file, size), None, notes)
 
 
-def mapped(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[Fit]:
-    """All else that the files and the number of rows allow, the likely ones first.
+def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
+    """All other grids that the files and the number of rows allow, the likely ones first.
 
     Args:
-        ply: What was found in the ``.ply``.
+        ply: What the header of the ``.ply`` says.
         camera_file: The cameras at the size that their file has.
         size: (width, height) of the photos; None without any.
     """
@@ -84,22 +77,89 @@ def mapped(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator
     if size is not None and own is not None and own != size:
         yield from _between(camera_file, size, own)
     base = size or own
-    if base is None or any(not _alike(s, base) for s in known):
+    if base is None or any(not same_shape(s, base) for s in known):
         return
     cameras = to_cameras(camera_file, base)
-    patches = patched(base) if ply.sh_degree == 0 and ply.opacity_encoding == "logit" else iter(())
+    patches = patch_grids(base) if ply.sh_degree == 0 and ply.opacity_encoding == "logit" else iter(())
     what = "photos and cameras" if size is not None else "cameras"
-    for rank, mapping in [(1 if m.is_whole else 2, m) for m in counted(ply.count, len(camera_file), base)] + [
-        (3, m) for m in patches if ply.count < len(camera_file) * m.width * m.height
+    for rank, transform in [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)] + [
+        (3, t) for t in patches if ply.count < len(camera_file) * t.width * t.height
     ]:
-        note = f"{what} of {base[0]} x {base[1]} are {mapping.words}, the Gaussian grid's size"
-        yield Fit(_moved(cameras, mapping.intrinsics(cameras.Ks), mapping), mapping, (note,), rank)
-        if not known and not mapping.is_whole:
-            whole = to_cameras(camera_file, (mapping.width, mapping.height))
-            yield Fit(whole, mapping, (f"{note}; the intrinsics are those of the result",), rank)
+        note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
+        yield GridFit(_transformed(cameras, transform), transform, (note,), rank)
+        if not known and transform.crops:
+            whole = to_cameras(camera_file, (transform.width, transform.height))
+            yield GridFit(whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
 
 
-def small_photos(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
+def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit]:
+    """Photos brought to the cameras' size, or cameras of uncropped pictures brought to the photos'."""
+    cameras = to_cameras(camera_file, own)
+    for transform in (resize_to(size, own), resize_and_crop(size, own)):
+        if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
+            continue  # previews: a fit to them would blur the Gaussians
+        note = f"photos of {size[0]} x {size[1]} are {transform.description}, the cameras' and the Gaussian grid's size"
+        yield GridFit(cameras, transform, (note,))
+    if not same_shape(own, size):
+        for transform in (resize_to(own, size), resize_and_crop(own, size)):
+            note = f"cameras of {own[0]} x {own[1]} are {transform.description}, the images' size"
+            yield GridFit(_transformed(cameras, transform), None, (note,))
+
+
+def _transformed(cameras: Cameras, transform: PhotoTransform) -> Cameras:
+    Ks = transform.intrinsics(cameras.Ks)
+    return replace(cameras, Ks=Ks, width=transform.width, height=transform.height)
+
+
+def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
+    """Transforms to smaller grids that the number of rows allows, with as many rows for each of all views.
+
+    Args:
+        count: Rows of the file.
+        views: Cameras.
+        size: Of the photos, pixels.
+    """
+    crops: list[PhotoTransform] = []
+    for trim in (0, TRIM):
+        for per_pixel in PER_PIXEL:
+            pixels, rest = divmod(count, views * per_pixel)
+            if rest:
+                continue
+            for to in _sizes_of_area(pixels, trim, size):
+                aspect = to[0] * size[1] / (to[1] * size[0])
+                if abs(aspect - 1) <= ASPECT_TOLERANCE:
+                    yield resize_to(size, to)
+                is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
+                if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
+                    crops.append(resize_and_crop(size, to))
+    yield from (crop for crop in crops if crop.crops)
+
+
+def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
+    """Sizes up to ``size`` that leave as many pixels when ``trim`` is cut off at every border."""
+    for width in range(max(1, pixels // size[1]), min(size[0], pixels) + 1):
+        height, rest = divmod(pixels, width)
+        to = width + 2 * trim, height + 2 * trim
+        if not rest and to != size and to[0] <= size[0] and to[1] <= size[1]:
+            yield to
+
+
+def patch_grids(size: Size) -> Iterator[PhotoTransform]:
+    """Transforms of networks that take multiples of 14: each side to the nearest one, or cropped to it."""
+    known = set()
+    for side in SIDES:
+        for whole in (max(size), min(size)):
+            scale = side / whole
+            nearest = tuple(PATCH * max(1, round(s * scale / PATCH)) for s in size)
+            below = tuple(PATCH * max(1, int(round(s * scale) // PATCH)) for s in size)
+            resized, cropped = (nearest[0], nearest[1]), (below[0], below[1])
+            for transform in (resize_to(size, resized), resize_and_crop(size, cropped, scale)):
+                if transform not in known and scale <= 1:
+                    known.add(transform)
+                    yield transform
+
+
+def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
     """Why photos do not do where the rows are as many as the cameras have pixels, but of another size."""
     own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or own is None or own == size:
@@ -109,55 +169,3 @@ def small_photos(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Sc
         f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}",
         "give the images that the backbone saw, or their originals",
     )
-
-
-def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[Fit]:
-    """Photos brought to the cameras' size, or cameras of uncropped pictures brought to the photos'."""
-    cameras = to_cameras(camera_file, own)
-    for mapping in (stretch(size, own), cover(size, own)):
-        if max(mapping.scale_x, mapping.scale_y) > _MOST_ENLARGED:
-            continue  # previews: a fit to them would blur the Gaussians
-        note = f"photos of {size[0]} x {size[1]} are {mapping.words}, the cameras' and the Gaussian grid's size"
-        yield Fit(cameras, mapping, (note,))
-    if not _alike(own, size):
-        for mapping in (stretch(own, size), cover(own, size)):
-            note = f"cameras of {own[0]} x {own[1]} are {mapping.words}, the images' size"
-            yield Fit(_moved(cameras, mapping.intrinsics(cameras.Ks), mapping), None, (note,))
-
-
-def _moved(cameras: Cameras, Ks: torch.Tensor, mapping: Mapping) -> Cameras:
-    return replace(cameras, Ks=Ks, width=mapping.width, height=mapping.height)
-
-
-def _alike(one: Size, other: Size) -> bool:
-    """Whether two sizes have the same shape, but for rounding."""
-    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= ASPECT_TOLERANCE
-
-
-def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
-    """Photos without lens distortion and cameras that are pinholes, with the same intrinsics; and a note of it.
-
-    Raises:
-        SceneError: If a lens is no pinhole and there are no photos of the camera's shape.
-    """
-    if not camera_file.lenses:
-        return camera_file, photos, []
-    pinholes = replace(camera_file, lenses=())
-    name = next(lens.name for lens in camera_file.lenses if lens is not None)
-    size = photo_size(photos)
-    if photos is None or size is None:
-        raise SceneError(
-            camera_file.path,
-            f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images",
-            "name the images with --images, or undistort them first",
-        )
-    other = next((s for s in sizes_of(camera_file) if not _alike(s, size)), None)
-    if other is not None:
-        raise SceneError(
-            camera_file.path,
-            f"expected images of the cameras' {other[0]} x {other[1]} to undistort ({name}), found"
-            f" {size[0]} x {size[1]}",
-            "give the images as they were taken, or undistort them first",
-        )
-    straight = undistorted(photos, to_cameras(pinholes, size).Ks.numpy(), camera_file.lenses)
-    return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]

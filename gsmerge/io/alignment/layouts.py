@@ -1,16 +1,20 @@
-"""Which row of a file may belong to which pixel: what the number of rows allows."""
+"""Which row of a file may belong to which pixel: what the number of rows allows; and scenes laid out accordingly."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.types import Cameras, Gaussians, PixelScene
 
 Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 ORDERS: tuple[str, ...] = get_args(Order)
-MAY_BE_LOOSE: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
+MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
 
 TRIM = 8  # pixels that DepthSplat and its relatives cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
@@ -22,7 +26,7 @@ class Layout:
     """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote.
 
     Args:
-        words: What it is, for people.
+        description: What it is, for people.
         kind: "full", "trim", "box", "box+depth" or "pruned": which pixels there are.
         order: In which order the rows are.
         width: Of the grid, pixels.
@@ -33,7 +37,7 @@ class Layout:
         per_pixel: Gaussians per pixel; above 1 each layer is a block.
     """
 
-    words: str
+    description: str
     kind: str
     order: str
     width: int
@@ -45,7 +49,7 @@ class Layout:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the rows are the grid as they stand: nothing to move, nothing missing."""
+        """Whether the rows are the grid as they are: nothing to move, nothing missing."""
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
 
@@ -54,7 +58,7 @@ class Box:
     """The part of a view that was kept: rows ``top`` to ``height - top``, columns ``left`` to ``width - left``."""
 
     kind: str
-    words: str
+    description: str
     top: int
     left: int
 
@@ -67,12 +71,12 @@ class Box:
 def boxes(width: int, height: int) -> list[Box]:
     """What is cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
     top, left = da3_border(width, height)
-    found = [Box("full", "every pixel", 0, 0)]
+    out = [Box("full", "every pixel", 0, 0)]
     if min(width, height) > 2 * TRIM:
-        found.append(Box("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
+        out.append(Box("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
     if (top or left) and (top, left) != (TRIM, TRIM):
-        found.append(Box("box", f"{top} rows and {left} columns trimmed at every border", top, left))
-    return found
+        out.append(Box("box", f"{top} rows and {left} columns trimmed at every border", top, left))
+    return out
 
 
 def da3_border(width: int, height: int) -> tuple[int, int]:
@@ -116,13 +120,13 @@ def _orders(
         "layer-major": index.reshape(per_pixel, blocks, rows, columns).transpose(1, 0, 2, 3),
     }
     pixels = grid.reshape(-1)
-    for order, laid in arranged.items():
+    for order, ids in arranged.items():
         if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and blocks == 1):
             continue
-        words = box.words + (f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else "") + f", {order}"
-        parts = tuple(laid[block, layer] for block in range(blocks) for layer in range(per_pixel))
+        layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
+        parts = tuple(ids[block, layer] for block in range(blocks) for layer in range(per_pixel))
         yield Layout(
-            words=words,
+            description=f"{box.description}{layers}, {order}",
             kind=box.kind,
             order=order,
             width=width,
@@ -135,7 +139,7 @@ def _orders(
 
 
 def depth_layout(count: int, depths: np.ndarray) -> Layout | None:
-    """The layout of Depth Anything 3 from the depth maps beside it: border, nearest 90 % of each view, every n-th view.
+    """The layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
     Args:
         count: Rows of the file.
@@ -153,7 +157,7 @@ def depth_layout(count: int, depths: np.ndarray) -> Layout | None:
             top, left = da3_border(width, height)
             every = "" if step == 1 else f", every {step}. view"
             return Layout(
-                words=f"{top} rows and {left} columns trimmed, nearest 90 % of each view{every}, view-major",
+                description=f"{top} rows and {left} columns trimmed, nearest 90 % of each view{every}, view-major",
                 kind="box+depth",
                 order="view-major",
                 width=width,
@@ -180,12 +184,7 @@ def depth_mask(depth: np.ndarray) -> np.ndarray:
     return np.flatnonzero(mask & inside)
 
 
-def relabelled(layout: Layout, views: Sequence[int]) -> Layout:
-    """The same with other cameras for its blocks."""
-    return replace(layout, views=tuple(views))
-
-
-def thinned(layout: Layout, per_block: int) -> Layout:
+def subsample(layout: Layout, per_block: int) -> Layout:
     """About ``per_block`` rows of each block, spread over all columns and rows."""
     rows, pixels = [], []
     for some, where in zip(layout.rows, layout.pixels, strict=True):
@@ -196,3 +195,51 @@ def thinned(layout: Layout, per_block: int) -> Layout:
         rows.append(some.flat[chosen])
         pixels.append(where[chosen])
     return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
+
+
+def to_grid(
+    gaussians: Gaussians, valid: Tensor, layout: Layout, cameras: Cameras, images: Tensor | None, names: tuple[str, ...]
+) -> PixelScene:
+    """The scene on the full grid of the layout.
+
+    Pixels without a row get a fully transparent Gaussian, like rows that are not finite.
+
+    Args:
+        gaussians: The file's rows.
+        valid: ``[n]`` bool.
+        layout: Which row belongs to which pixel.
+        cameras: All cameras, in the frame of the Gaussians and at the grid's size.
+        images: ``[c,h,w,3]`` of all cameras, or None.
+        names: Names of all cameras.
+    """
+    views = list(layout.views)
+    if views != list(range(len(cameras))):
+        cameras, images = cameras[views], None if images is None else images[views]
+    grid = len(views), layout.height, layout.width
+    names = tuple(names[view] for view in views)
+    if layout.is_plain:
+        return PixelScene(gaussians, cameras, images, valid.reshape(grid), names)
+    source = _row_of_pixel(layout)
+    missing = source < 0
+    none = torch.from_numpy(missing) if missing.any() else None
+    if none is not None:
+        there = np.where(missing, 0, np.arange(len(source)))
+        there[: int(np.argmin(missing))] = int(np.argmin(missing))
+        source = source[np.maximum.accumulate(there)]
+    index = torch.from_numpy(source)
+    out, kept = gaussians[index], valid[index]
+    if none is not None:
+        kept[none] = False
+        for values, value in ((out.opacities, 0.0), (out.sh0, 0.0), (out.shN, 0.0)):
+            values[none] = value
+        out.quats[none] = torch.tensor((1.0, 0, 0, 0))
+    return PixelScene(out, cameras, images, kept.reshape(grid), names, None if none is None else none.reshape(grid))
+
+
+def _row_of_pixel(layout: Layout) -> np.ndarray:
+    """The file row of every pixel of the grid, -1 where there is none."""
+    size = layout.width * layout.height
+    source = np.full(size * len(layout.views), -1, np.int64)
+    for i, (rows, pixels) in enumerate(zip(layout.rows, layout.pixels, strict=True)):
+        source[i * size + pixels] = rows.reshape(-1)
+    return source

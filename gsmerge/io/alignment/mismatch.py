@@ -1,26 +1,43 @@
-"""What to say where Gaussians and cameras do not belong together."""
+"""Why Gaussians and cameras do not belong together, and what to say then."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.verify import Alignment
-from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.alignment.score import Alignment, PixelSample, check_alignment, check_sample, sample_pixels
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENGL,
+    CONVENTIONS,
+    CameraFile,
+    Convention,
+    describe,
+    from_viewmats,
+    to_viewmats,
+    with_poses,
+)
 from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.photos import ASPECT_TOLERANCE
+from gsmerge.types import Cameras, Gaussians
 
-ASPECT_TOLERANCE = 0.04  # backbones round each side to a multiple of 14 by itself
 
-
-def count_problem(ply: PlyInfo, views: int, width: int, height: int) -> str:
+def count_problem(ply: PlyInfo, cameras: Cameras) -> str:
     """That the number of rows is not that of the pixels."""
-    pixels = width * height
+    views, width, height = len(cameras), cameras.width, cameras.height
     return (
-        f"expected one Gaussian per pixel, {views} x {height} x {width} = {views * pixels} (views x height x width), "
-        f"found {ply.count}"
+        f"expected one Gaussian per pixel, {views} x {height} x {width} = {views * height * width} "
+        f"(views x height x width), found {ply.count}"
     )
 
 
-def other_grid(count: int, views: int, width: int, height: int) -> str:
+def count_remedy(count: int, cameras: Cameras) -> str:
     """Which simple reading the number of Gaussians has instead."""
+    views, width, height = len(cameras), cameras.width, cameras.height
     pixels = width * height
     if count % (views * pixels) == 0:
         return f"that is {count // (views * pixels)} Gaussians per pixel"
@@ -39,12 +56,88 @@ def other_grid(count: int, views: int, width: int, height: int) -> str:
     return "give the cameras and images that belong to it"
 
 
-def misaligned(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
-    """That the rows would be enough, but do not lie where their pixels look."""
-    measured = (
+def misalignment_error(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
+    """That the rows would be enough, but do not lie on the rays of their pixels."""
+    problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
         f"found a median of up to {alignment.worst_px:.1f} px and "
         f"{100 * alignment.share_in_front:.0f} % in front of their camera"
     )
     unknown = "no other convention fits either: give the cameras that belong to the .ply"
-    return SceneError(camera_file.path, measured, f"{reason}: convert one to the other" if reason else unknown)
+    return SceneError(camera_file.path, problem, f"{reason}: convert one to the other" if reason else unknown)
+
+
+def explain_misalignment(
+    gaussians: Gaussians, cameras: Cameras, valid: Tensor, convention: Convention = C2W_OPENGL
+) -> str | None:
+    """Name the other reading of the cameras or of the row order under which the scene would fit.
+
+    Args:
+        gaussians: As for :func:`check_alignment`.
+        cameras: The views, read under ``convention``.
+        valid: As for :func:`check_alignment`.
+        convention: How the camera file's format stores poses.
+
+    Returns:
+        What would fit, in words; None if nothing that is known does.
+    """
+    sample = sample_pixels(gaussians, cameras, valid)
+    for reason, viewmats in _other_viewmats(sample, cameras, convention):
+        if check_sample(sample, with_poses(cameras, viewmats)).ok:
+            return reason
+    for reason, order in _other_orders(len(cameras), cameras.height, cameras.width):
+        if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
+            return reason
+    swapped = replace(cameras, width=cameras.height, height=cameras.width)
+    if check_alignment(gaussians, swapped, valid).ok:
+        return "the cameras fit with width and height swapped"
+    return None
+
+
+def _other_viewmats(sample: PixelSample, cameras: Cameras, convention: Convention) -> Iterator[tuple[str, np.ndarray]]:
+    given = cameras.viewmats.double().numpy()
+    stored = from_viewmats(given, convention)
+    for other in CONVENTIONS:
+        if other != convention:
+            words = (
+                f"the poses fit when read as {describe(other)}, where this format has {' with '.join(convention)} axes"
+            )
+            yield words, to_viewmats(stored, other)
+    transposed = given.copy()
+    transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
+    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres.double().numpy())
+    yield "the cameras fit with their rotations transposed", transposed
+    for axis, words in ((1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")):
+        mirrored = given.copy()
+        mirrored[:, axis] *= -1
+        yield f"the cameras fit with the {words}", mirrored
+    scale = _camera_scale(sample, cameras)
+    if scale > 0:
+        scaled = given.copy()
+        scaled[:, :3, 3] *= scale
+        yield f"the cameras fit with their positions scaled by {scale:.4g}", scaled
+
+
+def _camera_scale(sample: PixelSample, cameras: Cameras) -> float:
+    """The factor s of the camera positions that brings every mean nearest to its pixel's ray.
+
+    With ray direction d, centre c and mean X, (X - s c) x d = 0 for all; so s = sum e·g / sum e·e with
+    e = c x d and g = X x d. 0 where the centres do not determine it.
+    """
+    ones = torch.ones(len(sample.pixels), 1, dtype=torch.float64)
+    rays = torch.cat([sample.pixels, ones], 1) @ torch.linalg.inv(cameras.Ks.double()).transpose(1, 2)
+    rays = torch.nn.functional.normalize(rays @ cameras.viewmats[:, :3, :3].double(), dim=-1)
+    centres = cameras.centres.double()[:, None].expand_as(rays)
+    e, g = torch.linalg.cross(centres, rays), torch.linalg.cross(sample.points, rays)
+    weight = sample.valid.double()
+    bottom = ((e * e).sum(-1) * weight).sum()
+    return float(((e * g).sum(-1) * weight).sum() / bottom) if bottom > 0 else 0.0
+
+
+def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, Tensor]]:
+    """Permutations that bring rows of another order into view-major, row-major order."""
+    rows = torch.arange(views * height * width)
+    by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
+    yield "the rows fit in the order row, column, view (view fastest)", by_pixel.permute(2, 0, 1).reshape(-1)
+    yield "the rows fit in the order view, column, row (column-major)", by_column.permute(0, 2, 1).reshape(-1)
+    yield "the rows fit with the views in reverse order", rows.reshape(views, -1).flip(0).reshape(-1)

@@ -1,4 +1,4 @@
-"""Pixels of files that dropped some, nobody knows which: views one after the other, each row by row.
+"""Pixels of incomplete files that have one view after the other, each row by row.
 
 Where one view ends and the next begins, the projected rows start again from the top; within a view the pixels can
 only go forward.
@@ -6,88 +6,52 @@ only go forward.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from gsmerge.io.alignment.layouts import Layout
-from gsmerge.io.alignment.similarity import Frame
+from gsmerge.io.alignment.projected_rows import MIN_BLOCK, ProjectedRows
+from gsmerge.io.alignment.similarity import scale_by
 
 WINDOW = 40  # rows averaged on either side of a restart
 RESTART = 0.25  # of the image's height: how far back a restart goes at least
-SHORT = 1500  # rows that tell which view a block is of
-MIN_BLOCK = 500  # rows; less of a view cannot be told from noise
+SHORT = 1500  # rows that say which view a block is of
 SCALES = np.geomspace(1 / 30, 30, 69)  # of the cameras' positions, tried in turn
-SPAN = 1.25  # how far the first guess of the scale may be off
-MOST_SCALES = 400  # that are tried
+SPAN = 1.25  # factor by which the first guess of the scale may be off
+MAX_SCALES = 400  # that are tried
 TRIED_BLOCKS, STRETCH = 4, 2000  # blocks, and rows of each in a row, that a scale is tried on
 _SMALL = 1e-6  # weight of a point that says nothing
-
-Project = Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]
-
-
-def projector(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> Project:
-    """``(rows, view) -> (u, v)`` in pixels; NaN behind the camera."""
-
-    def project(rows: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
-        matrix = Ks[view] @ viewmats[view, :3]
-        image = points[rows] @ matrix[:, :3].T + matrix[:, 3]
-        with np.errstate(all="ignore"):
-            u, v = image[:, 0] / image[:, 2], image[:, 1] / image[:, 2]
-        u[image[:, 2] <= 0] = np.nan
-        v[image[:, 2] <= 0] = np.nan
-        return u, v
-
-    return project
+_MAX_UNEVENNESS = 10.0  # of one block, so that no single one decides
 
 
-def pruned_layout(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> Layout | None:
-    """Which pixel of which view every row is, for cameras in the frame of the Gaussians.
-
-    Args:
-        points: ``[n,3]`` float64, all finite.
-        viewmats: ``[c,4,4]``.
-        Ks: ``[c,3,3]``.
-        width: Of the grid, pixels.
-        height: The same.
-
-    Returns:
-        A layout, right or wrong: its pixels have to be measured. None if the rows do not look like views at all.
-    """
-    project = projector(points, viewmats, Ks)
-    blocks = _blocks(project, len(points), len(viewmats), width * height, height)
+def pruned_layout(rows: ProjectedRows) -> Layout | None:
+    """Which pixel of which view every row is, block by block."""
+    blocks = _blocks(rows)
     if blocks is None:
         return None
-    pixels = [assign_pixels(*project(rows, view), width, height) for view, rows in blocks]
-    missing = len(blocks) * width * height - len(points)
-    return Layout(
-        words=f"{missing:,} pixels of {len(blocks)} views dropped, view-major",
-        kind="pruned",
-        order="view-major",
-        width=width,
-        height=height,
-        views=tuple(view for view, _ in blocks),
-        rows=tuple(rows for _, rows in blocks),
-        pixels=tuple(pixels),
-    )
+    pixels = [assign_pixels(*rows.project(some, view), rows.width, rows.height) for view, some in blocks]
+    missing = len(blocks) * rows.width * rows.height - len(rows)
+    return rows.layout("view-major", [v for v, _ in blocks], [some for _, some in blocks], pixels, missing=missing)
 
 
-def _blocks(project: Project, count: int, views: int, most: int, height: int) -> list[tuple[int, np.ndarray]] | None:
+def _blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
     """(view, rows) of each block, views increasing; None if the rows do not look like that.
 
     Where a block ends shows in any view that is nearly its own. Which views they are is decided for all together.
     """
+    count, views, largest = len(rows), rows.num_views, rows.width * rows.height
     start, view = 0, -1
     parts: list[np.ndarray] = []
     costs: list[np.ndarray] = []
     while start < count:
-        rows = np.arange(start, min(count, start + SHORT))
-        cost = np.array([_unevenness(*project(rows, view)) for view in range(views)])
+        some = np.arange(start, min(count, start + SHORT))
+        cost = np.array([_unevenness(*rows.project(some, view)) for view in range(views)])
         if len(parts) == views or not np.isfinite(cost).any():
             return None
         later = cost[view + 1 :]
         view = view + 1 + int(np.argmin(later)) if np.isfinite(later).any() else int(np.argmin(cost))
-        end = _block_end(project, start, min(count, start + most), view, height)
+        end = _block_end(rows, start, min(count, start + largest), view)
         if end - start < MIN_BLOCK:
             return None
         parts.append(np.arange(start, end, dtype=np.int64))
@@ -114,7 +78,7 @@ def _increasing(costs: np.ndarray) -> list[int] | None:
 
 
 def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
-    """How far the typical step is from one pixel to the right."""
+    """How far the typical step is from one pixel to the right, pixels."""
     du, dv = np.diff(u), np.diff(v)
     good = np.isfinite(du) & np.isfinite(dv)
     if good.sum() < max(8, 0.5 * len(du)):
@@ -122,9 +86,10 @@ def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
     return float(abs(np.median(du[good]) - 1) + np.median(np.abs(du[good] - 1)) + np.median(np.abs(dv[good])))
 
 
-def _block_end(project: Project, start: int, stop: int, view: int, height: int) -> int:
+def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
     """The row after the last one of the block: the first clear restart, at its steepest step."""
-    _, v = project(np.arange(start, stop), view)
+    height = rows.height
+    _, v = rows.project(np.arange(start, stop), view)
     v = np.clip(np.nan_to_num(v, nan=0.0), -height, 2 * height)
     if len(v) < 2 * WINDOW:
         return stop
@@ -147,7 +112,7 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     """Strictly increasing pixels for the rows of one view.
 
     The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With
-    the row known, ``pixel - rank`` never decreases, and is found by isotonic regression, which averages the
+    the row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the
     jitter over stretches without gaps.
 
     Args:
@@ -166,8 +131,8 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     rank = np.arange(count)
     sure = known & (np.abs(v - row - 0.5) < 2 + 4 * noise) & (u > -2 - 4 * noise) & (u < width + 2 + 4 * noise)
     key = row * width + np.clip(u, 0, width) - 0.5 - rank
-    found = _never_falling(key, np.where(sure, 1.0, _SMALL))
-    return np.asarray(np.clip(np.rint(found), 0, width * height - count), np.int64) + rank
+    pixels = _never_falling(key, np.where(sure, 1.0, _SMALL))
+    return np.asarray(np.clip(np.rint(pixels), 0, width * height - count), np.int64) + rank
 
 
 def _rows_of(scanline: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -188,81 +153,67 @@ def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(isotonic_regression(values, weights=weights).x)
 
 
-def rough_scale(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> float:
+def rough_scale(rows: ProjectedRows) -> float:
     """The scale of the cameras' positions under which rows step by single pixels, before any pixel is known."""
-    views = len(viewmats)
+    middles = (np.arange(rows.num_views) + 0.5) / rows.num_views * len(rows)
     windows = [
-        (view, np.arange(middle - SHORT // 4, middle + SHORT // 4).clip(0, len(points) - 1))
-        for view, middle in enumerate((np.arange(views) + 0.5) / views * len(points))
+        np.arange(middle - SHORT // 4, middle + SHORT // 4).clip(0, len(rows) - 1).astype(np.int64)
+        for middle in middles
     ]
-    windows = [(view, rows.astype(np.int64)) for view, rows in windows]
 
-    def cost(size: float) -> float:
-        frame = Frame(np.eye(3), size, np.zeros(3))
-        return _mean_unevenness(points, frame.move_cameras(viewmats), Ks, windows)
+    def cost(scale: float) -> float:
+        there = _scaled(rows, scale)
+        uneven = (_unevenness(*there.project(some, view)) for view, some in enumerate(windows))
+        return float(np.mean([min(pixels, _MAX_UNEVENNESS) for pixels in uneven]))
 
-    costs = [cost(size) for size in SCALES]
-    best = float(SCALES[int(np.argmin(costs))])
+    best = float(min(SCALES, key=cost))
     for width_of_search in (1.08, 1.02, 1.005):
-        near = best * np.geomspace(1 / width_of_search, width_of_search, 9)
-        best = float(near[int(np.argmin([cost(size) for size in near]))])
+        best = float(min(best * np.geomspace(1 / width_of_search, width_of_search, 9), key=cost))
     return best
 
 
-def scaled(scale: float, words: str = "") -> Frame:
-    """The cameras' frame with other units."""
-    return Frame(np.eye(3), scale, np.zeros(3), f"positions scaled by {scale:.4g}{words}", "scaled")
-
-
-def finer_scale(points: np.ndarray, layout: Layout, viewmats: np.ndarray, Ks: np.ndarray, rough: float) -> float:
+def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     """The scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
 
     A scale that is wrong by little moves rows by parts of a pixel, which finding their pixels hides: so scales are
     tried in steps that move most rows by a quarter of a pixel at most.
 
     Args:
-        points: ``[n,3]`` float64.
+        rows: All rows of the file, and the cameras in their own frame.
         layout: Its blocks are right, its pixels need not be.
-        viewmats: ``[c,4,4]`` in the cameras' own frame.
-        Ks: ``[c,3,3]``.
-        rough: Where to look.
+        rough: Where to search.
     """
     chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
-    middles = [(len(layout.rows[b]) - STRETCH) // 2 for b in chosen]
-    parts = [
-        (layout.views[b], layout.rows[b][max(0, a) : max(0, a) + STRETCH]) for b, a in zip(chosen, middles, strict=True)
-    ]
+    starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]
+    parts = [(layout.views[b], layout.rows[b][a : a + STRETCH]) for b, a in zip(chosen, starts, strict=True)]
 
-    def seen(scale: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        project = projector(points, scaled(scale).move_cameras(viewmats), Ks)
-        return [project(rows, view) for view, rows in parts]
+    def projected(scale: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        there = _scaled(rows, scale)
+        return [there.project(some, view) for view, some in parts]
 
     def cost(scale: float) -> float:
-        return float(np.mean([_distance(u, v, layout.width, layout.height) for u, v in seen(scale)]))
+        return float(np.mean([_distance(u, v, layout.width, layout.height) for u, v in projected(scale)]))
 
-    here, there = seen(rough), seen(rough * 1.001)
+    here, there = projected(rough), projected(rough * 1.001)
     moved = np.concatenate([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in zip(here, there, strict=True)]) / 0.001
     speed = float(np.nanquantile(moved, 0.9)) if np.isfinite(moved).any() else 0.0
     if speed <= 0:
         return rough
-    step = max(0.25 / speed, 2 * np.log(SPAN) / MOST_SCALES)
+    step = max(0.25 / speed, 2 * np.log(SPAN) / MAX_SCALES)
     best = rough
     for reach in (max(step, np.log(SPAN)), step, step / 8):
         near = best * np.exp(np.linspace(-reach, reach, 2 * max(1, int(np.ceil(reach / step))) + 1))
-        best = float(near[int(np.argmin([cost(scale) for scale in near]))])
+        best = float(min(near, key=cost))
         step = min(step, reach) / 8
     return best
 
 
+def _scaled(rows: ProjectedRows, scale: float) -> ProjectedRows:
+    return replace(rows, viewmats=scale_by(scale).move_viewmats(rows.viewmats))
+
+
 def _distance(u: np.ndarray, v: np.ndarray, width: int, height: int) -> float:
-    """Median distance of projected rows from the pixels that they come to."""
+    """Median distance of projected rows from the pixels that they come to, pixels."""
     y, x = np.divmod(assign_pixels(u, v, width, height), width)
     away = np.hypot(u - x - 0.5, v - y - 0.5)
     return float(np.median(np.where(np.isfinite(away), away, width)))
-
-
-def _mean_unevenness(
-    points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, windows: Sequence[tuple[int, np.ndarray]]
-) -> float:
-    project = projector(points, viewmats, Ks)
-    return float(np.mean([min(_unevenness(*project(rows, view)), 10.0) for view, rows in windows]))

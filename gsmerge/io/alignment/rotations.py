@@ -8,49 +8,48 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry import quat_to_rotmat, rotmat_to_quat
 from gsmerge.io.hints import QuatChoice
 from gsmerge.types import PixelScene
 
-_SAMPLES = 3000  # pixels per view whose surface is looked at
+_SAMPLES = 3000  # pixels per view whose surface is used
 _STEP = 2  # pixels to the neighbours that span the surface
-_FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian says which way its surface faces
-_MIN_TESTED = 300
+_FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian's thinnest axis is a normal of its surface
+_MIN_TESTED = 300  # Gaussians
 _MIN_COSINE, _MIN_GAIN = 0.6, 0.15  # of the mean cosine between thinnest axis and normal, for another reading
-_AROUND = 5  # pixels of the square over which means are averaged where roots are looked at
+_AROUND = 5  # pixels of the square over which means are averaged before roots are compared
 _FOLLOWS = 0.95  # cosine above which an axis follows the surface
 _MAX_LEFT = 0.5  # share of Gaussians that follow under no root, over that under any other reading
 _READINGS: tuple[QuatChoice, ...] = ("wxyz", "xyzw", "camera")
-_WORDS = {
+_DESCRIPTIONS = {
     "xyzw": "stored with w last",
     "camera": "relative to each view's camera",
     "xyzw-root": "stored with w last and each applied twice",
 }
 
 
-def read_rotations(scene: PixelScene, hints: QuatChoice) -> PixelScene:
+def read_rotations(scene: PixelScene, quats: QuatChoice) -> PixelScene:
     """The scene with its stored rotations read in another way.
 
     Args:
-        scene: Rotations as they stand in the file, read as wxyz, local to world.
-        hints: "wxyz": as they are; "xyzw": w comes last; "xyzw-root": w comes last, and each is applied
+        scene: Rotations as they are in the file, read as wxyz, local to world.
+        quats: "wxyz": as they are; "xyzw": w comes last; "xyzw-root": w comes last, and each is applied
             twice: of its two square roots, the one whose thinnest axis follows the surface better; "camera": wxyz,
             relative to the camera of the own view.
     """
-    if hints in ("auto", "wxyz"):
+    if quats in ("auto", "wxyz"):
         return scene
-    quats = scene.gaussians.quats
-    if hints == "xyzw":
-        turned = from_xyzw(quats)
-    elif hints == "xyzw-root":
+    stored = scene.gaussians.quats
+    if quats == "xyzw":
+        read = from_xyzw(stored)
+    elif quats == "xyzw-root":
         normals, thinnest = _smooth_normals(scene), scene.gaussians.scales.argmin(1)
-        roots = square_roots(from_xyzw(quats))
-        first, second = (_cosines(quat_to_rotmat(root), thinnest, normals) for root in roots)
-        turned = torch.where((second > first)[:, None], roots[1], roots[0])
+        roots = square_roots(from_xyzw(stored))
+        first, second = (_cosines(root, thinnest, normals) for root in roots)
+        read = torch.where((second > first)[:, None], roots[1], roots[0])
     else:
-        pose = _quats_of(scene.cameras.viewmats[:, :3, :3].transpose(1, 2)).float()
-        turned = _multiply(pose.repeat_interleave(scene.pixels_per_view, 0), quats)
-    return replace(scene, gaussians=replace(scene.gaussians, quats=turned))
+        read = _multiply(_camera_quats(scene).repeat_interleave(scene.pixels_per_view, 0), stored)
+    return replace(scene, gaussians=replace(scene.gaussians, quats=read))
 
 
 def from_xyzw(quats: Tensor) -> Tensor:
@@ -69,11 +68,11 @@ def square_roots(quats: Tensor) -> tuple[Tensor, Tensor]:
     return half, _half_a_turn_more(half)
 
 
-def likely_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
-    """How the rotations are to be read: the way that turns the thinnest axes towards the surface's normals.
+def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
+    """How the rotations are to be read: the way that rotates the thinnest axes towards the surface's normals.
 
     Args:
-        scene: Rotations as they stand in the file, read as wxyz.
+        scene: Rotations as they are in the file, read as wxyz.
 
     Returns:
         The reading, and a sentence about it; "wxyz" and "" unless another one is better by a large margin.
@@ -86,61 +85,58 @@ def likely_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
     if len(rows) < _MIN_TESTED:
         return "wxyz", ""
     thinnest, quats = scene.gaussians.scales[rows].argmin(1), scene.gaussians.quats[rows]
-    poses = scene.cameras.viewmats[:, :3, :3].transpose(1, 2)
-    in_world = _multiply(_quats_of(poses).float()[views], quats)
     as_xyzw = from_xyzw(quats)
-    turns = {
-        "wxyz": quat_to_rotmat(quats),
-        "xyzw": quat_to_rotmat(as_xyzw),
-        "camera": quat_to_rotmat(in_world),
-    }
-    cosine: dict[QuatChoice, float] = {
-        name: float(_cosines(turns[name], thinnest, normals).mean()) for name in _READINGS
-    }
+    single = [quats, as_xyzw, _multiply(_camera_quats(scene)[views], quats)]
+    means = (float(_cosines(read, thinnest, normals).mean()) for read in single)
+    cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
     best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
-    if _is_root(scene, rows, [quats, as_xyzw, in_world], thinnest, normals):
+    if _is_root(scene, rows, single, thinnest, normals):
         best, cosine["xyzw-root"] = "xyzw-root", _better_of(square_roots(as_xyzw), thinnest, normals, 0.0)
     elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + _MIN_GAIN):
         return "wxyz", ""
     return best, (
-        f"rotations are {_WORDS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the surface"
-        f" then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
+        f"rotations are {_DESCRIPTIONS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the"
+        f" surface then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
     )
 
 
-def _cosines(turns: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
-    """``[n]`` between the thinnest axes of Gaussians turned by ``[n,3,3]`` and the normals, 0 to 1."""
-    axes = turns.gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+def _camera_quats(scene: PixelScene) -> Tensor:
+    """``[v,4]`` rotations from each camera to the world, wxyz."""
+    return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].double().transpose(1, 2)).float()
+
+
+def _cosines(quats: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
+    """``[n]`` between the thinnest axes of Gaussians with rotations ``[n,4]`` and the normals, 0 to 1."""
+    axes = quat_to_rotmat(quats).gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
     return (axes * normals).sum(1).abs()
 
 
 def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Tensor, normals: Tensor) -> bool:
     """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
 
-    The better of two is better by chance as well: every other reading is given a second rotation as the roots have it,
+    The better of two is better by chance as well: every other reading gets a second rotation as the roots have it,
     half a turn more about the same axis.
 
     Args:
-        scene: As it stands.
-        rows: ``[t]`` Gaussians that are looked at.
+        scene: As it is in the file.
+        rows: ``[t]`` Gaussians that are compared.
         single: ``[t,4]`` their rotations as read otherwise; as stored first, as xyzw next.
         thinnest: ``[t]`` their thinnest axes.
-        normals: ``[t,3]`` of the surface there, roughly: a first look, which takes little time.
+        normals: ``[t,3]`` of the surface there, roughly: a first comparison, which takes little time.
     """
     others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
     roots = square_roots(single[1])
     if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in others):
         return False
     smooth = _smooth_normals(scene)[rows]
-    rival = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in others)
-    return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - rival)
+    best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in others)
+    return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - best_other)
 
 
-def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor, least: float) -> float:
-    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``; share above ``least`` if not 0."""
-    first, second = (_cosines(quat_to_rotmat(quats), thinnest, normals) for quats in pair)
-    better = torch.maximum(first, second)
-    return float((better > least).float().mean() if least else better.mean())
+def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor, threshold: float) -> float:
+    """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``; the share above a threshold > 0."""
+    better = torch.maximum(*(_cosines(quats, thinnest, normals) for quats in pair))
+    return float((better > threshold).float().mean() if threshold else better.mean())
 
 
 def _half_a_turn_more(quats: Tensor) -> Tensor:
@@ -187,29 +183,12 @@ def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
     return normals, rows, rows.div(h * w, rounding_mode="floor")
 
 
-def _quats_of(rotations: Tensor) -> Tensor:
-    """``[c,3,3]`` rotations -> ``[c,4]`` unit quaternions wxyz."""
-    r = rotations.double()
-    trace = r.diagonal(dim1=1, dim2=2)
-    m = torch.zeros(len(r), 4, 4, dtype=torch.float64)
-    m[:, 0, 0] = trace.sum(1)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        m[:, i + 1, i + 1] = trace[:, i] - trace[:, j] - trace[:, k]
-        m[:, 0, i + 1] = m[:, i + 1, 0] = r[:, k, j] - r[:, j, k]
-        m[:, i + 1, j + 1] = m[:, j + 1, i + 1] = r[:, i, j] + r[:, j, i]
-    return torch.linalg.eigh(m).eigenvectors[:, :, -1]  # of the largest eigenvalue, 3
-
-
 def _multiply(a: Tensor, b: Tensor) -> Tensor:
     """Products of quaternions wxyz: first ``b``, then ``a``."""
     aw, ax, ay, az = a.unbind(1)
     bw, bx, by, bz = b.unbind(1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        1,
-    )
+    product = [
+        aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
+    ]  # fmt: skip
+    return torch.stack(product, 1)

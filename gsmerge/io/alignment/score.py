@@ -8,55 +8,32 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from gsmerge.io.alignment.layouts import Layout, thinned
-from gsmerge.io.alignment.similarity import Frame, Sightings, pixel_errors
-from gsmerge.io.alignment.verify import pixel_limit
-from gsmerge.types import SH_C0, Cameras, Gaussians
+from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.io.alignment.layouts import Layout, subsample
+from gsmerge.io.alignment.similarity import Correspondences, Similarity, pixel_errors
+from gsmerge.types import Cameras, Gaussians
 
-QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians that a reading is measured on; per view at least
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """One reading of a file, measured.
-
-    Args:
-        layout: Which row belongs to which pixel.
-        frame: Where the cameras stand in the frame of the Gaussians.
-        median_px: Median distance of the projected Gaussians from their pixels; inf where most are behind.
-        worst_px: The same of the worst view.
-        color_error: Mean distance of the base colours from the photos, 0 to 1; NaN without photos.
-        ok: Whether it is near enough to be true.
-    """
-
-    layout: Layout
-    frame: Frame
-    median_px: float
-    worst_px: float
-    color_error: float
-    ok: bool
-
-    @property
-    def words(self) -> str:
-        """What it is, for people."""
-        return ", ".join(part for part in (self.layout.words, self.frame.words) if part)
+QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians that a reading is scored on; per view at least
+MAX_CHECKED = 20_000  # pixels per view that an alignment is checked on
+MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
 
 
 @dataclass(frozen=True)
-class Clues:
-    """What there is to recover the pixels from.
+class AlignmentInput:
+    """What the pixels are recovered from.
 
     Args:
-        gaussians: The file's rows.
+        gaussians: The file's n rows.
         valid: ``[n]`` bool.
-        cameras: All cameras at the grid's size, in their own world.
+        cameras: All c cameras at the grid's size, in their own world.
         images: ``[c,h,w,3]``, or None.
         labellings: Orders that the views may be in: the file's, that of the names.
-        depths: Reads ``[c,h,w]`` depth maps beside the cameras; None where there are none.
-        order: The order of the rows where it is told, otherwise "auto".
-        scale: Size of the Gaussians' world in units of the cameras', where it is told.
+        depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
+        order: The order of the rows where it is given, otherwise "auto".
+        scale: Size of the Gaussians' world in units of the cameras', where it is given.
     """
 
     gaussians: Gaussians
@@ -79,56 +56,167 @@ class Clues:
         return np.asarray(self.cameras.Ks.double().numpy())
 
 
-def sampled(layout: Layout, samples: int = SAMPLES) -> Layout:
-    """As much of a layout as its reading is measured on."""
-    return thinned(layout, max(MIN_SAMPLES, samples // len(layout.views)))
+@dataclass(frozen=True)
+class AlignmentScore:
+    """One reading of a file, and how well it fits.
+
+    Args:
+        layout: Which row belongs to which pixel.
+        frame: From the frame of the cameras to that of the Gaussians.
+        median_px: Median distance of the projected Gaussians from their pixels; inf where most are behind.
+        worst_px: The same of the worst view.
+        color_error: Mean distance of the base colours from the photos, 0 to 1; NaN without photos.
+        ok: Whether it is near enough to be true.
+    """
+
+    layout: Layout
+    frame: Similarity
+    median_px: float
+    worst_px: float
+    color_error: float
+    ok: bool
+
+    @property
+    def description(self) -> str:
+        """What it is, for people."""
+        return ", ".join(part for part in (self.layout.description, self.frame.description) if part)
 
 
-def sightings(clues: Clues, layout: Layout, *, colored: bool = True) -> tuple[Sightings, np.ndarray | None]:
-    """The rows of a layout with their pixels and views, and how far their colours are from the photos."""
+def pixel_limit(width: int, height: int) -> float:
+    """Median distance in pixels up to which Gaussians count as those of their pixels."""
+    return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
+
+
+def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
+    """The part of a layout that its reading is scored on."""
+    return subsample(layout, max(MIN_SAMPLES, samples // len(layout.views)))
+
+
+def find_correspondences(
+    inputs: AlignmentInput, layout: Layout, *, colored: bool = True
+) -> tuple[Correspondences, np.ndarray | None]:
+    """The rows of a layout with their pixels and views, and ``[t]`` distances of their colours from the photos."""
     rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
     blocks = np.repeat(np.arange(len(layout.views)), [len(some) for some in layout.rows])
-    good = clues.valid.numpy()[rows]
+    good = inputs.valid.numpy()[rows]
     rows, pixels, blocks = rows[good], pixels[good], blocks[good]
     views = np.array(layout.views)[blocks]
     y, x = np.divmod(pixels, layout.width)
-    points = clues.gaussians.means.numpy()[rows].astype(np.float64)
+    points = inputs.gaussians.means.numpy()[rows].astype(np.float64)
     colors = None
-    if colored and clues.images is not None:
-        base = 0.5 + SH_C0 * clues.gaussians.sh0.numpy()[rows, 0]
-        colors = np.abs(base.clip(0, 1) - clues.images.numpy()[views, y, x]).mean(1)
-    return Sightings(points, np.stack([x, y], 1) + 0.5, views, blocks), colors
+    if colored and inputs.images is not None:
+        base = sh0_to_rgb(inputs.gaussians.sh0.numpy()[rows, 0])
+        colors = np.abs(base.clip(0, 1) - inputs.images.numpy()[views, y, x]).mean(1)
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, views, blocks), colors
 
 
-def color_error(clues: Clues, layout: Layout) -> float:
-    """Mean distance of the base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
-    return _mean(sightings(clues, sampled(layout))[1])
-
-
-def measured(
-    clues: Clues, layout: Layout, frame: Frame, sight: tuple[Sightings, np.ndarray | None] | None = None
-) -> Evidence:
-    """A layout in a frame, measured on some of its rows: those of ``sight``, where they are at hand."""
-    seen, colors = sightings(clues, sampled(layout)) if sight is None else sight
-    errors = pixel_errors(seen, frame.move_cameras(clues.viewmats), clues.Ks)
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(seen.blocks, minlength=len(layout.views)))])
+def score_layout(
+    inputs: AlignmentInput,
+    layout: Layout,
+    frame: Similarity,
+    pairs: tuple[Correspondences, np.ndarray | None] | None = None,
+) -> AlignmentScore:
+    """The score of a layout in a frame, on a sample of its rows: ``pairs``, where they are at hand."""
+    matches, colors = find_correspondences(inputs, sample_layout(layout)) if pairs is None else pairs
+    errors = pixel_errors(matches, frame.move_viewmats(inputs.viewmats), inputs.Ks)
+    bounds = np.concatenate([[0], np.cumsum(np.bincount(matches.blocks, minlength=len(layout.views)))])
     medians = [float(np.median(errors[a:b])) for a, b in itertools.pairwise(bounds) if b > a]
     median = float(np.median(errors)) if len(errors) else math.inf
     limit = pixel_limit(layout.width, layout.height)
     ok = bool(medians) and max(medians) < limit and bool(np.isfinite(errors).mean() > 0.5)
-    return Evidence(layout, frame, median, max(medians, default=math.inf), _mean(colors), ok)
+    return AlignmentScore(layout, frame, median, max(medians, default=math.inf), _mean(colors), ok)
 
 
-def dealt_out(clues: Clues, best: Evidence) -> tuple[float, float]:
-    """Median distance in pixels, and mean distance of the colours, if a reading's pixels were dealt out at random.
-
-    They are dealt out within each block.
-    """
-    rng, some = np.random.default_rng(0), sampled(best.layout)
-    seen, colors = sightings(clues, replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels)))
-    errors = pixel_errors(seen, best.frame.move_cameras(clues.viewmats), clues.Ks)
+def shuffled_score(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float, float]:
+    """Median distance, pixels, and mean distance of the colours, with a reading's pixels shuffled within each block."""
+    rng, some = np.random.default_rng(0), sample_layout(best.layout)
+    shuffled = replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels))
+    pairs, colors = find_correspondences(inputs, shuffled)
+    errors = pixel_errors(pairs, best.frame.move_viewmats(inputs.viewmats), inputs.Ks)
     return float(np.median(errors)), _mean(colors)
+
+
+def color_error(inputs: AlignmentInput, layout: Layout) -> float:
+    """Mean distance of the base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
+    return _mean(find_correspondences(inputs, sample_layout(layout))[1])
 
 
 def _mean(colors: np.ndarray | None) -> float:
     return math.nan if colors is None or not len(colors) else float(colors.mean())
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How well every view's own Gaussians project into their own pixels.
+
+    Args:
+        median_px: Median distance from the pixel centre per view, pixels; inf where most are behind the camera,
+            NaN where a view has no finite Gaussian.
+        share_in_front: Share of all checked Gaussians with positive depth in their own view.
+        share_within_1px: Share of all checked Gaussians at most one pixel from their pixel's centre.
+        limit_px: Largest median that counts as aligned.
+        ok: Whether every view's median is below the limit and most Gaussians are in front.
+    """
+
+    median_px: tuple[float, ...]
+    share_in_front: float
+    share_within_1px: float
+    limit_px: float
+    ok: bool
+
+    @property
+    def worst_px(self) -> float:
+        """The largest median of a view."""
+        return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """Some pixels of every view: ``points`` [v,s,3] float64, ``pixels`` [s,2] centres, ``valid`` [v,s]."""
+
+    points: Tensor
+    pixels: Tensor
+    valid: Tensor
+
+
+def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Alignment:
+    """Project a sample of every view's own Gaussians into that view.
+
+    Args:
+        gaussians: V·H·W rows, assumed to be in view-major, row-major order.
+        cameras: The V views.
+        valid: ``[V,H,W]`` or ``[V·H·W]`` bool; rows that are False are left out.
+
+    Raises:
+        ValueError: If the number of rows is not V·H·W.
+    """
+    return check_sample(sample_pixels(gaussians, cameras, valid), cameras)
+
+
+def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> PixelSample:
+    """The sample of :func:`check_alignment`."""
+    views, width, pixels = len(cameras), cameras.width, cameras.width * cameras.height
+    if len(gaussians) != views * pixels:
+        raise ValueError(f"expected {views} x {cameras.height} x {width} Gaussians, got {len(gaussians)}")
+    step = -(-pixels // MAX_CHECKED)
+    while math.gcd(step, width) > 1:  # a step that divides the width would only see some columns
+        step += 1
+    ids = torch.arange(0, pixels, step)
+    centres = torch.stack([ids % width, ids.div(width, rounding_mode="floor")], 1).double() + 0.5
+    points = gaussians.means.reshape(views, pixels, 3)[:, ids].double()
+    return PixelSample(points, centres, valid.reshape(views, pixels)[:, ids])
+
+
+def check_sample(sample: PixelSample, cameras: Cameras) -> Alignment:
+    """:func:`check_alignment` of a sample under cameras that may be others."""
+    limit = pixel_limit(cameras.width, cameras.height)
+    xy, depth = project_points(sample.points, cameras.viewmats.double(), cameras.Ks.double())
+    in_front = depth > 0
+    distance = (xy - sample.pixels).norm(dim=-1)
+    distance = torch.where(in_front, distance, torch.inf).nan_to_num(nan=torch.inf, posinf=torch.inf)
+    median = [float(d[ok].median()) if ok.any() else math.nan for d, ok in zip(distance, sample.valid, strict=True)]
+    count = max(1, int(sample.valid.sum()))
+    share = float((in_front & sample.valid).sum()) / count
+    near = float(((distance <= 1) & sample.valid).sum()) / count
+    fits = [m < limit for m in median if not math.isnan(m)]
+    return Alignment(tuple(median), share, near, limit, bool(fits) and all(fits) and share > 0.5)

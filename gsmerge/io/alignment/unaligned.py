@@ -1,4 +1,4 @@
-"""Whether Gaussians that belong to no pixels lie where the cameras look."""
+"""Whether the cameras see Gaussians that belong to no pixels."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from gsmerge.io.alignment.layouts import exact_layouts, thinned
-from gsmerge.io.alignment.similarity import Sightings, pixel_errors, pose_from_grid
-from gsmerge.io.alignment.verify import pixel_limit
-from gsmerge.types import SH_C0, Cameras, Gaussians
+from gsmerge.geometry import project_points, sh0_to_rgb
+from gsmerge.io.alignment.layouts import exact_layouts, subsample
+from gsmerge.io.alignment.score import pixel_limit
+from gsmerge.io.alignment.similarity import Correspondences, pixel_errors, solve_pose
+from gsmerge.types import Cameras, Gaussians
 
-_SAMPLES = 20_000  # Gaussians that are looked for
+_SAMPLES = 20_000  # Gaussians that are projected
 _MIN_SEEN = 0.5  # share of them that some camera sees
-_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from pixels taken at random
+_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
+_SAME_COLORS = 0.01  # mean distance of the colours from random pixels below which photos say nothing
 
 
 @dataclass(frozen=True)
-class Sight:
+class CameraCheck:
     """What the cameras see of some Gaussians.
 
     Args:
         share_seen: Share of the Gaussians inside at least one picture.
-        color_ratio: How far their colours are from the photos where they are seen, as a share of how far they are
-            from the same pixels shuffled; NaN without photos, or where the colours hardly vary.
+        color_ratio: Distance of their colours from the photos where they are seen, over the distance from the same
+            pixels shuffled; NaN without photos, or where the colours hardly vary.
         ok: Whether these are likely the cameras of these Gaussians.
     """
 
@@ -34,11 +36,11 @@ class Sight:
 
     @property
     def score(self) -> float:
-        """0 to 1, to compare cameras by: the share that is seen, less where the colours are any others' as well."""
+        """0 to 1, to rank cameras by: the share that is seen, reduced where colours fit little better than random."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """The figures in one sentence."""
         seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
         if np.isnan(self.color_ratio):
@@ -46,56 +48,53 @@ class Sight:
         return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as any others"
 
 
-def sight(gaussians: Gaussians, valid: Tensor, cameras: Cameras, images: Tensor | None) -> Sight:
+def check_cameras(gaussians: Gaussians, valid: Tensor, cameras: Cameras, images: Tensor | None) -> CameraCheck:
     """Project some Gaussians into all views and compare them with what is there.
 
     Args:
         gaussians: n rows.
-        valid: ``[n]`` bool; the others are not looked at.
+        valid: ``[n]`` bool; the others are left out.
         cameras: In the frame of the Gaussians, as far as known.
         images: ``[c,h,w,3]``, or None.
     """
     rows = np.flatnonzero(valid.numpy())
     rows = rows[:: max(1, len(rows) // _SAMPLES)]
     points = gaussians.means.numpy()[rows].astype(np.float64)
-    colors = (0.5 + SH_C0 * gaussians.sh0.numpy()[rows, 0]).clip(0, 1)
-    seen, errors, others = np.zeros(len(rows), bool), [], []
+    colors = sh0_to_rgb(gaussians.sh0.numpy()[rows, 0]).clip(0, 1)
+    visible, errors, others = np.zeros(len(rows), bool), [], []
     rng = np.random.default_rng(0)
-    for view, (viewmat, K) in enumerate(
-        zip(cameras.viewmats.double().numpy(), cameras.Ks.double().numpy(), strict=True)
-    ):
-        image = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    for view in range(len(cameras)):
         with np.errstate(all="ignore"):
-            xy = np.floor(image[:, :2] / image[:, 2:])
-        inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
-        seen |= inside
+            xy, depth = project_points(points, viewmats[view], Ks[view])
+            xy = np.floor(xy)
+        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
+        visible |= inside
         if images is not None and inside.any():
             x, y = xy[inside].astype(np.int64).T
             photo = images[view].numpy()[y, x]
             errors.append(np.abs(colors[inside] - photo).mean(1))
             others.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
-    share = float(seen.mean())
-    ratio = np.nan
-    if errors and (other := float(np.concatenate(others).mean())) > 0.01:
+    share, ratio = float(visible.mean()), np.nan
+    if errors and (other := float(np.concatenate(others).mean())) > _SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other
-    return Sight(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
+    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
 
 
 def looks_like_a_grid(gaussians: Gaussians, valid: Tensor, cameras: Cameras) -> bool:
     """Whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then."""
     layouts = exact_layouts(len(gaussians), len(cameras), cameras.width, cameras.height)
-    full = next(layout for layout in layouts if layout.is_plain)
-    small = thinned(full, 2000)
+    small = subsample(next(layout for layout in layouts if layout.is_plain), 2000)
     rows, pixels = small.rows[0], small.pixels[0]
     good = valid.numpy()[rows]
     y, x = np.divmod(pixels[good], cameras.width)
     points = gaussians.means.numpy()[rows[good]].astype(np.float64)
     none = np.zeros(len(points), np.int64)
-    seen = Sightings(points, np.stack([x, y], 1) + 0.5, none, none)
+    pairs = Correspondences(points, np.stack([x, y], 1) + 0.5, none, none)
     K = cameras.Ks.double().numpy()[:1]
-    pose = pose_from_grid(seen, 0, K[0])
+    pose = solve_pose(pairs, 0, K[0])
     if pose is None:
         return False
     # the intrinsics may be what is wrong: a pose that takes most of it up is enough
     limit = 4 * pixel_limit(cameras.width, cameras.height)
-    return bool(np.median(pixel_errors(seen, pose[None], K)) < limit)
+    return bool(np.median(pixel_errors(pairs, pose[None], K)) < limit)

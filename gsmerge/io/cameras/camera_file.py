@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,10 +13,10 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
-from gsmerge.io.cameras.lens import Lens
 from gsmerge.types import Cameras
 
-_MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # what no camera has, and would overflow later
+_MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
+_MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
@@ -27,6 +28,31 @@ C2W_OPENCV: Convention = ("camera-to-world", "OpenCV")
 W2C_OPENGL: Convention = ("world-to-camera", "OpenGL")
 C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
 CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens that is no pinhole.
+
+    Args:
+        name: As the camera file calls the model.
+        model: "perspective": radial and tangential, as ``cv2.undistort``; "fisheye": as ``cv2.fisheye``.
+        coefficients: The first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0.
+    """
+
+    name: str
+    model: Literal["perspective", "fisheye"]
+    coefficients: tuple[float, ...]
+
+
+def perspective(name: str, coefficients: Sequence[float]) -> Lens | None:
+    """A lens with coefficients in the order k1, k2, p1, p2, k3, k4, k5, k6; None where all are zero: a pinhole."""
+    return Lens(name, "perspective", tuple(coefficients)) if any(coefficients) else None
+
+
+def fisheye(name: str, coefficients: Sequence[float]) -> Lens:
+    """A fisheye with up to four coefficients; with none of them it is no pinhole either."""
+    return Lens(name, "fisheye", tuple(coefficients))
 
 
 @dataclass(frozen=True)
@@ -88,7 +114,8 @@ def make_camera_file(
         lenses: None for a pinhole; empty for pinholes throughout.
 
     Raises:
-        SceneError: If there is no camera, a number is not finite, a rotation is none, or a focal length not positive.
+        SceneError: If there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is
+            not positive.
     """
     if len(poses) == 0:
         raise SceneError(path, "expected at least one camera, found none")
@@ -141,7 +168,7 @@ def _check(path: str | os.PathLike[str], poses: np.ndarray, Ks: np.ndarray, name
         if largest > _MAX_NUMBER:
             raise SceneError(path, f"view {name}: expected numbers up to {_MAX_NUMBER:g}, found {largest:g}")
         rotation = pose[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 0.02:
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_ROTATION_ERROR:
             raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
         if np.linalg.det(rotation) < 0:
             raise SceneError(
@@ -168,8 +195,24 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
     return np.linalg.inv(poses) if direction == "camera-to-world" else poses
 
 
+def describe(convention: Convention) -> str:
+    """A convention in words."""
+    return f"{convention[0]} matrices with {convention[1]} axes"
+
+
+def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
+    """The same file, its poses read in another convention."""
+    stored = from_viewmats(camera_file.viewmats.numpy(), camera_file.convention)
+    return replace(camera_file, viewmats=torch.from_numpy(to_viewmats(stored, convention)), convention=convention)
+
+
+def with_poses(cameras: Cameras, viewmats: np.ndarray) -> Cameras:
+    """The same cameras at other poses ``[c,4,4]``."""
+    return replace(cameras, viewmats=torch.from_numpy(viewmats))
+
+
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
-    """The named views, in that order."""
+    """The views of these ids, in that order."""
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     return replace(
@@ -184,10 +227,13 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     )
 
 
+def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
+    return sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
+
+
 def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
     """All (width, height) that the file's cameras are known to have."""
-    found = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
-    return [(w, h) for w, h in found if min(w, h) > 0 and (w, h) != (1, 1)]
+    return [(w, h) for w, h in _stored_sizes(camera_file) if min(w, h) > 0 and (w, h) != (1, 1)]
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
@@ -208,12 +254,12 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
             f"view {name}: expected a pinhole camera, found {lens.name} with lens distortion",
             "undistort the images first",
         )
-    found = sorted(set(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True)))
     if size is None:
-        if len(found) > 1:
-            sizes = " and ".join(f"{w} x {h}" for w, h in found[:2])
+        stored = _stored_sizes(camera_file)
+        if len(stored) > 1:
+            sizes = " and ".join(f"{w} x {h}" for w, h in stored[:2])
             raise SceneError(camera_file.path, f"expected cameras of one image size, found {sizes}")
-        size = found[0]
+        size = stored[0]
         if 0 in size or size == (1, 1):
             raise SceneError(camera_file.path, "expected the image size (w, h) of the cameras, found none")
     check_pixels(camera_file.path, *size)

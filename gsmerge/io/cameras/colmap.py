@@ -12,8 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.cameras.lens import Lens, fisheye, perspective
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, Lens, fisheye, make_camera_file, perspective
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -78,7 +77,7 @@ def read_colmap(folder: Path) -> CameraFile:
 
 @contextmanager
 def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """A file as bytes that are only read where they are looked at; an empty one raises ValueError."""
+    """A file as bytes that are only read where they are used; an empty one raises ValueError."""
     check_file(path)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         yield data
@@ -106,8 +105,8 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
         )
     one = model in _ONE_FOCAL
     fx, fy, cx, cy = (params[0], params[0], *params[1:3]) if one else params[:4]
-    bent = params[3 if one else 4 : _NUM_PARAMS[model]]
-    lens = fisheye(model, bent) if model in _FISHEYE else perspective(model, bent)
+    distortion = params[3 if one else 4 : _NUM_PARAMS[model]]
+    lens = fisheye(model, distortion) if model in _FISHEYE else perspective(model, distortion)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size, lens
 
 

@@ -52,7 +52,7 @@ def holds_images(path: Path) -> bool:
 
 
 def read_depths(path: Path) -> np.ndarray | None:
-    """The depth maps ``[c,h,w]`` beside the cameras; None where there are none."""
+    """The depth maps ``[c,h,w]`` of the cameras' file; None without any."""
     if path.suffix != ".npz" or array_names(path).isdisjoint(_DEPTHS):
         return None
     depths = _first(read_arrays(path, _DEPTHS), _DEPTHS)
@@ -111,7 +111,7 @@ def as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Intrinsics at the given size: these networks keep the principal point in the middle, which tells their size."""
+    """Intrinsics at the given size: these networks keep the principal point in the middle."""
     middle = np.maximum(Ks[:, :2, 2], _SMALL)
     ratio_x, ratio_y = 2 * middle[:, 0] / width, 2 * middle[:, 1] / height
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)

@@ -1,4 +1,4 @@
-"""``cameras.json`` beside an INRIA model."""
+"""``cameras.json`` of an INRIA model."""
 
 from __future__ import annotations
 

@@ -1,45 +1,49 @@
-"""Lens distortion: what camera files say of it, and photos without it."""
+"""Photos without lens distortion."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import CameraFile, Lens, sizes_of, to_cameras
+from gsmerge.io.photos import Photos, photo_size, same_shape
 from gsmerge.runtime.threads import parallel_map
 
 
-@dataclass(frozen=True)
-class Lens:
-    """A lens that is no pinhole.
+def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
+    """Photos without lens distortion and cameras that are pinholes, with the same intrinsics; and a note about it.
 
-    Args:
-        name: As the camera file calls the model.
-        model: "perspective": radial and tangential, as ``cv2.undistort``; "fisheye": as ``cv2.fisheye``.
-        coefficients: The first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0.
+    Raises:
+        SceneError: If a lens is no pinhole and there are no photos of the camera's shape.
     """
+    if not camera_file.lenses:
+        return camera_file, photos, []
+    pinholes = replace(camera_file, lenses=())
+    name = next(lens.name for lens in camera_file.lenses if lens is not None)
+    size = photo_size(photos)
+    if photos is None or size is None:
+        raise SceneError(
+            camera_file.path,
+            f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images",
+            "name the images with --images, or undistort them first",
+        )
+    other = next((s for s in sizes_of(camera_file) if not same_shape(s, size)), None)
+    if other is not None:
+        raise SceneError(
+            camera_file.path,
+            f"expected images of the cameras' {other[0]} x {other[1]} to undistort ({name}), found"
+            f" {size[0]} x {size[1]}",
+            "give the images as they were taken, or undistort them first",
+        )
+    straight = undistort_photos(photos, to_cameras(pinholes, size).Ks.numpy(), camera_file.lenses)
+    return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
 
-    name: str
-    model: Literal["perspective", "fisheye"]
-    coefficients: tuple[float, ...]
 
-
-def perspective(name: str, coefficients: Sequence[float]) -> Lens | None:
-    """A lens with coefficients in the order k1, k2, p1, p2, k3, k4, k5, k6; None where all are zero: a pinhole."""
-    return Lens(name, "perspective", tuple(coefficients)) if any(coefficients) else None
-
-
-def fisheye(name: str, coefficients: Sequence[float]) -> Lens:
-    """A fisheye with up to four coefficients; with none of them it is no pinhole either."""
-    return Lens(name, "fisheye", tuple(coefficients))
-
-
-def undistorted(
-    photos: Sequence[np.ndarray] | np.ndarray, Ks: np.ndarray, lenses: Sequence[Lens | None]
-) -> list[np.ndarray]:
+def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> list[np.ndarray]:
     """The photos that pinholes with the same intrinsics would have taken.
 
     Args:

@@ -1,4 +1,4 @@
-"""The dataset file that Long-LRM reads, and the two files with which it says how it moved the world."""
+"""The dataset file that Long-LRM reads, and the two files that say how it moved the world."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_text
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
 
-CHOSEN, MOVED, SCALED = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
+FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
 
 
 def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Beside it Long-LRM leaves which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in the
+    Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in the
     cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world.
 
     Raises:
@@ -35,11 +35,11 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
             raise SceneError(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers ({error})") from error
         Ks.append(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
         names.append(name)
-    chosen = _numbers(path.with_name(CHOSEN))
-    ids = range(len(names)) if chosen is None else [round(value) for value in chosen.reshape(-1)]
+    frame_ids = _numbers(path.with_name(FRAMES_FILE))
+    ids = range(len(names)) if frame_ids is None else [round(value) for value in frame_ids.reshape(-1)]
     odd = next((i for i in ids if not 0 <= i < len(names)), None)
     if odd is not None:
-        raise SceneError(path.with_name(CHOSEN), f"expected frames 0 to {len(names) - 1}, found {odd:.6g}")
+        raise SceneError(path.with_name(FRAMES_FILE), f"expected frames 0 to {len(names) - 1}, found {odd:.6g}")
     with np.errstate(all="ignore"):  # what overflows is refused with the cameras
         moved = _moved(path, np.array([poses[i] for i in ids]).reshape(-1, 4, 4))
     return make_camera_file(
@@ -49,17 +49,17 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
 
 def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
     """World-to-camera matrices of the Gaussians' world: with X' = s (A X), the rotation is R inv(A), the shift s t'."""
-    move, scale = _numbers(path.with_name(MOVED)), _numbers(path.with_name(SCALED))
+    move, scale = _numbers(path.with_name(POSE_FILE)), _numbers(path.with_name(SCALE_FILE))
     if move is not None:
         if move.size != 16:
-            raise SceneError(path.with_name(MOVED), f"expected 16 numbers, found {move.size}")
+            raise SceneError(path.with_name(POSE_FILE), f"expected 16 numbers, found {move.size}")
         try:
             viewmats = viewmats @ np.linalg.inv(move.reshape(4, 4))
         except np.linalg.LinAlgError as error:
-            raise SceneError(path.with_name(MOVED), "expected a matrix that can be inverted") from error
+            raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
     if scale is not None:
         if scale.size != 1 or not scale.reshape(-1)[0] > 0:
-            raise SceneError(path.with_name(SCALED), "expected one positive number")
+            raise SceneError(path.with_name(SCALE_FILE), "expected one positive number")
         viewmats[:, :3, 3] *= scale.reshape(-1)[0]
     return viewmats
 

@@ -14,7 +14,7 @@ import torch
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.photos import decode_photos
+from gsmerge.io.photos import decode_embedded
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
@@ -75,13 +75,13 @@ def _load(path: Path) -> list[Mapping[str, Any]]:
 def _chosen(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> Mapping[str, Any]:
     if len(entries) == 1:
         return entries[0]
-    found = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
-    if len(found) == 1:
-        return found[0]
+    named = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
+    if len(named) == 1:
+        return named[0]
     keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
     raise SceneError(
         path,
-        f"expected one scene with the key {scene!r}, found {len(found)} among {len(entries)} ({keys}, ...)",
+        f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)",
         "name the .ply as its scene is named",
     )
 
@@ -107,11 +107,11 @@ def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
     if images is None or (isinstance(images, list | tuple) and not images):
         return None
     if not isinstance(images, list | tuple) or len(images) != len(names):
-        found = len(images) if isinstance(images, list | tuple) else type(images).__name__
-        raise SceneError(path, f"expected {len(names)} images, one per camera, found {found}")
+        count = len(images) if isinstance(images, list | tuple) else type(images).__name__
+        raise SceneError(path, f"expected {len(names)} images, one per camera, found {count}")
     limit = path.stat().st_size
     for image in images:
         plain = isinstance(image, torch.Tensor) and image.ndim == 1 and image.dtype == torch.uint8
         if not plain or not _has_values(image) or image.numel() > limit or not image.is_contiguous():
             raise SceneError(path, "expected images as tensors [bytes] of uint8, found others")
-    return decode_photos(path, names, [image.numpy() for image in images], _MAX_PHOTOS)
+    return decode_embedded(path, names, [image.numpy() for image in images], _MAX_PHOTOS)

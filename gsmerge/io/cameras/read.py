@@ -1,4 +1,4 @@
-"""Telling camera files apart."""
+"""Finding camera files and choosing their reader."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsmerge.io.cameras.trajectory import is_trajectory, read_trajectory
 from gsmerge.io.cameras.transforms import read_transforms
 from gsmerge.io.cameras.world_mirror import read_world_mirror
 
-# Where cameras lie beside a scene, the first that exists wins; a COLMAP model right in the folder comes last,
+# Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
     "views.npz",
@@ -68,10 +68,10 @@ def read_cameras(path: str | os.PathLike[str], *, scene: str | None = None) -> C
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if path.is_dir():
-        found = path if is_colmap(path) else find_cameras(path)
-        if found is None:
+        inside = path if is_colmap(path) else find_cameras(path)
+        if inside is None:
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
-        path = found
+        path = inside
     if path.is_dir():
         return read_colmap(path)
     check_file(path)

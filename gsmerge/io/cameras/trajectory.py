@@ -16,7 +16,7 @@ INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 def read_trajectory(path: Path) -> CameraFile:
     """Cameras of a text file with 12 or 16 numbers a line: camera-to-world, OpenCV axes, row by row.
 
-    Beside it lies ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or
+    Next to it is ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or
     one for each. The images have the size.
 
     Raises:
@@ -24,12 +24,13 @@ def read_trajectory(path: Path) -> CameraFile:
     """
     rows = _rows(path, (12, 16))
     poses = [row.reshape(-1, 4) for row in rows]
-    beside = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
-    if beside is None:
-        raise SceneError(path, f"expected the intrinsics beside it in {INTRINSICS[0]}, found none", "write fx fy cx cy")
-    values = _rows(beside, (4,))
+    intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
+    if intrinsics is None:
+        problem = f"expected the intrinsics next to it in {INTRINSICS[0]}, found none"
+        raise SceneError(path, problem, "write fx fy cx cy")
+    values = _rows(intrinsics, (4,))
     if len(values) not in (1, len(poses)):
-        raise SceneError(beside, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
+        raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
     Ks = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in values]
     Ks = Ks * len(poses) if len(Ks) == 1 else Ks
     names = [f"{view:06d}" for view in range(len(poses))]
@@ -56,8 +57,8 @@ def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
         except ValueError as error:
             raise SceneError(path, f"line {number}: expected numbers ({error})") from error
         if len(row) not in lengths:
-            wanted = " or ".join(map(str, lengths))
-            raise SceneError(path, f"line {number}: expected {wanted} numbers, found {len(row)}")
+            counts = " or ".join(map(str, lengths))
+            raise SceneError(path, f"line {number}: expected {counts} numbers, found {len(row)}")
         rows.append(row)
         if len(rows) > MAX_VIEWS:
             raise SceneError(path, f"expected at most {MAX_VIEWS} views, found more")

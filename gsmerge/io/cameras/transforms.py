@@ -10,13 +10,20 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, CameraFile, make_camera_file
-from gsmerge.io.cameras.lens import Lens, fisheye, perspective
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENCV,
+    C2W_OPENGL,
+    CameraFile,
+    Lens,
+    fisheye,
+    make_camera_file,
+    perspective,
+)
 from gsmerge.io.photos import find_image, image_size
 
 _PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
-_BENT = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
-_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_BENT}
+_DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _UNDISTORT = "undistort the images first"
 
 
@@ -89,13 +96,13 @@ def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     """The lens of one frame, None for a pinhole."""
     model = str(values.get("camera_model", "PINHOLE")).upper()
-    found = {key: float(values.get(key) or 0) for key in (*_PARAMS, "k5", "k6")}
+    params = {key: float(values.get(key) or 0) for key in (*_PARAMS, "k5", "k6")}
     listed = [float(value) for value in values.get("distortion_params") or ()]
-    if not any(found.values()):
-        found |= dict(zip(_PARAMS, listed, strict=False))
+    if not any(params.values()):
+        params |= dict(zip(_PARAMS, listed, strict=False))
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
-        return fisheye("OPENCV_FISHEYE", [found[key] for key in ("k1", "k2", "k3", "k4")])
-    odd = next((key for key in ("k4", "k5", "k6") if found[key]), None)
+        return fisheye("OPENCV_FISHEYE", [params[key] for key in ("k1", "k2", "k3", "k4")])
+    odd = next((key for key in ("k4", "k5", "k6") if params[key]), None)
     if model not in _PERSPECTIVE or odd is not None:
         what = (
             f"camera model {model}" if odd is None else f"lens distortion {odd}, which formats understand differently"
@@ -103,4 +110,6 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
         raise SceneError(
             path, f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {what}", _UNDISTORT
         )
-    return perspective(model if model in _BENT else "OPENCV", [found[key] for key in ("k1", "k2", "p1", "p2", "k3")])
+    return perspective(
+        model if model in _DISTORTED else "OPENCV", [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
+    )

@@ -16,7 +16,7 @@ def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Cameras of a parsed ``camera_params.json``.
 
     ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
-    axes, intrinsics in pixels of the processed size, which the file does not tell: the images have it. ``camera_id``
+    axes, intrinsics in pixels of the processed size, which only the images have. ``camera_id``
     is the stem of the image's name, or the image's number, by which the cameras are then sorted.
 
     Raises:
@@ -37,7 +37,7 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     entries = data.get(key)
     if not isinstance(entries, list):
         raise SceneError(path, f"expected {key!r} to be a list, found something else")
-    found = {}
+    matrices = {}
     for entry in entries:
         try:
             name, matrix = str(entry["camera_id"]), np.array(entry["matrix"], np.float64)
@@ -45,5 +45,5 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
             raise SceneError(path, f"{key}: expected entries of 'camera_id' and 'matrix' ({error})") from error
         if matrix.shape not in ((side, side), (3, side)):
             raise SceneError(path, f"{key} of {name}: expected {side}x{side} numbers, found shape {matrix.shape}")
-        found[name] = matrix
-    return found
+        matrices[name] = matrix
+    return matrices

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gsmerge.io.formats.ply_layout import MAX_LOG_SCALE
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.io.formats.ply_file import MAX_LOG_SCALE
+from gsmerge.types import Gaussians
 
 
 @dataclass(frozen=True)
 class Columns:
     """n Gaussians: ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]`` in [0, 1],
-    ``colors [n,3]`` (0.5 + 0.2821 sh0) and ``harmonics [n,k-1,3]``.
+    ``colors [n,3]``, 0 to 1 in range, and ``harmonics [n,k-1,3]``.
     """
 
     means: np.ndarray
@@ -28,12 +29,12 @@ class Columns:
     def __len__(self) -> int:
         return len(self.means)
 
-    def taken(self, order: np.ndarray) -> Columns:
+    def select(self, order: np.ndarray) -> Columns:
         """The rows in another order."""
         return Columns(*(column[order] for column in vars(self).values()))
 
 
-def columns_of(gaussians: Gaussians, max_degree: int) -> Columns:
+def to_columns(gaussians: Gaussians, max_degree: int) -> Columns:
     """Finite Gaussians as arrays, without harmonics above a degree.
 
     Raises:
@@ -57,7 +58,7 @@ def columns_of(gaussians: Gaussians, max_degree: int) -> Columns:
         quats=quats,
         log_scales=log_scales,
         opacities=array(gaussians.opacities).clip(0, 1),
-        colors=0.5 + SH_C0 * array(gaussians.sh0)[:, 0],
+        colors=sh0_to_rgb(array(gaussians.sh0)[:, 0]),
         harmonics=array(gaussians.shN)[:, : (degree + 1) ** 2 - 1],
     )
 

@@ -7,14 +7,17 @@ any, as bytes in an element ``sh``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyListProperty
 
 from gsmerge.errors import SceneError
-from gsmerge.io.formats.ply_layout import MEANS, QUATS, REQUIRED, SCALES, SH0
-from gsmerge.types import SH_C0
+from gsmerge.geometry import morton_codes, rgb_to_sh0
+from gsmerge.io.formats.arrays import smallest_three, to_bytes, to_columns
+from gsmerge.io.formats.ply_file import MEANS, QUATS, REQUIRED, SCALES, SH0
+from gsmerge.types import Gaussians
 
 CHUNK = 256  # Gaussians that share a range
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -24,25 +27,26 @@ RANGES = (
 )
 COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
+MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def is_compressed(data: PlyData) -> bool:
-    """Whether a PLY holds packed Gaussians."""
-    return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
+    """Whether a PLY with an element ``chunk`` holds packed Gaussians."""
+    return "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
 def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_layout`, opacities as logits.
+    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_file`, opacities as logits.
 
     Raises:
         SceneError: If chunks are missing or lack a column.
     """
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
-        found = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
-        odd = next((name for name in needed if found.get(name) not in types), None)
+        dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
+        odd = next((name for name in needed if dtypes.get(name) not in types), None)
         if odd is not None:
-            where, kind = f"in element '{element.name}' of a compressed file", found.get(odd, "none")
+            where, kind = f"in element '{element.name}' of a compressed file", dtypes.get(odd, "none")
             raise SceneError(path, f"expected {odd} {where} as {types[0]}, found {kind}")
     count = vertex.count
     if count == 0:
@@ -99,10 +103,10 @@ def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
     missing = np.sqrt(np.clip(1 - sum(part**2 for part in parts), 0, None))
     quats = np.empty((len(words), 4))
     for which in range(4):
-        mine = largest == which
+        own = largest == which
         others = iter(parts)
         for i in range(4):
-            quats[mine, i] = missing[mine] if i == which else next(others)[mine]
+            quats[own, i] = missing[own] if i == which else next(others)[own]
     for i, name in enumerate(QUATS):
         rows[name] = quats[:, i]
 
@@ -118,4 +122,55 @@ def _fill_colors(rows: np.ndarray, words: np.ndarray, ranges: dict[str, np.ndarr
             low, high = ranges[f"min_{channel}"], ranges[f"max_{channel}"]
             with np.errstate(all="ignore"):
                 color = low * (1 - color) + high * color
-        rows[name] = (color - 0.5) / SH_C0
+        rows[name] = rgb_to_sh0(color)
+
+
+def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
+    """Content of a ``.compressed.ply``; rows along a space-filling curve, so that chunks are small.
+
+    Raises:
+        ValueError: If there is NaN or inf.
+    """
+    columns = to_columns(gaussians, MAX_DEGREE)
+    columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))
+    count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
+    low_means, high_means, means = _ranged(columns.means)
+    low_scales, high_scales, scales = _ranged(columns.log_scales)
+    low_colors, high_colors, colors = _ranged(columns.colors)
+    chunks = np.concatenate([low_means, high_means, low_scales, high_scales, low_colors, high_colors], 1)
+    words = np.empty((count, 4), "<u4")
+    words[:, 0], words[:, 2] = _packed(means, (11, 10, 11)), _packed(scales, (11, 10, 11))
+    largest, others = smallest_three(columns.quats)
+    words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / np.sqrt(2.0) + 0.5, (10, 10, 10))
+    words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
+    harmonics = to_bytes(
+        np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1).reshape(count, num_rest)
+    )
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    header += [f"element chunk {len(chunks)}", *(f"property float {name}" for name in (*RANGES, *COLORS))]
+    header += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
+    if num_rest:
+        header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]
+    text = "\n".join([*header, "end_header", ""])
+    return text.encode("ascii") + chunks.astype("<f4").tobytes() + words.tobytes() + harmonics.tobytes()
+
+
+def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Smallest and largest values ``[c,3]`` of every chunk, as float32 holds them, and all values between 0 and 1."""
+    starts = np.arange(0, len(values), CHUNK)
+    if len(starts) == 0:
+        return values, values, values
+    low, high = (
+        reduce.reduceat(values, starts).astype(np.float32).astype(np.float64) for reduce in (np.minimum, np.maximum)
+    )
+    ids, span = np.arange(len(values)) // CHUNK, high - low
+    return low, high, (values - low[ids]) / np.where(span > 0, span, 1)[ids]
+
+
+def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Numbers between 0 and 1 side by side in a word, the first one on top."""
+    words = np.zeros(len(shares), np.uint32)
+    for column, width in zip(shares.T, bits, strict=True):
+        top = 2**width - 1
+        words = words << np.uint32(width) | np.clip(np.floor(column * top + 0.5), 0, top).astype(np.uint32)
+    return words

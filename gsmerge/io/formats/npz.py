@@ -30,8 +30,8 @@ def array_names(path: Path) -> frozenset[str]:
         return frozenset()
 
 
-def read_arrays(path: Path, wanted: Collection[str]) -> dict[str, np.ndarray]:
-    """The wanted arrays that an ``.npz`` has, in its order.
+def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Those of the named arrays that an ``.npz`` has, in its order.
 
     Raises:
         SceneError: If it cannot be read, an array holds anything but numbers and text, or one is larger than its
@@ -44,7 +44,7 @@ def read_arrays(path: Path, wanted: Collection[str]) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(path) as archive, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers in old styles
             members = _members(archive)
-            return {name: _read(path, archive, info) for name, info in members.items() if name in wanted}
+            return {name: _read(path, archive, info) for name, info in members.items() if name in names}
     except SceneError:
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise

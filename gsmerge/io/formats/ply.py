@@ -12,9 +12,9 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats.compressed import is_compressed, unpack
-from gsmerge.io.formats.ply_file import let_go, open_ply
-from gsmerge.io.formats.ply_layout import (
+from gsmerge.io.formats.ply_file import (
     BLOCK_BYTES,
     LOGIT_COMMENT,
     MAX_HARMONIC,
@@ -29,11 +29,13 @@ from gsmerge.io.formats.ply_layout import (
     bytes_by_attribute,
     color_columns,
     layout_name,
+    open_ply,
+    release_block,
     sh_degree,
     spread_low_degree,
 )
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import Gaussians
 
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
 
@@ -42,27 +44,27 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """What was found in a PLY file.
+    """What a PLY file holds.
 
     Args:
         path: The file.
         layout: Name of the column layout, as "17-column export" or "INRIA, SH degree 3".
         format: "ascii", "binary little-endian" or "binary big-endian".
-        count: Gaussians, the set-aside ones included.
+        count: Gaussians, the unusable ones included.
         file_bytes: Size of the file.
         bytes_by_attribute: Bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats,
             extra); of the values' binary types for an ascii file.
         columns: All columns of the vertex element, in the file's order.
-        extra_columns: Those that mean nothing here.
-        extra_elements: Elements beside ``vertex``.
+        extra_columns: Those that are ignored.
+        extra_elements: Elements besides ``vertex``.
         byte_columns: Columns stored as bytes.
         comments: Of the header.
         sh_degree: 0 to 4.
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
-        opacity_guessed: Whether the values themselves told the encoding, not the caller or the file.
+        opacity_guessed: Whether the encoding was guessed from the values, not given by the caller or the file.
         num_nonfinite: Rows with NaN or inf, set aside.
         num_clipped_scales: Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped.
-        num_zero_quats: Gaussians without a rotation, taken as the identity.
+        num_zero_quats: Gaussians without a rotation, read as the identity.
     """
 
     path: str
@@ -92,7 +94,7 @@ class PlyScene:
         gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
             fully transparent and grey, and has the position and scales of the finite row before it.
         valid: ``[n]`` bool, False for the rows that were not finite.
-        info: What was found.
+        info: What the file holds.
     """
 
     gaussians: Gaussians
@@ -126,7 +128,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         opacity: How opacities are stored; "auto" takes them as activated if all finite ones lie in [0, 1], else
             as logits. Infinite logits are opacities of 0 and 1.
 
-    Colours may stand as red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or holds no finite Gaussian.
@@ -136,31 +138,22 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
     data = open_ply(path)
-    compressed = is_compressed(data)
+    compressed = "chunk" in data and is_compressed(data)
     stored = unpack(path, data) if compressed else _vertex(path, data).data
     rows = np.asarray(stored)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
-    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
-    blocks = [slice(start, min(start + size, len(rows))) for start in range(0, len(rows), size)]
-
-    def convert(block: slice) -> _Converted:
-        found = _convert(rows[block], {name: column[block] for name, column in out.items()})
-        let_go(stored, block)
-        return found
-
-    done = parallel_map(convert, blocks)
+    blocks = _convert_all(stored, out)
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    named = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
-    encoding = named or _likely_encoding(done)
+    known = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
+    encoding = known or _likely_encoding(blocks)
     _activate(out["opacities"], out["valid"], encoding)
-    num_bad = _set_aside(path, out)
+    num_bad = _clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
     if byte_columns == NORMALS:
         spread_low_degree(out["shN"])
-    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
-    extra = tuple(name for name in names if name not in used)
+    extra = _extra_columns(names, num_rest)
     info = PlyInfo(
         path=str(path),
         layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
@@ -175,10 +168,10 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         comments=comments,
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
-        opacity_guessed=named is None,
+        opacity_guessed=known is None,
         num_nonfinite=num_bad,
-        num_clipped_scales=sum(d.num_clipped for d in done),
-        num_zero_quats=sum(d.num_zero_quats for d in done),
+        num_clipped_scales=sum(b.num_clipped for b in blocks),
+        num_zero_quats=sum(b.num_zero_quats for b in blocks),
     )
     tensors = {k: torch.from_numpy(v) for k, v in out.items()}
     return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
@@ -186,8 +179,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
 
 def _vertex(path: Path, data: PlyData) -> PlyElement:
     if "vertex" not in data:
-        found = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
-        raise SceneError(path, f"expected an element 'vertex', found {found}")
+        names = ", ".join(f"'{e.name}'" for e in data.elements) or "none"
+        raise SceneError(path, f"expected an element 'vertex', found {names}")
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties}
     missing = [name for name in REQUIRED if name not in columns]
@@ -205,6 +198,25 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     if vertex.count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
     return vertex
+
+
+def _convert_all(stored: np.ndarray, out: dict[str, np.ndarray]) -> list[_Converted]:
+    """Fill the arrays block by block, in parallel."""
+    rows = np.asarray(stored)
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+
+    def convert(start: int) -> _Converted:
+        block = slice(start, min(start + size, len(rows)))
+        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        release_block(stored, block)
+        return converted
+
+    return parallel_map(convert, range(0, len(rows), size))
+
+
+def _extra_columns(names: tuple[str, ...], num_rest: int) -> tuple[str, ...]:
+    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    return tuple(name for name in names if name not in used)
 
 
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
@@ -228,7 +240,7 @@ def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Converted:
-    """What one block of rows had."""
+    """What one block of rows contained."""
 
     num_clipped: int
     num_zero_quats: int
@@ -237,7 +249,7 @@ class _Converted:
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
-    """Fill the arrays of one block of rows, column by column; opacities are copied as they are."""
+    """Fill the arrays of one block of rows, column by column; opacities are only copied."""
     with np.errstate(all="ignore"):
         total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
 
@@ -262,7 +274,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
         for j, name in enumerate(color_columns(rows.dtype.names)):
             column = take_harmonic(name)
             if name in RGB:
-                column = (column / (255 if rows.dtype[name].kind == "u" else 1) - 0.5) / SH_C0
+                column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
             out["sh0"][:, 0, j] = column
         num_higher = out["shN"].shape[1]
         for channel in range(3):
@@ -319,9 +331,9 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
-def _likely_encoding(done: list[_Converted]) -> str:
-    finite = any(d.any_finite_opacity for d in done)
-    return "raw" if finite and all(d.unit_opacities for d in done) else "logit"
+def _likely_encoding(blocks: list[_Converted]) -> str:
+    finite = any(block.any_finite_opacity for block in blocks)
+    return "raw" if finite and all(block.unit_opacities for block in blocks) else "logit"
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
@@ -336,7 +348,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
         np.reciprocal(opacities, out=opacities)
 
 
-def _set_aside(path: Path, out: dict[str, np.ndarray]) -> int:
+def _clear_invalid(path: Path, out: dict[str, np.ndarray]) -> int:
     """Make the invalid rows transparent, in place; returns their number."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)

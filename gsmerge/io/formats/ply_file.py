@@ -1,4 +1,7 @@
-"""Opening a PLY file: its header is weighed against the file's size before anything is allocated for it."""
+"""PLY files of Gaussians: their columns, and opening them with the header checked against the file's size.
+
+Log scales, logits and channel-major harmonics exist only in what reads and writes files.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,19 @@ from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
+
+MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
+MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
+MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
+LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
+
+MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files of plain colours
+SCALES = ("scale_0", "scale_1", "scale_2")
+QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
 MAX_HEADER_BYTES = 1 << 20
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
@@ -27,7 +43,7 @@ def open_ply(path: Path) -> PlyData:
     """A PLY file, mapped into memory where it is binary.
 
     Raises:
-        SceneError: If it is none, is truncated or damaged, or promises more than it holds.
+        SceneError: If it is no PLY file, is truncated or damaged, or its header asks for more than it holds.
     """
     size = check_file(path)
     try:
@@ -37,7 +53,7 @@ def open_ply(path: Path) -> PlyData:
             raise SceneError(
                 path, "expected a PLY file, found one that does not start with the line 'ply'", "name the .ply"
             )
-        _weigh(path, start, size)
+        _check_header(path, start, size)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
             return PlyData.read(str(path), mmap="r")
@@ -55,8 +71,8 @@ def open_ply(path: Path) -> PlyData:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
 
-def let_go(rows: np.ndarray, block: slice) -> None:
-    """Drop a block of rows of a mapped file from the process's memory; looked at again, it is read again."""
+def release_block(rows: np.ndarray, block: slice) -> None:
+    """Drop a block of rows of a mapped file from the process's memory; used again, it is read again."""
     mapped = getattr(rows, "_mmap", None)
     if not isinstance(rows, np.memmap) or mapped is None or not hasattr(mmap, "MADV_DONTNEED"):
         return
@@ -66,24 +82,26 @@ def let_go(rows: np.ndarray, block: slice) -> None:
     mapped.madvise(mmap.MADV_DONTNEED, start, end - start)
 
 
-def promised(path: Path) -> tuple[int, int]:
-    """Gaussians that a PLY file promises, and their columns of higher harmonics, from its header alone.
-
-    Zeros where there is none that can be read.
-    """
+def header_counts(path: Path) -> tuple[int, int]:
+    """Gaussians and columns of higher harmonics that a PLY file's header says; zeros where it cannot be read."""
     try:
         with path.open("rb") as file:
             header = file.read(1 << 16).partition(b"end_header")[0]
     except OSError:
         return 0, 0
-    found = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
-    return int(found[1]) if found else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
+    match = re.search(rb"^element vertex (\d{1,12})\s*$", header, re.MULTILINE)
+    return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
 
 
-def _weigh(path: Path, start: bytes, size: int) -> None:
+def _check_header(path: Path, start: bytes, size: int) -> None:
     """Refuse a header that never ends, and elements with more rows than the rest of the file has bytes for.
 
-    What else may be wrong with a header is left to the parser, which says it better.
+    Everything else is left to the parser.
+
+    Args:
+        path: The file, for messages.
+        start: Its first bytes.
+        size: Of the file, bytes.
     """
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
@@ -127,3 +145,55 @@ def _is_int(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def sh_degree(num_rest: int) -> int:
+    """SH degree of that many ``f_rest`` columns."""
+    return round((num_rest / 3 + 1) ** 0.5) - 1
+
+
+def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The columns that hold the base colour."""
+    return SH0 if names is None or SH0[0] in names else RGB
+
+
+def spread_low_degree(shN: np.ndarray) -> None:
+    """Put harmonics of a low degree in their places, where the columns are those of degree 3; in place.
+
+    Long-LRM writes 45 columns whatever the degree: those of degree 1 (or 2) are channel-major in the first 9 (or 24).
+
+    Args:
+        shN: ``[n,15,3]`` as read from columns of degree 3; others are left alone.
+    """
+    if shN.shape[1] != 15:
+        return
+    columns = shN.transpose(0, 2, 1).reshape(len(shN), 45)
+    last = int(np.flatnonzero(columns.any(0)).max(initial=-1))
+    for higher in (3, 8):
+        if 0 <= last < 3 * higher:
+            shN[:] = 0
+            shN[:, :higher] = columns[:, : 3 * higher].reshape(-1, 3, higher).transpose(0, 2, 1)
+            return
+
+
+def layout_name(names: tuple[str, ...], num_rest: int) -> str:
+    """What to call a file with these columns."""
+    normals = set(NORMALS) <= set(names)
+    if SH0[0] not in names:
+        return "columns of red, green and blue"
+    if num_rest == 0:
+        return "17-column export" if normals else "14-column export (no normals)"
+    return f"INRIA, SH degree {sh_degree(num_rest)}" + ("" if normals else " (no normals)")
+
+
+def bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, int]:
+    """Bytes of all rows by attribute; ``extra`` are the columns that are ignored."""
+    groups = {"means": MEANS, "normals": NORMALS, "sh0": color_columns(rows.dtype.names), "opacities": ("opacity",)}
+    groups |= {"scales": SCALES, "quats": QUATS, "extra": extra}
+    of = {name: kind for kind, names in groups.items() for name in names}
+    sizes: dict[str, int] = {}
+    assert rows.dtype.names is not None
+    for name in rows.dtype.names:
+        kind = of.get(name, "shN")
+        sizes[kind] = sizes.get(kind, 0) + rows.dtype[name].itemsize * len(rows)
+    return sizes

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats.ply_layout import (
+from gsmerge.io.formats.ply_file import (
     BLOCK_BYTES,
     LOGIT_COMMENT,
     MAX_LOG_SCALE,
@@ -53,19 +54,48 @@ def write_ply(
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
     num_higher = (degree + 1) ** 2 - 1
-    names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher))]
-    names += ["opacity", *SCALES, *QUATS]
-    header = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}"]
-    header += [*(f"comment {comment}" for comment in comments), f"element vertex {len(gaussians)}"]
-    header += [*(f"property float {name}" for name in names), "end_header", ""]
-    block = max(1, BLOCK_BYTES // (4 * len(names)))
+    header, num_columns = _header(len(gaussians), degree, comments)
+    block = max(1, BLOCK_BYTES // (4 * num_columns))
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write(header)
         for start in range(0, len(gaussians), block):
             rows = _stored(gaussians[start : start + block], num_higher)
             if not np.isfinite(rows).all():
                 raise ValueError(f"expected finite Gaussians, got NaN or inf in rows from {start}")
             file.write(rows.data)
+
+
+def _header(count: int, sh_degree: int, comments: Sequence[str] = ()) -> tuple[bytes, int]:
+    """The header of a file of that many Gaussians, and its number of columns, all of them float32."""
+    num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}"]
+    lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
+    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+    return "\n".join(lines).encode("ascii"), len(names)
+
+
+def file_bytes(count: int, sh_degree: int) -> int:
+    """Size of the ``.ply`` of that many Gaussians, as :func:`write_ply` writes it without comments."""
+    header, num_columns = _header(count, sh_degree)
+    return len(header) + 4 * num_columns * count
+
+
+def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
+    """Largest number of Gaussians whose ``.ply`` has at most ``max_bytes``.
+
+    Raises:
+        ValueError: If the degree is not 0 to 4.
+        UsageError: If not even one fits.
+    """
+    if not 0 <= sh_degree <= 4:
+        raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
+    if max_bytes < file_bytes(1, sh_degree):
+        raise UsageError(f"max bytes: expected at least {file_bytes(1, sh_degree)} for one Gaussian, got {max_bytes}")
+    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - file_bytes(1, sh_degree))
+    while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
+        count -= 1
+    return count
 
 
 def _stored(part: Gaussians, num_higher: int) -> np.ndarray:

@@ -15,10 +15,10 @@ import struct
 
 import numpy as np
 
-from gsmerge.io.formats.arrays import Columns, columns_of, smallest_three, to_bytes
+from gsmerge.io.formats.arrays import Columns, smallest_three, to_bytes, to_columns
 from gsmerge.types import SH_C0, Gaussians
 
-MAX_DEGREE = 3  # of four degrees older readers know nothing
+MAX_DEGREE = 3  # older readers do not know degree 4
 MAGIC, VERSION = 0x5053474E, 3
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
@@ -32,7 +32,7 @@ def spz_bytes(gaussians: Gaussians) -> bytes:
     Raises:
         ValueError: If there is NaN or inf.
     """
-    columns = columns_of(gaussians, MAX_DEGREE)
+    columns = to_columns(gaussians, MAX_DEGREE)
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
     fraction = _fraction_bits(columns.means)
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(columns), degree, fraction, 0, 0)
@@ -52,9 +52,9 @@ def _fraction_bits(means: np.ndarray) -> int:
     if len(means) == 0:
         return 0
     size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
-    wanted = FINE - np.log2(max(size, 1e-6))
+    fine = FINE - np.log2(max(size, 1e-6))
     left = np.log2(LARGEST / max(np.abs(means).max(), 1e-6))
-    return int(np.clip(min(np.ceil(wanted), np.floor(left)), 0, MAX_FRACTION))
+    return int(np.clip(min(np.ceil(fine), np.floor(left)), 0, MAX_FRACTION))
 
 
 def _positions(columns: Columns, fraction: int) -> bytes:

@@ -6,21 +6,25 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats import compressed_writer, splat_writer, spz_writer
-from gsmerge.io.formats.compressed_writer import compressed_bytes
+from gsmerge.io.formats import compressed, spz_writer
+from gsmerge.io.formats.arrays import to_bytes, to_columns
 from gsmerge.io.formats.ply_writer import write_ply
-from gsmerge.io.formats.splat_writer import splat_bytes
-from gsmerge.io.formats.spz_writer import spz_bytes
 from gsmerge.types import Gaussians
+
+# ``.splat``: 32 bytes per Gaussian and no header, the format of antimatter15/splat that most viewers read. Quaternions
+# wxyz are bytes 128 + 128 q; there is no room for harmonics above degree 0.
+SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
 OUTPUT_FORMATS = {
-    ".compressed.ply": compressed_writer.MAX_DEGREE,
+    ".compressed.ply": compressed.MAX_DEGREE,
     ".ply": 4,
     ".spz": spz_writer.MAX_DEGREE,
-    ".splat": splat_writer.MAX_DEGREE,
+    ".splat": 0,
 }
 
 
@@ -31,11 +35,11 @@ def output_format(path: str | os.PathLike[str]) -> str:
         UsageError: If it is none of ``OUTPUT_FORMATS``.
     """
     name = Path(path).name.lower()
-    found = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
-    if found is None:
-        *most, last = OUTPUT_FORMATS
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(most)} or {last}")
-    return found
+    ending = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
+    if ending is None:
+        *first, last = OUTPUT_FORMATS
+        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}")
+    return ending
 
 
 def lost_harmonics(path: str | os.PathLike[str], sh_degree: int) -> str | None:
@@ -45,8 +49,8 @@ def lost_harmonics(path: str | os.PathLike[str], sh_degree: int) -> str | None:
         UsageError: As :func:`output_format`.
     """
     ending = output_format(path)
-    most = OUTPUT_FORMATS[ending]
-    return None if sh_degree <= most else f"{ending} has no room for harmonics above degree {most}: left out"
+    highest = OUTPUT_FORMATS[ending]
+    return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
 
 
 def write_gaussians(
@@ -81,6 +85,20 @@ def write_gaussians(
         raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
         if ending == ".compressed.ply":
-            file.write(compressed_bytes(gaussians, comments))
+            file.write(compressed.compressed_bytes(gaussians, comments))
         else:
-            file.write(spz_bytes(gaussians) if ending == ".spz" else splat_bytes(gaussians))
+            file.write(spz_writer.spz_bytes(gaussians) if ending == ".spz" else splat_bytes(gaussians))
+
+
+def splat_bytes(gaussians: Gaussians) -> bytes:
+    """Content of a ``.splat`` file.
+
+    Raises:
+        ValueError: If there is NaN or inf.
+    """
+    columns = to_columns(gaussians, OUTPUT_FORMATS[".splat"])
+    rows = np.empty(len(columns), SPLAT_ROW)
+    rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
+    rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
+    rows["quats"] = to_bytes(128 * columns.quats + 128)
+    return rows.tobytes()

@@ -1,1 +1,1 @@
-"""Experiments over a grid of settings, what they measured, and charts and a page of it."""
+"""Experiments over a grid of settings, their measurements, and charts and a page of them."""

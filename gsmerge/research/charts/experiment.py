@@ -1,4 +1,4 @@
-"""The grid of experiments: the product of lists, without what makes no sense."""
+"""The grid of experiments: the product of lists, without combinations that make no sense."""
 
 from __future__ import annotations
 
@@ -16,26 +16,19 @@ from gsmerge.research.charts.record import INPUT
 OURS = "gsmerge"
 ALL = "all"  # word for all views
 SIZES = ("budget", "density")
-WHOLE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians, so have one size
-OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # would be overruled, or misnamed
-FITTED = ("unmerged-fit",)  # methods other than ours that effort changes
+ONE_SIZE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians
+OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
+FITTED = ("unmerged-fit",)  # baselines that effort changes
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """One run.
+    """One run."""
 
-    Args:
-        scene: A ``.ply`` or the folder that it is in.
-        method: ``gsmerge``, the name of another method, or ``input``: nothing is merged, only measured.
-        settings: What differs from the defaults, by flat name.
-        views: Number of views, evenly spread; None: all.
-    """
-
-    scene: Path
-    method: str = OURS
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    views: int | None = None
+    scene: Path  # A .ply or the folder that it is in
+    method: str = OURS  # gsmerge, the name of a baseline, or input: nothing is merged, only measured
+    settings: Mapping[str, Any] = field(default_factory=dict)  # settings that differ from the defaults, by flat name
+    views: int | None = None  # number of views, evenly spread; None: all
 
 
 @dataclass(frozen=True)
@@ -43,10 +36,10 @@ class Grid:
     """Lists whose product is run.
 
     Args:
-        methods: ``gsmerge`` and rivals.
+        methods: ``gsmerge`` and baselines.
         k: Gaussians per superpixel: 1 to 8 or "auto".
         budgets: Gaussians in the result, such as 40000 or "2%".
-        densities: Superpixels per pixel; beside the budgets, not times them.
+        densities: Superpixels per pixel; in addition to the budgets, not times them.
         segmentations: Superpixel methods.
         fit: ``full``, ``color``, ``none``.
         efforts: ``draft``, ``fast``, ``default``, ``best``.
@@ -55,7 +48,7 @@ class Grid:
         fixed: Any other settings of ours, each "name=value", the same in all runs.
 
     Raises:
-        ValueError: If a list is empty that must not be, or a value is none that can be.
+        ValueError: If a list is empty that must not be, or a value is impossible.
     """
 
     methods: tuple[str, ...] = (OURS,)
@@ -88,9 +81,9 @@ class Grid:
         """The fixed settings by name.
 
         Raises:
-            UsageError: If one is no "name=value", or no setting that can be fixed.
+            UsageError: If one is not "name=value", or a setting that cannot be fixed.
         """
-        found: dict[str, Any] = {}
+        settings: dict[str, Any] = {}
         for text in self.fixed:
             name, sign, value = str(text).partition("=")
             if not (name and sign):
@@ -98,13 +91,13 @@ class Grid:
             if name in OWN_OPTIONS:
                 raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
             try:
-                found[name] = json.loads(value)
+                settings[name] = json.loads(value)
             except ValueError:
-                found[name] = value
-            plain = found[name] is None or isinstance(found[name], str | int | float)
-            if not plain or found[name] != found[name]:
+                settings[name] = value
+            plain = settings[name] is None or isinstance(settings[name], str | int | float)
+            if not plain or settings[name] != settings[name]:
                 raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")
-        return found
+        return settings
 
 
 _PARSERS: dict[str, Any] = {
@@ -115,23 +108,23 @@ _PARSERS: dict[str, Any] = {
 }
 
 
-def parse_grid(told: Mapping[str, str | None], base: Grid | None = None) -> Grid:
-    """A grid from comma-separated lists as the command line has them; None leaves the base's.
+def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Grid:
+    """A grid from comma-separated lists of the command line; None leaves the base's.
 
     Raises:
-        UsageError: If a value is none that can be.
+        UsageError: If a value is impossible.
     """
-    lists: dict[str, tuple[Any, ...]] = {}
-    for name, text in told.items():
+    values: dict[str, tuple[Any, ...]] = {}
+    for name, text in lists.items():
         if text is None:
             continue
         parts = [part.strip() for part in text.split(",") if part.strip()]
         try:
-            lists[name] = tuple(_PARSERS.get(name, str)(part) for part in parts)
+            values[name] = tuple(_PARSERS.get(name, str)(part) for part in parts)
         except ValueError as error:
             raise UsageError(f"{name}: expected numbers, got {text!r}") from error
     try:
-        return replace(base or Grid(), **lists)
+        return replace(base or Grid(), **values)
     except ValueError as error:
         raise UsageError(str(error)) from error
 
@@ -155,8 +148,8 @@ def read_grid(path: Path) -> Grid:
 def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
     """Method and settings of every run on one scene, for one number of views, and what was left out.
 
-    Only what differs from the defaults is set. Left out are a method of superpixels times efforts that it does not
-    have, and for other methods than ours everything that only ours has: they run once per size.
+    Only settings that differ from the defaults are set. Left out are efforts that do not change a superpixel method,
+    and for baselines all settings that only ours has: they run once per size.
 
     Returns:
         The combinations, the unmerged input first; one note per kind of combination that was left out.
@@ -168,18 +161,18 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
     for method in grid.methods:
         for *values, size in product(grid.k, grid.segmentations, grid.fit, grid.efforts, grid.matches, sizes or [{}]):
             chosen = dict(zip(defaults, values, strict=True))
-            why = _senseless(method, chosen, size, grid, sizes)
+            why = _skip_reason(method, chosen, size, grid, sizes)
             if why is not None:
                 dropped[why] = dropped.get(why, 0) + 1
                 continue
             known = chosen if method == OURS else {"effort": chosen["effort"]} if method in FITTED else {}
-            told = {name: value for name, value in known.items() if value != defaults[name]}
-            told |= grid.settings if method == OURS else {}
-            out.append((method, told if method in WHOLE else size | told))
+            changed = {name: value for name, value in known.items() if value != defaults[name]}
+            changed |= grid.settings if method == OURS else {}
+            out.append((method, changed if method in ONE_SIZE else size | changed))
     return out, [f"{why}: {count} combination(s) left out" for why, count in dropped.items()]
 
 
-def _senseless(
+def _skip_reason(
     method: str, chosen: Mapping[str, Any], size: Mapping[str, Any], grid: Grid, sizes: Sequence[Mapping[str, Any]]
 ) -> str | None:
     """Why a combination is left out; None if it is not."""
@@ -189,7 +182,7 @@ def _senseless(
         own = {"effort"} if method in FITTED else set()
         if any(chosen[name] != value for name, value in first.items() if name not in own):
             return f"{method} takes " + ("effort alone" if own else "a size alone")
-        return f"{method} keeps all Gaussians" if method in WHOLE and sizes and size != sizes[0] else None
+        return f"{method} keeps all Gaussians" if method in ONE_SIZE and sizes and size != sizes[0] else None
     other = chosen["effort"] != grid.efforts[0] and "draft" not in (chosen["effort"], grid.efforts[0])
     if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and other:
         return "effort changes nothing for other superpixels than rdseg without a full fit"
@@ -202,7 +195,7 @@ def make_experiments(scenes: Sequence[Path], grid: Grid) -> tuple[list[Experimen
     """All runs, scene by scene, and notes on what was left out.
 
     Raises:
-        UsageError: If a setting is none that the library takes.
+        UsageError: If a setting is unknown to the library.
     """
     combinations, notes = grid_settings(grid)
     for method, settings in combinations:
@@ -223,16 +216,16 @@ def _check(method: str, settings: Mapping[str, Any]) -> None:
 
     try:
         CompactOptions().with_settings(run_settings(method, settings))
-        rival = None if method == INPUT else find_baseline(method)
+        baseline = None if method == INPUT else find_baseline(method)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    except TypeError as error:  # words in the place of numbers
-        told = ", ".join(f"{name}={value}" for name, value in settings.items())
-        raise UsageError(f"{method}: expected settings that compact takes, got {told}") from error
-    if rival is not None:
-        check_program(rival)
+    except TypeError as error:  # text instead of a number
+        given = ", ".join(f"{name}={value}" for name, value in settings.items())
+        raise UsageError(f"{method}: expected settings that compact takes, got {given}") from error
+    if baseline is not None:
+        check_program(baseline)
 
 
 def run_settings(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings as ``compact`` takes them: with the method, where it is not ours."""
+    """The settings for ``compact``, with the method where it is a baseline."""
     return dict(settings) if method in (OURS, INPUT) else {**settings, "method": method}

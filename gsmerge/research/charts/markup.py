@@ -1,4 +1,4 @@
-"""HTML from plain values: everything that comes from files or names is escaped here."""
+"""HTML from plain values; text from files and names is escaped here."""
 
 from __future__ import annotations
 
@@ -10,27 +10,22 @@ from html import escape
 from pathlib import Path
 
 _TYPES = {".jpg": "image/jpeg", ".png": "image/png"}
-PX_PER_PT = 1.75  # at most; drawings are not blown up beyond it
+PX_PER_PT = 1.75  # largest magnification of drawings, pixels per point
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table.
+    """A cell of a table."""
 
-    Args:
-        text: As it is; escaped later.
-        kind: Class of the cell.
-    """
-
-    text: str
-    kind: str = ""
+    text: str  # not escaped yet
+    kind: str = ""  # CSS class
 
 
 Row = Sequence[str | Cell]
 
 
 def text(value: object) -> str:
-    """Anything as text in HTML or in a quoted attribute."""
+    """Any value as text in HTML or in a quoted attribute."""
     return escape(str(value), quote=True)
 
 
@@ -40,7 +35,7 @@ def table(head: Sequence[str], rows: Sequence[Row], *, texts: Sequence[int] = (0
     Args:
         head: Names of the columns.
         rows: Cells of each row.
-        texts: Columns of words, set left; the rest are numbers.
+        texts: Columns of text, aligned left; the rest are numbers.
         ours: Rows that are ours.
     """
     words = set(texts)
@@ -58,8 +53,8 @@ def table(head: Sequence[str], rows: Sequence[Row], *, texts: Sequence[int] = (0
 
 
 def _class(names: Sequence[str]) -> str:
-    told = " ".join(name for name in names if name)
-    return f' class="{text(told)}"' if told else ""
+    joined = " ".join(name for name in names if name)
+    return f' class="{text(joined)}"' if joined else ""
 
 
 def details(summary: str, content: str) -> str:
@@ -73,12 +68,12 @@ def data_uri(path: Path) -> str:
 
 
 def inline_svg(svg: str, name: str, label: str) -> str:
-    """A drawing as part of the page: no prologue, no metadata, no addresses, names of its own, scaling.
+    """A drawing as part of the page: without prologue, metadata and addresses, with unique ids, scalable.
 
     Args:
         svg: As matplotlib writes it.
         name: Put before every id, because a page has several drawings.
-        label: What it shows, for those who cannot see it.
+        label: Alternative text.
     """
     drawing = svg[svg.index("<svg") :]
     drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)

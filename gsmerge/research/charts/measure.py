@@ -1,10 +1,9 @@
-"""What a set of Gaussians is worth: scores of renders against photos, time to render, and pictures of it."""
+"""Scores, render time and pictures of a set of Gaussians."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -12,45 +11,41 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from gsmerge.io import SceneLoad, atomic_output, read_targets
+from gsmerge.io import SceneLoad, atomic_output, read_held_out
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plane
 from gsmerge.measure.preview import Picture, to_picture
 from gsmerge.render import render
-from gsmerge.research.charts.store import picture_path
+from gsmerge.research.charts.record import picture_path
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
 Scene = PixelScene | UnalignedScene
-MOST_PICTURES = 2  # views of a run whose pictures are kept
-MOST_WIDTH = 640  # pixels of a kept picture
-MOST_TIMED = 4  # views that are rendered for the time
-WORST = 0.25  # mean absolute error over the channels at the top of the error maps' scale
+TargetPlaces = tuple[tuple[int, ...], tuple[int, ...]]  # positions along the trajectory: context views, targets
+MAX_PICTURES = 2  # views of a run whose pictures are stored
+MAX_WIDTH = 640  # pixels of a stored picture
+MAX_TIMED = 4  # views that are rendered for the time
+MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the error maps' scale
 QUALITY = 88  # of the JPEG files
-MOST_DB = 100.0  # what equal pictures count as, since JSON has no infinity
+MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
 
 
-def held_out(load: SceneLoad, cameras: Path | None, images: Path | None) -> tuple[Views | None, TargetPlaces | None]:
-    """The target views of a scene, and where they lie along the trajectory if that is known."""
+def read_target_views(
+    load: SceneLoad, cameras: Path | None, images: Path | None
+) -> tuple[Views | None, TargetPlaces | None]:
+    """The target views of a scene, and their places along the trajectory if those are known."""
     if cameras is None:
         return None, None
-    found = read_targets(load, cameras, images)
-    places = None if found.context_places is None else (found.context_places, found.places)
-    return Views(found.cameras, found.images, found.names), places
-
-
-TargetPlaces = tuple[tuple[int, ...], tuple[int, ...]]  # of the context views, of the targets
+    targets = read_held_out(load, cameras, images)
+    places = None if targets.context_places is None else (targets.context_places, targets.places)
+    return Views(targets.cameras, targets.images, targets.names), places
 
 
 def choose_views(
     scene: Scene, targets: Views | None, places: TargetPlaces | None, count: int | None
 ) -> tuple[Scene, Views | None]:
-    """The scene with so many of its views, evenly spread, and the targets nearest the middle between them.
+    """``count`` of the scene's views, evenly spread, and the targets nearest the middle between them.
 
-    Args:
-        scene: All views.
-        targets: All held-out views; None without any.
-        places: Of context views and targets along the trajectory; None where it is unknown: all targets stay.
-        count: Context views; None: all, with all targets.
+    Without ``count`` all views and targets are kept, and without ``places`` all targets.
     """
     if count is None or count >= len(scene):
         return scene, targets
@@ -67,30 +62,26 @@ def measure(
 ) -> dict[str, float]:
     """Scores by name (``psnr_target_visible``, ...), means over the views; what cannot be measured is left out.
 
-    Args:
-        scene: What the Gaussians were made of; its views are the context.
-        gaussians: The result; None: the scene's own.
-        targets: Held-out views; None without any.
-        options: Which of the slow metrics are measured.
+    Without ``gaussians`` the scene's own are measured.
     """
     if gaussians is None:
-        found = evaluate(scene, {}, targets, options)
+        evaluation = evaluate(scene, {}, targets, options)
     else:
-        found = evaluate(scene, {"result": gaussians}, targets, replace(options, own=False))
+        evaluation = evaluate(scene, {"result": gaussians}, targets, replace(options, own=False))
     scores: dict[str, float] = {}
-    for split in found.num_views:
-        full, masked = found.results[-1].mean(split)
+    for split in evaluation.num_views:
+        full, masked = evaluation.results[-1].mean(split)
         for part, quality in (("", full), ("_visible", masked)):
             for name, value in asdict(quality).items():
                 if value is not None and not math.isnan(value):
-                    scores[f"{name}_{split}{part}"] = min(value, MOST_DB)
+                    scores[f"{name}_{split}{part}"] = min(value, MAX_DB)
     return scores
 
 
 def time_render(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Milliseconds that one view takes to render: the median over a few views; ``near`` in world units."""
+    """Milliseconds to render one view: the median over a few views; ``near`` in world units."""
     seconds = []
-    for view in pick_views(len(cameras), MOST_TIMED):
+    for view in pick_views(len(cameras), MAX_TIMED):
         start = time.perf_counter()
         render(gaussians, cameras[[view]], near=near)
         seconds.append(time.perf_counter() - start)
@@ -100,40 +91,37 @@ def time_render(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
 def keep_pictures(
     folder: Path, key: str, scene_sha256: str, gaussians: Gaussians, scene: Scene, targets: Views | None
 ) -> tuple[str, ...]:
-    """Write a few views of a result, of the targets if there are any, with their errors; once per scene the photos.
+    """Write renders and error maps of a few views of a result, and once per scene the photos.
 
     Args:
         folder: The results folder.
         key: Of the run.
         scene_sha256: Of the scene.
         gaussians: What is rendered.
-        scene: With all its views, so that all runs of a scene show the same ones.
-        targets: All held-out views; None without any.
+        scene: With all its views, so that all runs of a scene have pictures of the same ones.
+        targets: All held-out views, used instead of the scene's; None without any.
 
     Returns:
-        Names of the views that were kept.
+        Names of the views.
     """
-    cameras, photos, names = (
-        (scene.cameras, scene.images, scene.names)
-        if targets is None
-        else (targets.cameras, targets.images, targets.names)
-    )
-    ids, near = pick_views(len(names), MOST_PICTURES), near_plane(scene)
+    views = scene if targets is None else targets
+    photos, names = views.images, views.names
+    ids, near = pick_views(len(names), MAX_PICTURES), near_plane(scene)
     for i, view in enumerate(ids):
-        image = render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
+        image = render(gaussians, views.cameras[[view]], near=near).images[0].clamp(0, 1)
         _write(picture_path(folder, key, i, "render"), to_picture(image))
         if photos is None:
             continue
         photo = picture_path(folder, scene_sha256, i, "photo")
         if not photo.exists():
             _write(photo, to_picture(photos[view]))
-        _write(picture_path(folder, key, i, "error"), draw_error(image, photos[view]))
+        _write(picture_path(folder, key, i, "error"), error_map(image, photos[view]))
     return tuple(names[view] for view in ids)
 
 
-def draw_error(image: Tensor, photo: Tensor) -> Picture:
-    """Mean absolute error over the channels as a heat map of fixed scale, so that two of them can be compared."""
-    error = (image - photo).abs().mean(2).numpy() / WORST
+def error_map(image: Tensor, photo: Tensor) -> Picture:
+    """Mean absolute error over the channels as a heat map, on the same scale for all pictures."""
+    error = (image - photo).abs().mean(2).numpy() / MAX_ERROR
     colored = cv2.applyColorMap((error.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
     return np.ascontiguousarray(colored[..., ::-1], np.uint8)
 
@@ -141,10 +129,10 @@ def draw_error(image: Tensor, photo: Tensor) -> Picture:
 def _write(path: Path, picture: Picture) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width = picture.shape[:2]
-    if width > MOST_WIDTH:
-        size = MOST_WIDTH, max(1, round(height * MOST_WIDTH / width))
+    if width > MAX_WIDTH:
+        size = MAX_WIDTH, max(1, round(height * MAX_WIDTH / width))
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-    told: Sequence[int] = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if path.suffix == ".jpg" else []
-    _, data = cv2.imencode(path.suffix, picture[..., ::-1], told)
+    settings = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if path.suffix == ".jpg" else []
+    _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(data.tobytes())

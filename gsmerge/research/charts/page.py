@@ -1,4 +1,4 @@
-"""One HTML file with everything in it: tables, figures, pictures to compare, commands, environment."""
+"""One self-contained HTML file: tables, figures, pictures to compare, commands, environment."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from gsmerge.report import human_bytes
 from gsmerge.research.charts.experiment import OURS
 from gsmerge.research.charts.figures import Curves, Figure, VerdictTable
 from gsmerge.research.charts.markup import Cell, Row, details, inline_svg, table, text
-from gsmerge.research.charts.pictures import compare_section, error_section
+from gsmerge.research.charts.pictures import error_section, slider_section
 from gsmerge.research.charts.record import INPUT, RunRecord
+from gsmerge.research.charts.run import describe
 from gsmerge.research.charts.series import (
-    PART_WORDS,
-    best_part,
+    PART_LABELS,
     by_size,
+    choose_part,
     line_key,
     line_names,
-    metrics_of,
-    score_of,
+    list_metrics,
+    score_getter,
     size_label,
-    usable,
-    usual_views,
+    successful,
+    typical_views,
 )
 from gsmerge.research.charts.statistics import Interval
 
@@ -40,27 +41,21 @@ def make_page(
     *,
     command: str,
 ) -> str:
-    """The whole page; it asks the network for nothing, and says so to the browser.
+    """The whole page; it loads nothing from the network, and its policy forbids that.
 
-    Args:
-        records: All runs, failed ones too.
-        figures: What was drawn.
-        drawings: The SVG of each figure by name.
-        verdicts: Rivals against ours.
-        folder: The results folder, which has the pictures.
-        command: The command line that draws the page again.
+    ``drawings`` are the SVG of each figure by name; ``command`` is the command line that draws the page again.
     """
-    good = usable(records)
+    done = successful(records)
     scenes = list(dict.fromkeys(record.scene for record in records))
     failed = [record for record in records if record.error is not None]
     sections = [
-        ("results", "Results", _results(good)),
+        ("results", "Results", _results(done)),
         ("verdicts", "At equal cost", _verdicts(verdicts)),
-        *((figure.name, figure.title, _figure(figure, drawings[figure.name], good, command)) for figure in figures),
-        ("compare", "Side by side", compare_section(good, folder)),
-        ("errors", "Error maps", error_section(good, folder)),
+        *((figure.name, figure.title, _figure(figure, drawings[figure.name], done, command)) for figure in figures),
+        ("compare", "Side by side", slider_section(done, folder)),
+        ("errors", "Error maps", error_section(done, folder)),
         ("failures", "Failed runs", _failures(failed)),
-        ("runs", "All runs", _runs(good)),
+        ("runs", "All runs", _runs(done)),
         ("environment", "Environment", _environment(records, command)),
     ]
     sections = [section for section in sections if section[2]]
@@ -68,15 +63,15 @@ def make_page(
     body = "".join(
         f'<section id="{text(name)}"><h2>{text(title)}</h2>{content}</section>' for name, title, content in sections
     )
-    shown = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
-    words = f"{len(records)} runs on {len(scenes)} scene(s): {shown}" + (f"; {len(failed)} failed" if failed else "")
-    here = files("gsmerge.research.charts")
-    style, script = (here.joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
+    words = f"{len(records)} runs on {len(scenes)} scene(s): {names}" + (f"; {len(failed)} failed" if failed else "")
+    package = files("gsmerge.research.charts")
+    style, script = (package.joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{text(POLICY)}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>gsmerge: {text(shown)}</title><style>{style}</style></head><body>"
+        f"<title>gsmerge: {text(names)}</title><style>{style}</style></head><body>"
         f'<header><h1>gsmerge experiments</h1><p class="muted">{text(words)}</p><nav>{links}</nav></header>'
         f"<main>{body}</main><script>{script}</script></body></html>\n"
     )
@@ -91,13 +86,13 @@ def _results(records: Sequence[RunRecord]) -> str:
     """Means over the scenes by method, settings and size."""
     if not records:
         return ""
-    part = best_part(records)
-    metrics = metrics_of(records, part)
-    views = usual_views(records)
+    part = choose_part(records)
+    metrics = list_metrics(records, part)
+    views = typical_views(records)
     scores = {
         metric: {
             (line.name, point.label): point.y
-            for line in by_size(records, lambda record: record.ratio, score_of(metric, part))
+            for line in by_size(records, lambda record: record.ratio, score_getter(metric, part))
             for point in line.points
         }
         for metric in metrics
@@ -114,23 +109,23 @@ def _results(records: Sequence[RunRecord]) -> str:
             groups.setdefault((name, size_label(record)), []).append(record)
     rows = []
     for (name, size), group in groups.items():
-        told = [
-            _interval(found[name, size], DIGITS[metric]) if (name, size) in found else _plain(group, metric, part)
-            for metric, found in scores.items()
+        cells = [
+            _interval(means[name, size], DIGITS[metric]) if (name, size) in means else _plain(group, metric, part)
+            for metric, means in scores.items()
         ]
-        rows.append([name, size, str(len(group)), *_costs(group), *told])
+        rows.append([name, size, str(len(group)), *_costs(group), *cells])
     head = ["Method", "Size", "Scenes", "Gaussians", "Kept", "File", "Seconds", "ms/view", *(HEADS[m] for m in metrics)]
     words = (
-        f"Means over scenes, measured on {PART_WORDS[part]}; ± is half of a 95 % t interval of what the settings differ"
-        " by, the scenes' own level taken off. PSNR and SSIM: higher is better; LPIPS: lower."
+        f"Means over scenes, measured on {PART_LABELS[part]}; ± is half of a 95 % t interval of the differences between"
+        " settings, without those between scenes. PSNR and SSIM: higher is better; LPIPS: lower."
     )
     ours = [i for i, row in enumerate(rows) if row[0].startswith(OURS)]
     return f"<p>{text(words)}</p>{table(head, rows, texts=(0, 1), ours=ours)}"
 
 
 def _plain(group: Sequence[RunRecord], metric: str, part: str) -> str:
-    values = [value for record in group if (value := record.score(f"{metric}_{part}")) is not None]
-    return f"{sum(values) / len(values):.{DIGITS[metric]}f}" if values else ""
+    mean = _mean([record.score(f"{metric}_{part}") for record in group])
+    return "" if mean is None else f"{mean:.{DIGITS[metric]}f}"
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -140,12 +135,8 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 def _costs(group: Sequence[RunRecord]) -> list[str]:
     """Count, share, bytes, seconds, render time."""
-    count, ratio = _mean([r.count for r in group]), _mean([r.ratio for r in group])
-    size, seconds, ms = (
-        _mean([r.bytes for r in group]),
-        _mean([r.seconds for r in group]),
-        _mean([r.render_ms for r in group]),
-    )
+    names = ("count", "ratio", "bytes", "seconds", "render_ms")
+    count, ratio, size, seconds, ms = (_mean([getattr(r, name) for r in group]) for name in names)
     return [
         "" if count is None else f"{count:,.0f}",
         "" if ratio is None else f"{100 * ratio:.2f} %",
@@ -155,50 +146,55 @@ def _costs(group: Sequence[RunRecord]) -> list[str]:
     ]
 
 
-_KINDS = {"ours above": "above", "rival above": "below"}
+_KINDS = {"ours above": "above", "baseline above": "below"}
 
 
 def _verdicts(tables: Sequence[VerdictTable]) -> str:
-    """Whether any rival's point lies above ours, in a sentence, and the points."""
+    """Whether any baseline's point lies above ours, in a sentence, and the points."""
     parts = []
-    for one in tables:
-        words = [verdict.words for _, verdict in one.rows]
-        above, undecided = words.count("rival above"), words.count("undecided")
+    for compared in tables:
+        words = [verdict.words for _, verdict in compared.rows]
+        above, undecided = words.count("baseline above"), words.count("undecided")
         outside = words.count("ours has none so cheap")
-        answer = "no rival's point lies above ours" if not above else f"{above} rival point(s) lie above ours"
+        answer = f"{above} baseline point(s) lie above ours" if above else "no baseline's point lies above ours"
         sentence = (
-            f"{one.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours, {undecided}"
+            f"{compared.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours, {undecided}"
             f" undecided, {outside} cheaper than anything of ours, so not compared)."
         )
         rows: list[Row] = [
             [
-                verdict.rival,
+                verdict.baseline,
                 label,
                 f"{verdict.cost:.4g}",
-                f"{verdict.quality:.{one.decimals}f}",
-                "" if verdict.ours is None else f"{verdict.ours:.{one.decimals}f}",
-                "" if verdict.ahead is None else _interval(verdict.ahead, one.decimals),
+                f"{verdict.quality:.{compared.decimals}f}",
+                "" if verdict.ours is None else f"{verdict.ours:.{compared.decimals}f}",
+                "" if verdict.ahead is None else _interval(verdict.ahead, compared.decimals),
                 Cell(verdict.words, f"text {_KINDS.get(verdict.words, '')}"),
             ]
-            for label, verdict in one.rows
+            for label, verdict in compared.rows
         ]
-        head = ["Rival", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict"]
+        head = ["Baseline", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict"]
         parts.append(f"<p>{text(sentence)}</p>" + details("the points", table(head, rows, texts=(0, 1, 6))))
     if not parts:
         return ""
     how = (
-        "Each point of a rival against our curve at the same cost: our front, linear over the logarithm of the cost,"
-        " read scene by scene; a side is named where the 95 % interval of the paired difference leaves zero out."
+        "Each point of a baseline compared with our curve at the same cost: our front, linear over the logarithm of the"
+        " cost, scene by scene; a side is named where the 95 % interval of the paired difference excludes zero."
     )
     return f'<p class="muted">{text(how)}</p>{"".join(parts)}'
 
 
 def _figure(figure: Figure, drawing: str, records: Sequence[RunRecord], command: str) -> str:
-    made = list(dict.fromkeys(record.command for record in records if record.command))
-    commands = details("commands", f"<pre>{text(chr(10).join([*made, command]))}</pre>")
+    commands = details("commands", _commands(records, command))
     points = _points(figure) if isinstance(figure, Curves) else ""
     svg = inline_svg(drawing, figure.name, f"{figure.title}. {figure.caption}")
     return f"<figure>{svg}<figcaption>{text(figure.caption)}</figcaption></figure>{points}{commands}"
+
+
+def _commands(records: Sequence[RunRecord], command: str) -> str:
+    """The command lines of the runs, each once, and the one that draws the page."""
+    runs = list(dict.fromkeys(record.command for record in records if record.command))
+    return f"<pre>{text(chr(10).join([*runs, command]))}</pre>"
 
 
 def _points(figure: Curves) -> str:
@@ -222,34 +218,27 @@ def _points(figure: Curves) -> str:
 
 
 def _failures(failed: Sequence[RunRecord]) -> str:
-    rows: list[Row] = [[r.scene, _what(r), Cell(r.error or "", "long")] for r in failed]
+    rows: list[Row] = [[r.scene, describe(r), Cell(r.error or "", "long")] for r in failed]
     return table(["Scene", "Run", "Error"], rows, texts=(0, 1, 2)) if rows else ""
-
-
-def _what(record: RunRecord) -> str:
-    told = [f"{name} {value}" for name, value in record.settings.items()]
-    views = [] if record.views_asked is None else [f"{record.views_asked} views"]
-    return ", ".join([record.method, *told, *views])
 
 
 def _runs(records: Sequence[RunRecord]) -> str:
     """One row for each run."""
     if not records:
         return ""
-    columns = [(m, p) for p in PART_WORDS for m in HEADS if any(r.score(f"{m}_{p}") is not None for r in records)]
+    columns = [(m, p) for p in PART_LABELS for m in HEADS if any(r.score(f"{m}_{p}") is not None for r in records)]
     rows = []
     for record in records:
         scores = [record.score(f"{metric}_{part}") for metric, part in columns]
-        told = ["" if v is None else f"{v:.{DIGITS[m]}f}" for v, (m, _) in zip(scores, columns, strict=True)]
-        rows.append([record.scene, _what(record), str(record.views), *_costs([record]), *told])
+        cells = ["" if v is None else f"{v:.{DIGITS[m]}f}" for v, (m, _) in zip(scores, columns, strict=True)]
+        rows.append([record.scene, describe(record), str(record.views), *_costs([record]), *cells])
     head = ["Scene", "Run", "Views", "Gaussians", "Kept", "File", "Seconds", "ms/view"]
     head += [f"{HEADS[metric]} {part.replace('_', ', ')}" for metric, part in columns]
     return details(f"{len(rows)} runs", table(head, rows, texts=(0, 1)))
 
 
 def _environment(records: Sequence[RunRecord], command: str) -> str:
-    """The machines that ran it, each once, and all commands."""
+    """The machines of the runs, each once, and all commands."""
     machines = list(dict.fromkeys(tuple(record.environment.items()) for record in records))
     tables = [table(["", ""], [[name, value] for name, value in machine], texts=(0, 1)) for machine in machines]
-    made = list(dict.fromkeys(record.command for record in records if record.command))
-    return "".join(tables) + f"<pre>{text(chr(10).join([*made, command]))}</pre>"
+    return "".join(tables) + _commands(records, command)

@@ -1,4 +1,4 @@
-"""The page's pictures: results over photos with a slider between, and error maps."""
+"""The page's pictures: results and photos with a slider between them, and error maps."""
 
 from __future__ import annotations
 
@@ -8,76 +8,68 @@ from pathlib import Path
 
 from gsmerge.research.charts.experiment import OURS
 from gsmerge.research.charts.markup import data_uri, text
-from gsmerge.research.charts.measure import WORST
-from gsmerge.research.charts.record import INPUT, RunRecord
-from gsmerge.research.charts.series import line_key, line_names, stands_for_all, usual_size, usual_views
-from gsmerge.research.charts.store import picture_path
+from gsmerge.research.charts.measure import MAX_ERROR
+from gsmerge.research.charts.record import INPUT, RunRecord, picture_path
+from gsmerge.research.charts.series import is_typical, line_key, line_names, typical_size, typical_views
 
-MOST_SCENES = 6  # whose pictures are on the page
-MOST_RESULTS = 5  # beside the photo and the input
+MAX_SCENES = 6  # with pictures on the page
+MAX_RESULTS = 5  # pictures of a view in addition to the photo and the input
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One view of one scene: what there is to compare.
+class PictureSet:
+    """The pictures of one view of one scene."""
 
-    Args:
-        scene: Its name.
-        view: Its name.
-        layers: Name and file of each picture: photo, input, ours, rivals.
-        errors: The same of the error maps.
-    """
-
-    scene: str
-    view: str
-    layers: tuple[tuple[str, Path], ...]
-    errors: tuple[tuple[str, Path], ...]
+    scene: str  # its name
+    view: str  # its name
+    layers: tuple[tuple[str, Path], ...]  # name and file of each picture: photo, input, ours, baselines
+    errors: tuple[tuple[str, Path], ...]  # the same of the error maps
 
 
-def find_shots(records: Sequence[RunRecord], folder: Path) -> list[Shot]:
-    """Views with pictures of the input and of results of the usual size, scene by scene, ours first."""
-    size, views = usual_size(records), usual_views(records)
+def find_pictures(records: Sequence[RunRecord], folder: Path) -> list[PictureSet]:
+    """Views with pictures of the input and of results of the typical size, scene by scene, ours first."""
+    size, views = typical_size(records), typical_views(records)
     names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
-    shots: list[Shot] = []
-    for scene in list(dict.fromkeys(record.scene for record in records))[:MOST_SCENES]:
+    sets: list[PictureSet] = []
+    for scene in list(dict.fromkeys(record.scene for record in records))[:MAX_SCENES]:
         own = [r for r in records if r.scene == scene and r.views_asked == views and r.pictures]
         inputs = [r for r in own if r.method == INPUT][-1:]
-        results = [r for r in own if stands_for_all(r, size)]
+        results = [r for r in own if is_typical(r, size)]
         results.sort(key=lambda r: (r.method != OURS, len(line_key(r)[1])))
-        chosen = [*inputs, *results[:MOST_RESULTS]]
+        chosen = [*inputs, *results[:MAX_RESULTS]]
         for i, view in enumerate(chosen[0].pictures if chosen else ()):
             photo = picture_path(folder, chosen[0].scene_sha256, i, "photo")
             layers = [("photo", photo)] if photo.exists() else []
             errors: list[tuple[str, Path]] = []
             for record in chosen:
                 name = INPUT if record.method == INPUT else names[line_key(record)]
-                for kind, found in (("render", layers), ("error", errors)):
+                for kind, pictures in (("render", layers), ("error", errors)):
                     path = picture_path(folder, record.key, i, kind)
                     if path.exists():
-                        found.append((name, path))
+                        pictures.append((name, path))
             if len(layers) > 1:
-                shots.append(Shot(scene, view, tuple(layers), tuple(errors)))
-    return shots
+                sets.append(PictureSet(scene, view, tuple(layers), tuple(errors)))
+    return sets
 
 
-def compare_section(records: Sequence[RunRecord], folder: Path) -> str:
+def slider_section(records: Sequence[RunRecord], folder: Path) -> str:
     """Sliders between photo, input and results; the arrow keys move them."""
-    shots = find_shots(records, folder)
-    if not shots:
+    sets = find_pictures(records, folder)
+    if not sets:
         return ""
     how = "Left and right of the line; drag it, or move the slider with the arrow keys."
-    sliders = "".join(_slider(shot, number) for number, shot in enumerate(shots))
+    sliders = "".join(_slider(one, number) for number, one in enumerate(sets))
     return f'<p class="muted">{how}</p><div class="pairs">{sliders}</div>'
 
 
-def _slider(shot: Shot, number: int) -> str:
-    names = [name for name, _ in shot.layers]
+def _slider(pictures: PictureSet, number: int) -> str:
+    names = [name for name, _ in pictures.layers]
     left = names.index(INPUT) if INPUT in names else 0
     right = next((i for i, name in enumerate(names) if name.startswith(OURS)), len(names) - 1)
     images = "".join(
         f'<img class="layer{" left" * (i == left)}{" right" * (i == right)}" src="{data_uri(path)}"'
-        f' alt="{text(f"{shot.scene}, {shot.view}: {name}")}">'
-        for i, (name, path) in enumerate(shot.layers)
+        f' alt="{text(f"{pictures.scene}, {pictures.view}: {name}")}">'
+        for i, (name, path) in enumerate(pictures.layers)
     )
     sides = "".join(
         f"<label>{side} <select>"
@@ -85,31 +77,31 @@ def _slider(shot: Shot, number: int) -> str:
         + "</select></label>"
         for side, at in (("left", left), ("right", right))
     )
-    title = f"{shot.scene}, {shot.view}"
-    spoken = text(f"how much of the left picture: {title}")
+    title = f"{pictures.scene}, {pictures.view}"
+    aria_label = text(f"how much of the left picture: {title}")
     return (
         f'<div class="compare" id="compare-{number}"><h3>{text(title)}</h3>'
         f'<div class="frame">{images}</div>'
-        f'<input type="range" min="0" max="100" value="50" aria-label="{spoken}">'
+        f'<input type="range" min="0" max="100" value="50" aria-label="{aria_label}">'
         f'<div class="sides">{sides}</div></div>'
     )
 
 
 def error_section(records: Sequence[RunRecord], folder: Path) -> str:
     """Error maps side by side, with their scale."""
-    shots = [shot for shot in find_shots(records, folder) if shot.errors]
-    if not shots:
+    sets = [one for one in find_pictures(records, folder) if one.errors]
+    if not sets:
         return ""
     parts = [
         "<p>Mean absolute error over the colour channels, the same scale for all.</p>"
         '<div class="scale"></div>'
-        f'<div class="scale-words"><span>0</span><span>{WORST:g} and more</span></div>'
+        f'<div class="scale-words"><span>0</span><span>{MAX_ERROR:g} and more</span></div>'
     ]
-    for shot in shots:
+    for one in sets:
         maps = "".join(
             f'<figure><img src="{data_uri(path)}" alt="{text(f"error of {name}")}">'
             f"<figcaption>{text(name)}</figcaption></figure>"
-            for name, path in shot.errors
+            for name, path in one.errors
         )
-        parts.append(f'<h3>{text(f"{shot.scene}, {shot.view}")}</h3><div class="maps">{maps}</div>')
+        parts.append(f'<h3>{text(f"{one.scene}, {one.view}")}</h3><div class="maps">{maps}</div>')
     return "".join(parts)

@@ -1,11 +1,16 @@
-"""What one run measured: flat, and the same in memory as in the results file."""
+"""One run and its measurements, flat, and the results folder: one line per finished run, written at once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
+
+from gsmerge import __version__
+from gsmerge.io.content_hash import digest
+from gsmerge.runtime.jsonl import append_line, read_lines
 
 SCHEMA_VERSION = 1
 INPUT = "input"  # the method of a run that merges nothing
@@ -16,7 +21,7 @@ HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "lpips_alex"
 
 
 _TEXTS = ("key", "scene", "scene_sha256", "method", "command")
-_TABLES = {  # and their values
+_TABLES = {  # and the types of their values
     "settings": (str, int, float, bool, type(None)),
     "environment": (str,),
     "stages": (int, float),
@@ -40,54 +45,31 @@ def _fits(name: str, value: object) -> bool:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One finished run, well or badly.
+    """One finished run, successful or not.
 
     Scores are means over the views of a split: ``context`` are the views that the scene was made of, ``target``
-    held-out ones; ``_visible`` counts only pixels that the context views see. None where there is nothing to measure
-    by.
-
-    Args:
-        key: Of the experiment, see :func:`gsmerge.research.charts.store.experiment_key`.
-        scene: Name for people.
-        scene_sha256: Of everything that was read.
-        method: ``gsmerge``, the name of another method, or ``input``: the scene as it is.
-        settings: What was set, by flat name; the rest are defaults.
-        views_asked: Number of views that was asked for; None: all.
-        command: The command line of the run.
-        environment: Processor, threads and versions.
-        views: Views that went in.
-        num_input: Gaussians of those views.
-        count: Gaussians of the result.
-        ratio: ``count / num_input``.
-        bytes: Size of the result as a ``.ply``.
-        seconds: Wall time of the merge with everything but reading, writing and scoring.
-        stages: The same by stage, scoring included.
-        render_ms: Milliseconds that one view takes to render, the median.
-        pictures: Names of the views whose pictures were kept.
-        notes: What the reader and the run had to say.
-        error: Why the run failed, in one line; None if it did not.
-        schema_version: Of this record.
+    held-out ones; ``_visible`` counts only pixels that the context views see. None where nothing was measured.
     """
 
-    key: str
-    scene: str
-    scene_sha256: str
-    method: str
-    settings: Mapping[str, Any]
-    views_asked: int | None
-    command: str
-    environment: Mapping[str, str]
-    views: int | None = None
-    num_input: int | None = None
-    count: int | None = None
-    ratio: float | None = None
-    bytes: int | None = None
-    seconds: float | None = None
-    stages: Mapping[str, float] = field(default_factory=dict)
-    render_ms: float | None = None
-    pictures: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    error: str | None = None
+    key: str  # of the experiment, see experiment_key
+    scene: str  # its name
+    scene_sha256: str  # hash of everything that was read
+    method: str  # gsmerge, the name of a baseline, or input: the scene as it is
+    settings: Mapping[str, Any]  # settings by flat name; the rest are defaults
+    views_asked: int | None  # number of views that was asked for; None: all
+    command: str  # the command line of the run
+    environment: Mapping[str, str]  # processor, threads and versions
+    views: int | None = None  # views that went in
+    num_input: int | None = None  # Gaussians of those views
+    count: int | None = None  # Gaussians of the result
+    ratio: float | None = None  # count / num_input
+    bytes: int | None = None  # size of the result as a .ply
+    seconds: float | None = None  # wall time of the merge with everything but reading, writing and scoring
+    stages: Mapping[str, float] = field(default_factory=dict)  # the same by stage, scoring included
+    render_ms: float | None = None  # milliseconds that one view takes to render, the median
+    pictures: tuple[str, ...] = ()  # names of the views whose pictures were kept
+    notes: tuple[str, ...] = ()  # of the reader and of the run
+    error: str | None = None  # why the run failed, in one line; None if it did not
     psnr_context: float | None = None
     psnr_context_visible: float | None = None
     psnr_target: float | None = None
@@ -104,7 +86,7 @@ class RunRecord:
     lpips_alex_context_visible: float | None = None
     lpips_alex_target: float | None = None
     lpips_alex_target_visible: float | None = None
-    schema_version: int = SCHEMA_VERSION
+    schema_version: int = SCHEMA_VERSION  # of this record
 
     def score(self, name: str) -> float | None:
         """A score by its name, such as ``psnr_target_visible``."""
@@ -128,12 +110,64 @@ class RunRecord:
         if version != SCHEMA_VERSION:
             raise ValueError(f"expected a run record of schema version {SCHEMA_VERSION}, got {version!r}")
         known = {f.name: values[f.name] for f in fields(RunRecord) if f.name in values}
-        odd = next((name for name, value in known.items() if not _fits(name, value)), None)
-        if odd is not None:
-            raise ValueError(f"expected a run record, got one with another {odd}")
+        wrong = next((name for name, value in known.items() if not _fits(name, value)), None)
+        if wrong is not None:
+            raise ValueError(f"expected a run record, got one with another {wrong}")
         for name in ("pictures", "notes"):
             known[name] = tuple(known.get(name, ()))
         try:
             return RunRecord(**known)
         except TypeError as error:
             raise ValueError(f"expected a run record, got one with a field missing ({error})") from error
+
+
+RUNS, PROXIES, PICTURES, CHARTS, PAGE = "runs.jsonl", "proxies.jsonl", "pictures", "charts", "index.html"
+
+
+def experiment_key(scene_sha256: str, method: str, settings: Mapping[str, Any], views: int | None) -> str:
+    """The key of a run: a hash of the scene's content, all settings, and the versions.
+
+    Args:
+        scene_sha256: Of all files that the run reads.
+        method: Name of the method.
+        settings: By flat name.
+        views: Number of views that was asked for; None: all.
+    """
+    return digest(
+        {
+            "scene": scene_sha256,
+            "method": method,
+            "settings": dict(settings),
+            "views": views,
+            "tool_version": __version__,
+            "schema_version": SCHEMA_VERSION,
+        }
+    )
+
+
+def read_runs(folder: Path) -> tuple[dict[str, RunRecord], tuple[str, ...]]:
+    """All runs of a results folder by key, the newest of each, and notes on lines that were left out."""
+    lines = read_lines(folder / RUNS)
+    records: dict[str, RunRecord] = {}
+    foreign = 0
+    for value in lines.values:
+        try:
+            record = RunRecord.from_dict(value)
+        except ValueError:
+            foreign += 1
+            continue
+        records.pop(record.key, None)  # a repeated run moves to the end
+        records[record.key] = record
+    skipped = [f"{folder / RUNS}: {foreign} line(s) of another version were passed over"] if foreign else []
+    return records, (*lines.notes, *skipped)
+
+
+def append_run(folder: Path, record: RunRecord) -> None:
+    """Store a finished run."""
+    append_line(folder / RUNS, record.to_dict())
+
+
+def picture_path(folder: Path, owner: str, view: int, kind: str) -> Path:
+    """Path of a picture of a run (by its key) or of a scene (by its hash); ``kind``: photo, render or error."""
+    suffix = "png" if kind == "error" else "jpg"
+    return folder / PICTURES / owner[:16] / f"{view}.{kind}.{suffix}"

@@ -1,4 +1,4 @@
-"""Running experiments: those that are not done yet, each kept as soon as it is done."""
+"""Planning and running experiments: those that are not done yet, each stored as soon as it is done."""
 
 from __future__ import annotations
 
@@ -10,27 +10,51 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.budget import file_bytes
 from gsmerge.errors import error_line
 from gsmerge.io import AUTO, ReadHints, load_files
 from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.ply_writer import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.pipeline import compact
-from gsmerge.research.charts.experiment import Experiment, run_settings
-from gsmerge.research.charts.measure import TargetPlaces, choose_views, held_out, keep_pictures, measure, time_render
-from gsmerge.research.charts.places import Place
-from gsmerge.research.charts.proxies import measure_proxies, read_proxies, wanted_proxies
-from gsmerge.research.charts.record import INPUT, RunRecord
-from gsmerge.research.charts.store import append_run, experiment_key, read_runs
+from gsmerge.research.charts.experiment import OURS, Experiment, run_settings
+from gsmerge.research.charts.measure import (
+    TargetPlaces,
+    choose_views,
+    keep_pictures,
+    measure,
+    read_target_views,
+    time_render,
+)
+from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
+from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experiment_key, read_runs
+from gsmerge.research.charts.scenes import SceneSource
+from gsmerge.runtime.estimate import (
+    COST_BASELINES,
+    COST_COLOR_FIT,
+    COST_FIT_RENDERS,
+    COST_FULL_FIT,
+    COST_MERGE,
+    COST_OTHER_BASELINE,
+    COST_READ,
+    COST_ROBUST,
+    COST_SEGMENT,
+    COST_UNMERGED_STEP,
+    score_cost,
+)
 from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.stages.fit.options import STEPS
 from gsmerge.types import PixelScene, UnalignedScene
 
 Progress = Callable[[str, int, int], None]
 SCORING = ("score", "input")  # stages of a run that only measure
 PACKAGES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
+BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
+COST_EVALUATE = 2.5  # seconds per million pixels of all views, to score input and result
+COST_LPIPS = 12.0  # the same for each network
 
 
 @dataclass(frozen=True)
@@ -39,13 +63,13 @@ class RunOptions:
 
     Args:
         lpips: Networks of the perceptual distance; slow.
-        lpips_views: Views of each split that get it; None: all.
-        seed: Of everything random.
+        lpips_views: Views of each split that are measured with them; None: all.
+        seed: Seed of all random numbers.
         threads: Threads; None: all processors.
         proxy_views: Photos of each scene whose superpixels alone are measured; 0: none.
-        rerun: Do what is done already again.
+        rerun: Repeat what is done already.
         command: The command line, for the record.
-        hints: What is told of the scenes instead of found.
+        hints: Facts about the scenes that are given instead of detected.
         opacity: The same of their opacities.
     """
 
@@ -59,35 +83,24 @@ class RunOptions:
     hints: ReadHints = AUTO
     opacity: OpacityChoice = "auto"
 
-    @property
-    def evaluation(self) -> EvaluateOptions:
-        """What is measured."""
-        return EvaluateOptions(lpips=self.lpips, lpips_views=self.lpips_views, threads=self.threads)
-
-    def key_of(self, experiment: Experiment, place: Place) -> str:
-        """Of a run with these options."""
+    def key_of(self, experiment: Experiment, source: SceneSource) -> str:
+        """Key of a run with these options."""
         measured: dict[str, Any] = {"lpips": list(self.lpips), "lpips_views": self.lpips_views, "seed": self.seed}
-        told = {name: value for name, value in vars(self.hints).items() if value != getattr(AUTO, name)}
-        measured |= told if self.opacity == "auto" else {**told, "opacity": self.opacity}
+        measured |= {name: value for name, value in vars(self.hints).items() if value != getattr(AUTO, name)}
+        measured |= {} if self.opacity == "auto" else {"opacity": self.opacity}
         settings = {**experiment.settings, "measured": measured}
-        return experiment_key(place.sha256, experiment.method, settings, experiment.views)
+        return experiment_key(source.sha256, experiment.method, settings, experiment.views)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done.
+    """The runs of a grid, and which of them are still to be done."""
 
-    Args:
-        runs: Experiments, their scenes and keys; one for each key.
-        pending: Keys of those that are not done yet, or failed.
-        proxies: Segmentation and share by key of the points that are not measured yet, by scene.
-        notes: What was left out.
-    """
-
-    runs: tuple[tuple[str, Experiment, Place], ...]
-    pending: frozenset[str]
+    runs: tuple[tuple[str, Experiment, SceneSource], ...]  # key, experiment and scene of every run; one for each key
+    pending: frozenset[str]  # keys of the runs that are not done yet, or failed
+    # segmentation and share by key of the proxy points that are not measured yet, by scene
     proxies: Mapping[str, Mapping[str, tuple[str, float]]]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was left out
 
     @property
     def total(self) -> int:
@@ -96,8 +109,8 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class _Ready:
-    """A scene that was read."""
+class _LoadedScene:
+    """A scene in memory with its held-out views."""
 
     scene: PixelScene | UnalignedScene
     targets: Views | None
@@ -106,41 +119,41 @@ class _Ready:
 
 
 def make_plan(
-    experiments: Sequence[Experiment], places: Sequence[Place], folder: Path, options: RunOptions
+    experiments: Sequence[Experiment], sources: Sequence[SceneSource], folder: Path, options: RunOptions
 ) -> tuple[Plan, dict[str, RunRecord]]:
-    """What of a grid is to be done, and the runs that the folder holds already, by key."""
+    """The plan of a grid, and the runs that the folder holds already, by key."""
     stored, notes = read_runs(folder)
     done_proxies, more = read_proxies(folder)
-    by_path = {place.path: place for place in places}
-    runs: dict[str, tuple[str, Experiment, Place]] = {}
-    scarce: dict[str, int] = {}
+    by_path = {source.path: source for source in sources}
+    runs: dict[str, tuple[str, Experiment, SceneSource]] = {}
+    too_few: dict[str, int] = {}
     for experiment in experiments:
-        place = by_path[experiment.scene]
-        if experiment.views is not None and place.num_views is not None and experiment.views > place.num_views:
-            scarce[place.name] = scarce.get(place.name, 0) + 1
+        source = by_path[experiment.scene]
+        if experiment.views is not None and source.num_views is not None and experiment.views > source.num_views:
+            too_few[source.name] = too_few.get(source.name, 0) + 1
             continue
-        key = options.key_of(experiment, place)
-        runs.setdefault(key, (key, experiment, place))
-    told = [f"{name} has fewer views than asked for: {count} run(s) left out" for name, count in scarce.items()]
+        key = options.key_of(experiment, source)
+        runs.setdefault(key, (key, experiment, source))
+    skipped = [f"{name} has fewer views than asked for: {count} run(s) left out" for name, count in too_few.items()]
     pending = {k for k in runs if options.rerun or k not in stored or stored[k].error is not None}
     proxies: dict[str, Mapping[str, tuple[str, float]]] = {}
-    for place in places:
-        wanted = wanted_proxies(place.sha256, options.proxy_views) if options.proxy_views else {}
-        left = {key: point for key, point in wanted.items() if options.rerun or key not in done_proxies}
-        proxies |= {place.name: left} if left else {}
-    return Plan(tuple(runs.values()), frozenset(pending), proxies, (*notes, *more, *told)), stored
+    for source in sources:
+        points = proxy_points(source.sha256, options.proxy_views) if options.proxy_views else {}
+        left = {key: point for key, point in points.items() if options.rerun or key not in done_proxies}
+        proxies |= {source.name: left} if left else {}
+    return Plan(tuple(runs.values()), frozenset(pending), proxies, (*notes, *more, *skipped)), stored
 
 
 def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) -> tuple[list[RunRecord], list[str]]:
     """Run what is pending, scene by scene.
 
-    A run that fails is a record that says why, and the others go on.
+    A run that fails gives a record with the reason, and the others go on.
 
     Args:
-        plan: See :func:`make_plan`.
+        plan: From :func:`make_plan`.
         folder: The results folder.
         options: How.
-        progress: Called with (what, done, total), before each run and after the last.
+        progress: Called with (step, done, total), before each run and after the last.
 
     Returns:
         The records of the runs that were done, and notes.
@@ -149,140 +162,195 @@ def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) 
     notes: list[str] = []
     count = 0
 
-    def step(what: str, add: int = 1) -> None:
+    def step(text: str, add: int = 1) -> None:
         nonlocal count
-        progress(what, count, plan.total)
+        progress(text, count, plan.total)
         count += add
 
-    rehearsed: set[tuple[Any, ...]] = set()
+    warm: set[tuple[Any, ...]] = set()
     with use_threads(options.threads):
-        for place, group in groupby(plan.runs, key=lambda run: run[2]):
+        for source, group in groupby(plan.runs, key=lambda run: run[2]):
             runs = [(key, experiment) for key, experiment, _ in group if key in plan.pending]
-            proxies = plan.proxies.get(place.name, {})
+            proxies = plan.proxies.get(source.name, {})
             if not runs and not proxies:
                 continue
-            step(f"{place.name}: reading", 0)
-            ready = _read(place, options)
+            step(f"{source.name}: reading", 0)
+            loaded = _read(source, options)
             for key, experiment in runs:
-                step(f"{place.name}: {describe(experiment)}")
-                blank = _blank(key, experiment, place, options)
-                record = _guarded(blank, experiment, ready, folder, options, rehearsed)
+                step(f"{source.name}: {describe(experiment)}")
+                record = _try_experiment(key, source, experiment, loaded, folder, options, warm)
                 append_run(folder, record)
                 done.append(record)
-            if isinstance(ready, _Ready) and ready.scene.images is not None and proxies:
-                photos, told = ready.scene.images, partial(step, f"{place.name}: superpixels")
-                measure_proxies(folder, place.name, photos, proxies, most_views=options.proxy_views, progress=told)
+            if isinstance(loaded, _LoadedScene) and loaded.scene.images is not None and proxies:
+                photos, report = loaded.scene.images, partial(step, f"{source.name}: superpixels")
+                measure_proxies(folder, source.name, photos, proxies, max_views=options.proxy_views, progress=report)
             elif proxies:
-                notes.append(f"{place.name}: no photos to measure superpixels on")
+                notes.append(f"{source.name}: no photos to measure superpixels on")
                 count += len(proxies)
-            del ready
+            del loaded
     progress("done", plan.total, plan.total)
     return done, notes
 
 
-def describe(experiment: Experiment) -> str:
+def describe(run: Experiment | RunRecord) -> str:
     """A run in a few words."""
-    told = [f"{name} {value}" for name, value in experiment.settings.items()]
-    views = [] if experiment.views is None else [f"{experiment.views} views"]
-    return ", ".join([experiment.method, *told, *views])
+    settings = [f"{name} {value}" for name, value in run.settings.items()]
+    count = run.views if isinstance(run, Experiment) else run.views_asked
+    return ", ".join([run.method, *settings, *([] if count is None else [f"{count} views"])])
 
 
-def _read(place: Place, options: RunOptions) -> _Ready | str:
+def _read(source: SceneSource, options: RunOptions) -> _LoadedScene | str:
     """The scene with its targets, or why it cannot be read."""
     try:
-        load = load_files(place.files, opacity=options.opacity, hints=options.hints)
-        targets, where = held_out(load, place.targets, place.target_images)
-        return _Ready(load.scene, targets, where, tuple(load.notes))
+        load = load_files(source.files, opacity=options.opacity, hints=options.hints)
+        targets, places = read_target_views(load, source.targets, source.target_images)
+        return _LoadedScene(load.scene, targets, places, tuple(load.notes))
     except Exception as error:
         return error_line(error)
 
 
-def _blank(key: str, experiment: Experiment, place: Place, options: RunOptions) -> RunRecord:
-    return RunRecord(
+def _try_experiment(
+    key: str,
+    source: SceneSource,
+    experiment: Experiment,
+    loaded: _LoadedScene | str,
+    folder: Path,
+    options: RunOptions,
+    warm: set[tuple[Any, ...]],
+) -> RunRecord:
+    """The record of a run, which says why it failed if it did."""
+    record = RunRecord(
         key=key,
-        scene=place.name,
-        scene_sha256=place.sha256,
+        scene=source.name,
+        scene_sha256=source.sha256,
         method=experiment.method,
         settings=dict(experiment.settings),
         views_asked=experiment.views,
         command=options.command,
         environment=environment(options.threads),
     )
-
-
-def _guarded(
-    blank: RunRecord,
-    experiment: Experiment,
-    ready: _Ready | str,
-    folder: Path,
-    options: RunOptions,
-    rehearsed: set[tuple[Any, ...]],
-) -> RunRecord:
-    if isinstance(ready, str):
-        return replace(blank, error=ready)
+    if isinstance(loaded, str):
+        return replace(record, error=loaded)
     try:
-        return run_experiment(blank, experiment, ready, folder, options, rehearsed)
+        return run_experiment(record, experiment, loaded, folder, options, warm)
     except Exception as error:  # one bad run must not end the grid; Ctrl-C does
-        return replace(blank, error=error_line(error))
+        return replace(record, error=error_line(error))
 
 
 def run_experiment(
-    blank: RunRecord,
+    record: RunRecord,
     experiment: Experiment,
-    ready: _Ready,
+    loaded: _LoadedScene,
     folder: Path,
     options: RunOptions,
-    rehearsed: set[tuple[Any, ...]],
+    warm: set[tuple[Any, ...]],
 ) -> RunRecord:
-    """One run: merge, score, time, keep pictures.
+    """One run: merge, score, time, store pictures.
 
     Args:
-        blank: The record with what is known before.
+        record: With what is known beforehand.
         experiment: What to run.
-        ready: The scene and its targets.
+        loaded: The scene and its targets.
         folder: The results folder, for pictures.
         options: How.
-        rehearsed: Kinds of runs that this process has done before. The first of a kind is tried on two views, so
+        warm: Kinds of runs that this process has done before, added to. The first of a kind is tried on two views, so
             that compiling and loading of kernels does not count as its time.
     """
-    if experiment.views is not None and experiment.views > len(ready.scene):
-        raise ValueError(f"expected at most {len(ready.scene)} views, got {experiment.views}")
-    scene, targets = choose_views(ready.scene, ready.targets, ready.places, experiment.views)
+    if experiment.views is not None and experiment.views > len(loaded.scene):
+        raise ValueError(f"expected at most {len(loaded.scene)} views, got {experiment.views}")
+    scene, targets = choose_views(loaded.scene, loaded.targets, loaded.places, experiment.views)
     settings = run_settings(experiment.method, experiment.settings) | {"seed": options.seed, "threads": options.threads}
     seconds: dict[str, float] = {}
-    notes: tuple[str, ...] = ready.notes
-    gaussians = None
+    notes: tuple[str, ...] = loaded.notes
+    result = None
     if experiment.method != INPUT:
         kind = (experiment.method, *(experiment.settings.get(name) for name in ("fit", "segmentation", "k")))
-        if kind not in rehearsed:
+        if kind not in warm:
             compact(choose_views(scene, None, None, 2)[0], **settings)
-            rehearsed.add(kind)
-        result = compact(scene, **settings)
-        gaussians, seconds = result.gaussians, result.report.seconds
-        notes = (*notes, *result.report.notes)
-    scores: dict[str, Any] = {**measure(scene, gaussians, targets, options.evaluation)}
-    shown = scene.file_gaussians if gaussians is None else gaussians
-    count = scene.num_gaussians if gaussians is None else len(gaussians)
-    seen_from = scene.cameras if targets is None else targets.cameras
+            warm.add(kind)
+        done = compact(scene, **settings)
+        result, seconds = done.gaussians, done.report.seconds
+        notes = (*notes, *done.report.notes)
+    evaluation = EvaluateOptions(lpips=options.lpips, lpips_views=options.lpips_views, threads=options.threads)
+    scores: dict[str, Any] = {**measure(scene, result, targets, evaluation)}
+    gaussians = scene.file_gaussians if result is None else result
+    count = scene.num_gaussians if result is None else len(result)
+    cameras = scene.cameras if targets is None else targets.cameras
     return replace(
-        blank,
+        record,
         views=len(scene),
         num_input=scene.num_gaussians,
         count=count,
         ratio=count / max(scene.num_gaussians, 1),
-        bytes=file_bytes(count, shown.sh_degree),
+        bytes=file_bytes(count, gaussians.sh_degree),
         seconds=sum(value for name, value in seconds.items() if name not in SCORING),
         stages=dict(seconds),
-        render_ms=time_render(shown, seen_from, near_plane(scene)),
-        pictures=keep_pictures(folder, blank.key, blank.scene_sha256, shown, ready.scene, ready.targets),
+        render_ms=time_render(gaussians, cameras, near_plane(scene)),
+        pictures=keep_pictures(folder, record.key, record.scene_sha256, gaussians, loaded.scene, loaded.targets),
         notes=notes,
         **scores,
     )
 
 
+def estimate_seconds(
+    runs: Sequence[tuple[str, Experiment, SceneSource]],
+    stored: Mapping[str, RunRecord],
+    *,
+    threads: int,
+    lpips: Sequence[str] = (),
+    lpips_views: int | None = None,
+) -> float:
+    """Wall time of runs, within a factor of about two; from times of the same scene and method in ``stored`` if any."""
+    known: dict[tuple[str, str], list[float]] = {}
+    for record in stored.values():
+        if record.seconds is not None and record.error is None:
+            known.setdefault((record.scene, record.method), []).append(record.seconds)
+    total = 0.0
+    for _, experiment, source in runs:
+        pixels = source.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6
+        views = source.num_views or 1
+        share = min(1.0, (experiment.views or views) / views)
+        lpips_share = min(1.0, (lpips_views or views) / max(share * views, 1.0))
+        total += share * pixels * (COST_EVALUATE + lpips_share * COST_LPIPS * len(lpips)) / threads
+        times = known.get((source.name, experiment.method))
+        total += share * median(times) if times else _merge_seconds(experiment, share * pixels, views * share, threads)
+    sources = {source.path: source for _, _, source in runs}
+    return total + sum(COST_READ * p.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6 for p in sources.values())
+
+
+def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads: int) -> float:
+    """Of one merge; ``pixels`` in millions."""
+    if experiment.method == INPUT:
+        return 0.0
+    settings = experiment.settings
+    if experiment.method != OURS:
+        return _baseline_seconds(experiment.method, STEPS[settings.get("effort", "default")], pixels, views, threads)
+    work = pixels * (COST_MERGE + score_cost(views) + COST_SEGMENT[settings.get("segmentation", "rdseg")])
+    fit = settings.get("fit", "full")
+    if fit == "full":
+        work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
+        work += pixels * COST_FIT_RENDERS
+    else:
+        work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
+    return work / threads
+
+
+def _baseline_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
+    """The same of a baseline."""
+    work = (
+        COST_BASELINES.get(method, COST_OTHER_BASELINE)
+        + score_cost(views)
+        + COST_COLOR_FIT * (method == "unmerged-color")
+    )
+    work *= pixels
+    if method == "unmerged-fit":
+        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_UNMERGED_STEP)
+    return work / threads
+
+
 def environment(threads: int | None) -> dict[str, str]:
     """Processor, threads and versions that results and times depend on."""
-    found = {
+    values = {
         "gsmerge": __version__,
         "processor": _processor(),
         "threads": str(threads or available_threads()),
@@ -291,14 +359,14 @@ def environment(threads: int | None) -> dict[str, str]:
     }
     for name in PACKAGES:
         try:
-            found[name] = version(name)
+            values[name] = version(name)
         except PackageNotFoundError:
             continue  # installed under another name
-    return found
+    return values
 
 
 def _processor() -> str:
-    """Its model, and how many of them there are."""
+    """Its model, and the number of processors."""
     name = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:

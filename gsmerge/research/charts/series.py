@@ -1,4 +1,4 @@
-"""Records -> lines over scenes: which runs belong together, what they are called, their means and intervals."""
+"""Records -> lines over scenes: which runs belong together, their names, means and intervals."""
 
 from __future__ import annotations
 
@@ -9,64 +9,57 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.research.charts.experiment import OURS, SIZES, WHOLE
+from gsmerge.research.charts.experiment import ONE_SIZE, OURS, SIZES
 from gsmerge.research.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord
 from gsmerge.research.charts.statistics import Interval, paired_intervals
 
-FEW_SCENES = 0.4  # share of the scenes that a number of views must have to be shown: not all scenes have as many views
-USUAL_RATIO = 0.044  # of the usual result: where one size stands for all
-PARTS = ("target_visible", "target", "context_visible", "context")  # what scores are taken over, the best first
-PART_WORDS = {
+MIN_SHARE = 0.5  # of the scenes that a point of a line must have
+MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
+TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes
+PARTS = (
+    "target_visible",
+    "target",
+    "context_visible",
+    "context",
+)  # what scores are means over, the most meaningful first
+PART_LABELS = {
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
     "context_visible": "input views, pixels that they see",
     "context": "input views",
 }
-METRIC_WORDS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS (VGG)", "lpips_alex": "LPIPS (AlexNet)"}
+METRIC_LABELS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS (VGG)", "lpips_alex": "LPIPS (AlexNet)"}
 LineKey = tuple[str, tuple[tuple[str, Any], ...]]  # method, settings without the size
-Value = Callable[[RunRecord], float | None]
+Getter = Callable[[RunRecord], float | None]
 
 
 @dataclass(frozen=True)
 class Point:
-    """A setting, over all scenes.
+    """A method at one size or number of views, over all scenes."""
 
-    Args:
-        label: The size, or the number of views.
-        x: Mean cost over the scenes (geometric).
-        y: Mean quality with its interval.
-        by_scene: (x, y) of every scene.
-    """
-
-    label: str
-    x: float
-    y: Interval
-    by_scene: Mapping[str, tuple[float, float]]
+    label: str  # size or number of views
+    x: float  # mean cost over the scenes (geometric)
+    y: Interval  # mean quality with its interval
+    by_scene: Mapping[str, tuple[float, float]]  # (x, y) of every scene
 
 
 @dataclass(frozen=True)
 class Line:
-    """A method with its settings, from size to size.
+    """A method with its settings, from size to size."""
 
-    Args:
-        name: For people.
-        ours: Whether it is ours, not a rival's.
-        points: By rising size or number of views.
-    """
-
-    name: str
-    ours: bool
-    points: tuple[Point, ...]
+    name: str  # of the method and its settings
+    ours: bool  # whether it is ours, not a baseline's
+    points: tuple[Point, ...]  # by ascending size or number of views
 
 
 def line_key(record: RunRecord) -> LineKey:
-    """What a record's line is known by."""
+    """The key of a record's line."""
     settings = {name: value for name, value in record.settings.items() if name not in SIZES}
     return record.method, tuple(sorted(settings.items()))
 
 
 def size_label(record: RunRecord) -> str:
-    """The size that was asked for; empty for the default one."""
+    """The size that was set; empty for the default one."""
     for name in SIZES:
         if name in record.settings:
             value = record.settings[name]
@@ -75,105 +68,104 @@ def size_label(record: RunRecord) -> str:
 
 
 def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
-    """A name for every line: the method, and of its settings those that not all lines of it share."""
+    """A name for every line: the method, and those of its settings that differ between its lines."""
     names = {}
     for method, settings in keys:
         others = [dict(other) for name, other in keys if name == method]
         shared = {
             name for name, value in settings if all(other.get(name) == value for other in others) and len(others) > 1
         }
-        told = [_word(name, value) for name, value in settings if name not in shared]
-        names[method, settings] = ", ".join([method, *told])
+        labels = [_setting_label(name, value) for name, value in settings if name not in shared]
+        names[method, settings] = ", ".join([method, *labels])
     return names
 
 
-def _word(name: str, value: Any) -> str:
+def _setting_label(name: str, value: Any) -> str:
     if name == "fit":
         return {"none": "no fit", "color": "colour fit", "full": "full fit"}.get(value, f"fit {value}")
     return f"K = {value}" if name == "k" else str(value) if name == "segmentation" else f"{name} {value}"
 
 
 def newest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
-    """One record for each scene, method, settings and number of views, so that no scene counts twice in a mean.
+    """The last record for each scene, method, settings and number of views, so that no scene counts twice in a mean.
 
     A folder has several where the files of a scene changed, other scenes of the same name were run by another command,
-    or LPIPS or seed were set differently: the last one stays.
-
-    Args:
-        records: In the order in which they were made.
+    or LPIPS or seed were set differently.
 
     Returns:
-        Those that stay, and a note for each name of scenes that others were left out of.
+        The records, and a note for each name of scenes with records that were left out.
     """
     content = {record.scene: record.scene_sha256 for record in records}
     foreign: dict[str, int] = {}
-    found: dict[tuple[str, LineKey, str, int | None], RunRecord] = {}
+    last: dict[tuple[str, LineKey, str, int | None], RunRecord] = {}
     for record in records:
         if record.scene_sha256 != content[record.scene]:
             foreign[record.scene] = foreign.get(record.scene, 0) + 1
             continue
-        found[record.scene, line_key(record), size_label(record), record.views_asked] = record
+        last[record.scene, line_key(record), size_label(record), record.views_asked] = record
     notes = [
         f"{name}: {count} run(s) left out, which read other files or held-out views than the last one of that name"
         for name, count in foreign.items()
     ]
-    return list(found.values()), notes
+    return list(last.values()), notes
 
 
-def usable(records: Sequence[RunRecord]) -> list[RunRecord]:
-    """Those that did not fail."""
+def successful(records: Sequence[RunRecord]) -> list[RunRecord]:
+    """The records of runs that did not fail."""
     return [record for record in records if record.error is None]
 
 
-def best_part(records: Sequence[RunRecord]) -> str:
-    """What scores are taken over: the best that nine of ten runs know."""
+def choose_part(records: Sequence[RunRecord]) -> str:
+    """What scores are means over: the most meaningful that nine of ten runs have."""
     known = {part: sum(record.score(f"psnr_{part}") is not None for record in records) for part in PARTS}
     return next((part for part in PARTS if records and known[part] >= 0.9 * len(records)), PARTS[-1])
 
 
-def metrics_of(records: Sequence[RunRecord], part: str) -> list[str]:
-    """PSNR, SSIM and one LPIPS, VGG before AlexNet, of those that were measured."""
+def list_metrics(records: Sequence[RunRecord], part: str) -> list[str]:
+    """The metrics that were measured, of PSNR, SSIM and one LPIPS, VGG if possible."""
     known = [m for m in HIGHER_IS_BETTER if any(record.score(f"{m}_{part}") is not None for record in records)]
     return [m for m in known if m != "lpips_alex" or "lpips_vgg" not in known]
 
 
-def score_of(metric: str, part: str) -> Value:
+def score_getter(metric: str, part: str) -> Getter:
     """A score as a function of the record."""
     return lambda record: record.score(f"{metric}_{part}")
 
 
-def usual_views(records: Sequence[RunRecord]) -> int | None:
-    """The number of views asked for that stands for all: all of them, or the most."""
+def typical_views(records: Sequence[RunRecord]) -> int | None:
+    """The number of views asked for in figures over other quantities: all, or the largest."""
     asked = {record.views_asked for record in records}
     return None if None in asked else max((views for views in asked if views is not None), default=None)
 
 
-def usual_size(records: Sequence[RunRecord]) -> str:
-    """The size that stands for all: whose results are nearest the usual share of the input."""
+def typical_size(records: Sequence[RunRecord]) -> str:
+    """The size in figures over other quantities: whose results are nearest the typical share of the input."""
     ratios: dict[str, list[float]] = {}
     for record in records:
         if record.method == OURS and record.ratio:
-            ratios.setdefault(size_label(record), []).append(math.log(record.ratio / USUAL_RATIO))
+            ratios.setdefault(size_label(record), []).append(math.log(record.ratio / TYPICAL_RATIO))
     return min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
 
 
-def stands_for_all(record: RunRecord, size: str) -> bool:
-    """Whether a run has the size that stands for all, or a method that has one size alone."""
-    return record.method != INPUT and (size_label(record) == size or record.method in WHOLE)
+def is_typical(record: RunRecord, size: str) -> bool:
+    """Whether a run has the typical size, or a method that has only one size."""
+    return record.method != INPUT and (size_label(record) == size or record.method in ONE_SIZE)
 
 
-def by_size(records: Sequence[RunRecord], x: Value, y: Value) -> list[Line]:
-    """Lines from size to size, at the usual number of views."""
-    views = usual_views(records)
+def by_size(records: Sequence[RunRecord], x: Getter, y: Getter) -> list[Line]:
+    """Lines over the size, at the typical number of views."""
+    views = typical_views(records)
     merged = [r for r in records if r.method != INPUT and r.views_asked == views]
     return _lines(merged, size_label, lambda record: record.ratio or 0.0, x, y)
 
 
-def by_views(records: Sequence[RunRecord], y: Value, *, with_input: bool = False) -> list[Line]:
-    """Lines from number of views to number of views, at the usual size; empty where there is one number alone."""
-    size = usual_size(records)
-    chosen = [r for r in records if (r.method == INPUT and with_input) or stands_for_all(r, size)]
-    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, least=FEW_SCENES)
+def by_views(records: Sequence[RunRecord], y: Getter, *, with_input: bool = False) -> list[Line]:
+    """Lines over the number of views, at the typical size; empty where there is only one number."""
+    size = typical_size(records)
+    chosen = [r for r in records if (r.method == INPUT and with_input) or is_typical(r, size)]
+    lines = _lines(
+        chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, min_share=MIN_SHARE_VIEWS
+    )
     return [line for line in lines if len(line.points) > 1]
 
 
@@ -181,35 +173,37 @@ def _lines(
     records: Sequence[RunRecord],
     label: Callable[[RunRecord], str],
     order: Callable[[RunRecord], float],
-    x: Value,
-    y: Value,
-    least: float = 0.5,
+    x: Getter,
+    y: Getter,
+    min_share: float = MIN_SHARE,
 ) -> list[Line]:
-    """Lines of points that have at least a share of the scenes, all over the same ones."""
+    """Lines of points that have at least a share of the scenes, all over the same scenes."""
     cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]] = {}
     for record in sorted(records, key=order):
         at, value = x(record), y(record)
         if at is not None and value is not None:
             cells.setdefault(line_key(record), {}).setdefault(label(record), {})[record.scene] = (float(at), value)
-    _keep_common(cells, least)
+    _keep_common(cells, min_share)
     columns = [points for line in cells.values() for points in line.values()]
     intervals = dict(zip(map(id, columns), _intervals(columns), strict=True))
     names = line_names(list(cells))
     lines = []
     for key, sizes in sorted(cells.items(), key=lambda cell: (cell[0][0] != OURS, len(cell[0][1]))):
-        points = [Point(name, _middle(found), intervals[id(found)], found) for name, found in sizes.items()]
+        points = [
+            Point(name, _mean_cost(by_scene), intervals[id(by_scene)], by_scene) for name, by_scene in sizes.items()
+        ]
         lines.append(Line(names[key], key[0] == OURS, tuple(points)))
     return lines
 
 
-def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]], least: float) -> None:
-    """Leave only scenes that every point has, so that all means are over the same; all, where that leaves none.
+def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]], min_share: float) -> None:
+    """Leave only scenes that every point has, so that all means are over the same scenes; all, if that leaves none.
 
-    Points that have too few of the scenes are left out first: a few failed runs must not cost the rest.
+    Points that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
     """
     num_scenes = len({scene for line in cells.values() for points in line.values() for scene in points})
     for key in list(cells):
-        cells[key] = {name: points for name, points in cells[key].items() if len(points) >= least * num_scenes}
+        cells[key] = {name: points for name, points in cells[key].items() if len(points) >= min_share * num_scenes}
         if not cells[key]:
             del cells[key]
     columns = [points for line in cells.values() for points in line.values()]
@@ -220,7 +214,7 @@ def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]]
                 del points[scene]
 
 
-def _middle(points: Mapping[str, tuple[float, float]]) -> float:
+def _mean_cost(points: Mapping[str, tuple[float, float]]) -> float:
     """Geometric mean of the costs; arithmetic where one is not positive."""
     costs = [x for x, _ in points.values()]
     if min(costs) == max(costs):
@@ -229,7 +223,7 @@ def _middle(points: Mapping[str, tuple[float, float]]) -> float:
 
 
 def _intervals(columns: Sequence[Mapping[str, tuple[float, float]]]) -> list[Interval]:
-    """One for each column, without what scenes differ by; of no width where the columns have different ones."""
+    """One for each column, without the differences between scenes; of zero width where columns have other scenes."""
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))
@@ -237,19 +231,19 @@ def _intervals(columns: Sequence[Mapping[str, tuple[float, float]]]) -> list[Int
     return [Interval(mean, mean, mean, len(column)) for mean, column in zip(means, columns, strict=True)]
 
 
-def scene_points(records: Sequence[RunRecord], x: Value, y: Value) -> dict[str, list[tuple[float, float]]]:
-    """All (x, y) of our runs at the usual number of views, by scene."""
-    views, found = usual_views(records), dict[str, list[tuple[float, float]]]()
+def scene_points(records: Sequence[RunRecord], x: Getter, y: Getter) -> dict[str, list[tuple[float, float]]]:
+    """All (x, y) of our runs at the typical number of views, by scene."""
+    views, points = typical_views(records), dict[str, list[tuple[float, float]]]()
     for record in records:
         at, value = x(record), y(record)
         if record.method == OURS and record.views_asked == views and at is not None and value is not None:
-            found.setdefault(record.scene, []).append((at, value))
-    return found
+            points.setdefault(record.scene, []).append((at, value))
+    return points
 
 
-def input_mean(records: Sequence[RunRecord], value: Value, scenes: Sequence[str]) -> float | None:
-    """Mean of the unmerged input over some scenes, at the usual number of views."""
-    views = usual_views(records)
-    found = {r.scene: value(r) for r in records if r.method == INPUT and r.views_asked == views}
-    values = [v for scene in scenes if (v := found.get(scene)) is not None]
+def input_mean(records: Sequence[RunRecord], value: Getter, scenes: Sequence[str]) -> float | None:
+    """Mean of the unmerged input over some scenes, at the typical number of views."""
+    views = typical_views(records)
+    by_scene = {r.scene: value(r) for r in records if r.method == INPUT and r.views_asked == views}
+    values = [v for scene in scenes if (v := by_scene.get(scene)) is not None]
     return float(np.mean(values)) if values and len(values) == len(scenes) else None

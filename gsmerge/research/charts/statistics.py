@@ -1,4 +1,4 @@
-"""Means over scenes with their intervals, fronts, break-even, and who lies above whom at equal cost."""
+"""Means over scenes with their intervals, Pareto fronts, and comparisons of methods at equal cost."""
 
 from __future__ import annotations
 
@@ -10,49 +10,33 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-LEVEL = 0.95
+LEVEL = 0.95  # confidence of the intervals
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and how far off it may be.
+    """A mean and its confidence interval."""
 
-    Args:
-        mean: Over the scenes.
-        low: Lower end of the interval; equal to the mean where one scene leaves nothing to estimate it from.
-        high: Upper end.
-        count: Scenes.
-    """
-
-    mean: float
-    low: float
-    high: float
-    count: int
+    mean: float  # over the scenes
+    low: float  # lower end of the interval; equal to the mean where there is only one scene
+    high: float  # upper end
+    count: int  # scenes
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A rival's point against our curve at the same cost.
+    """A point of a baseline compared with our curve at the same cost."""
 
-    Args:
-        rival: Name of the rival's line.
-        cost: Mean cost of the point.
-        quality: Mean quality of the point, over the scenes where ours can be read at that cost.
-        ours: Ours at the same cost; None where no scene has so cheap a result of ours.
-        ahead: By how much ours is better, scene by scene: positive where ours is; None with ``ours``.
-        words: ``ours above``, ``rival above``, ``undecided`` or ``ours has none so cheap``.
-    """
-
-    rival: str
-    cost: float
-    quality: float
-    ours: float | None
-    ahead: Interval | None
-    words: str
+    baseline: str  # name of the baseline's line
+    cost: float  # mean cost of the point
+    quality: float  # mean quality of the point, over the scenes where ours is known at that cost
+    ours: float | None  # our quality at the same cost; None where no scene has so cheap a result of ours
+    ahead: Interval | None  # our quality less the baseline's, paired by scene; None with ours
+    words: str  # ours above, baseline above, undecided or ours has none so cheap
 
 
 def t_factor(count: int, level: float = LEVEL) -> float:
-    """Half-width of a t interval in standard errors, for so many samples."""
+    """Half-width of a t interval in standard errors, for ``count`` samples."""
     return float(stdtrit(count - 1, 0.5 + level / 2))
 
 
@@ -73,7 +57,7 @@ def mean_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
 
 
 def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float], level: float = LEVEL) -> Interval:
-    """Ours minus theirs over the scenes that both have: how hard a scene is cancels.
+    """Ours minus theirs over the scenes that both have, so that the difficulty of a scene cancels.
 
     Raises:
         ValueError: If no scene is in both.
@@ -82,13 +66,10 @@ def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float], le
 
 
 def paired_intervals(values: NDArray[np.float64], level: float = LEVEL) -> list[Interval]:
-    """Intervals of conditions that were measured on the same scenes, without what the scenes differ by.
+    """Intervals of ``values [scenes, conditions]`` without the differences between scenes.
 
-    Scenes differ by several dB and conditions by tenths, so plain intervals would say nothing about conditions. Here
-    every scene's own mean is taken off first (Cousineau 2005), with the correction for it (Morey 2008).
-
-    Args:
-        values: ``[scenes, conditions]``.
+    Scenes differ by several dB and conditions by tenths, so plain intervals would hide the conditions. Here every
+    scene's own mean is subtracted first (Cousineau 2005), with the correction for it (Morey 2008).
 
     Raises:
         ValueError: If there are no scenes or no conditions.
@@ -108,14 +89,10 @@ def _widened(interval: Interval, factor: float) -> tuple[float, float]:
 
 
 def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
-    """Points that no other beats: none is at most as dear and better, or cheaper and as good.
-
-    Args:
-        costs: Lower is better.
-        qualities: Higher is better.
+    """Points that no other dominates: none is as cheap and better (a higher quality), or cheaper and as good.
 
     Returns:
-        Indices by rising cost; of equal points the first.
+        Indices by ascending cost; of equal points the first.
     """
     best, front = -math.inf, []
     for i in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i], i)):
@@ -126,14 +103,9 @@ def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int
 
 
 def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
-    """What a method reaches at a cost: its front, linear over the logarithm of the cost between two points.
+    """Quality of a method at a cost: its front, linear over the logarithm of the cost between two points.
 
-    Beyond the dearest point its quality stays, since paying more is not needed to have it.
-
-    Args:
-        costs: Positive.
-        qualities: Higher is better.
-        cost: Where to read it.
+    Costs are positive, and a higher quality is better. Beyond the most expensive point the quality is constant.
 
     Returns:
         None below the cheapest point.
@@ -146,41 +118,42 @@ def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) 
 
 
 def judge(
-    rival: str,
+    baseline: str,
     points: Mapping[str, tuple[float, float]],
     ours: Mapping[str, Sequence[tuple[float, float]]],
     *,
     higher: bool = True,
 ) -> Verdict:
-    """Whether a rival's point lies above our curve at equal cost, scene by scene.
+    """Whether a baseline's point lies above our curve at equal cost, scene by scene.
 
     Args:
-        rival: Its name.
+        baseline: Its name.
         points: (cost, quality) of the point by scene.
         ours: All (cost, quality) of ours by scene.
         higher: Whether higher quality is better.
 
     Returns:
-        A side is only named where zero lies outside the interval of the difference, or the rival has one scene alone.
+        A verdict that names a side only where zero lies outside the interval of the difference, or the baseline has
+        only one scene.
 
     Raises:
-        ValueError: If the rival has no point.
+        ValueError: If the baseline has no point.
     """
     sign = 1.0 if higher else -1.0
-    read: dict[str, float] = {}
+    our_quality: dict[str, float] = {}
     for scene, (cost, _) in points.items():
         curve = ours.get(scene, ())
         value = quality_at([c for c, _ in curve], [sign * q for _, q in curve], cost)
         if value is not None:
-            read[scene] = value
+            our_quality[scene] = value
     mean_cost = float(np.exp(np.mean([math.log(cost) for cost, _ in points.values()])))
-    if not read:
+    if not our_quality:
         quality = float(np.mean([q for _, q in points.values()]))
-        return Verdict(rival, mean_cost, quality, None, None, "ours has none so cheap")
-    theirs = {scene: sign * points[scene][1] for scene in read}
-    ahead = paired_difference(read, theirs)
-    words = "ours above" if ahead.low > 0 else "rival above" if ahead.high < 0 else "undecided"
-    if len(read) == 1 < len(points):  # one scene of several says nothing about the others
+        return Verdict(baseline, mean_cost, quality, None, None, "ours has none so cheap")
+    theirs = {scene: sign * points[scene][1] for scene in our_quality}
+    ahead = paired_difference(our_quality, theirs)
+    words = "ours above" if ahead.low > 0 else "baseline above" if ahead.high < 0 else "undecided"
+    if len(our_quality) == 1 < len(points):  # one scene of several is no evidence for the others
         words = "undecided"
-    mean_ours = sign * float(np.mean(list(read.values())))
-    return Verdict(rival, mean_cost, sign * float(np.mean(list(theirs.values()))), mean_ours, ahead, words)
+    mean_ours = sign * float(np.mean(list(our_quality.values())))
+    return Verdict(baseline, mean_cost, sign * float(np.mean(list(theirs.values()))), mean_ours, ahead, words)

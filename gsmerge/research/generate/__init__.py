@@ -1,14 +1,14 @@
-"""Scenes made from random numbers alone, as a feed-forward network would export them: to train on and to test with."""
+"""Synthetic scenes from random numbers alone, as a feed-forward network would export them, for training and tests."""
 
 from gsmerge.research.generate.options import GenerateOptions, NoiseOptions, read_ranges
-from gsmerge.research.generate.run import Generated, generate, generate_scene, plan
-from gsmerge.research.generate.scene import MadeScene, make_scene
+from gsmerge.research.generate.run import SceneFolder, generate, generate_scene, plan
+from gsmerge.research.generate.scene import SyntheticScene, make_scene
 
 __all__ = [
     "GenerateOptions",
-    "Generated",
-    "MadeScene",
     "NoiseOptions",
+    "SceneFolder",
+    "SyntheticScene",
     "generate",
     "generate_scene",
     "make_scene",

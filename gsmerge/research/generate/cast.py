@@ -218,16 +218,16 @@ def _normal(kind, s, waves, x, y, z):
 
 
 @kernel
-def _local(turn, centre, eye, dx, dy, dz):
+def _local(rotation, centre, eye, dx, dy, dz):
     """Origin and direction of a ray in the shape's frame."""
     ex, ey, ez = eye[0] - centre[0], eye[1] - centre[1], eye[2] - centre[2]
     return (
-        turn[0, 0] * ex + turn[1, 0] * ey + turn[2, 0] * ez,
-        turn[0, 1] * ex + turn[1, 1] * ey + turn[2, 1] * ez,
-        turn[0, 2] * ex + turn[1, 2] * ey + turn[2, 2] * ez,
-        turn[0, 0] * dx + turn[1, 0] * dy + turn[2, 0] * dz,
-        turn[0, 1] * dx + turn[1, 1] * dy + turn[2, 1] * dz,
-        turn[0, 2] * dx + turn[1, 2] * dy + turn[2, 2] * dz,
+        rotation[0, 0] * ex + rotation[1, 0] * ey + rotation[2, 0] * ez,
+        rotation[0, 1] * ex + rotation[1, 1] * ey + rotation[2, 1] * ez,
+        rotation[0, 2] * ex + rotation[1, 2] * ey + rotation[2, 2] * ez,
+        rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz,
+        rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz,
+        rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz,
     )
 
 
@@ -243,7 +243,7 @@ def _ray(axes, lens, step, i, j):
 
 
 @kernel
-def cast(eye, axes, lens, step, kinds, turns, centres, sizes, waves, rects, depth, ids, points, normals):
+def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, depth, ids, points, normals):
     """Fill depth along z (untouched where nothing is hit nearer), shape, point in its frame, and world normal.
 
     ``axes [3,3]`` camera to world, ``lens`` fx, fy, cx, cy in pixels of which one is 1 / ``step`` samples wide,
@@ -254,7 +254,7 @@ def cast(eye, axes, lens, step, kinds, turns, centres, sizes, waves, rects, dept
         for i in range(rects[m, 1], rects[m, 3]):
             for j in range(rects[m, 0], rects[m, 2]):
                 dx, dy, dz = _ray(axes, lens, step, i, j)
-                ox, oy, oz, dx, dy, dz = _local(turns[m], centres[m], eye, dx, dy, dz)
+                ox, oy, oz, dx, dy, dz = _local(rotations[m], centres[m], eye, dx, dy, dz)
                 t = _hit(kinds[m], sizes[m], waves[m], reach, slope, depth[i, j], ox, oy, oz, dx, dy, dz)
                 if t < depth[i, j]:
                     depth[i, j] = t
@@ -265,7 +265,7 @@ def cast(eye, axes, lens, step, kinds, turns, centres, sizes, waves, rects, dept
             if m < 0:
                 continue
             wx, wy, wz = _ray(axes, lens, step, i, j)
-            ox, oy, oz, dx, dy, dz = _local(turns[m], centres[m], eye, wx, wy, wz)
+            ox, oy, oz, dx, dy, dz = _local(rotations[m], centres[m], eye, wx, wy, wz)
             t = depth[i, j]
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = x, y, z
@@ -273,13 +273,13 @@ def cast(eye, axes, lens, step, kinds, turns, centres, sizes, waves, rects, dept
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             if nx * dx + ny * dy + nz * dz > 0.0:  # seen from inside or behind
                 length = -length
-            turn = turns[m]
+            rotation = rotations[m]
             for k in range(3):
-                normals[i, j, k] = (turn[k, 0] * nx + turn[k, 1] * ny + turn[k, 2] * nz) / length
+                normals[i, j, k] = (rotation[k, 0] * nx + rotation[k, 1] * ny + rotation[k, 2] * nz) / length
 
 
 @kernel
-def light_seen(points, normals, axes, centre, radius, maps, bias, weights, out):
+def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
     """Share of each light that reaches points, times the cosine and its weight, summed over the lights.
 
     ``axes [k,3,3]`` rows right, down and forward of the lights' parallel rays, ``maps [k,s,s]`` how far forward of

@@ -1,4 +1,4 @@
-"""What a feed-forward network makes of a view: its depth, its confidence, and one Gaussian for each pixel."""
+"""The output of a simulated feed-forward network for a view: depth, confidence, and one Gaussian for each pixel."""
 
 from __future__ import annotations
 
@@ -10,37 +10,30 @@ import torch
 
 from gsmerge.kernels.raster.harmonics import view_colors
 from gsmerge.research.generate.options import Noise
-from gsmerge.research.generate.patterns import enlarged
+from gsmerge.research.generate.patterns import enlarge
 from gsmerge.research.generate.photograph import Float, Lens
 from gsmerge.research.generate.shapes import Array
 from gsmerge.types import SH_C0, Gaussians
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One view, exact: the photo as taken, and what the rays through the pixels' centres met.
+class TrueView:
+    """The photo of a view, exact geometry at the pixels' centres, and the network's estimate of the pose."""
 
-    Args:
-        image: ``[h,w,3]`` sRGB.
-        depth: ``[h,w]`` along z.
-        normals: ``[h,w,3]`` world.
-        c2w: ``[4,4]`` camera to world, as the network believes it.
-    """
-
-    image: Float
-    depth: Array
-    normals: Float
-    c2w: Array
+    image: Float  # [h,w,3] sRGB
+    depth: Array  # [h,w] along z
+    normals: Float  # [h,w,3] world
+    c2w: Array  # [4,4] camera to world, as estimated
 
 
 def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) -> Float:
-    """``[height,width]`` of deviation about 1 and ``cells`` swings along the longer side."""
+    """``[height,width]`` smooth noise of deviation about 1, ``cells`` cells along the longer side."""
     side = max(height, width)
-    field = enlarged(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
+    field = enlarge(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
     return field / max(float(field.std()), 1e-3)
 
 
-def edges(depth: Array) -> Float:
+def edge_mask(depth: Array) -> Float:
     """``[h,w]`` 0 on smooth surfaces to 1 where depth jumps by a tenth or more between neighbours."""
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
@@ -50,26 +43,26 @@ def edges(depth: Array) -> Float:
     return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
 
 
-def textured(image: Float) -> Float:
-    """``[h,w]`` 0 where a photo shows nothing to hold on to, 1 where it has detail."""
+def texture_mask(image: Float) -> Float:
+    """``[h,w]`` 0 where a photo has no texture, 1 where it has detail."""
     grey = image.mean(2)
     mean = cv2.blur(grey, (7, 7))
     deviation = np.sqrt(np.maximum(cv2.blur(grey * grey, (7, 7)) - mean * mean, 0))
     return np.clip(deviation / 0.05, 0, 1)
 
 
-def predicted_depth(seen: Seen, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
+def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
     """Depth as a network predicts it, and its confidence in [0, 1], both ``[h,w]``.
 
-    Errors are of the logarithm of depth: a bias of the view, a slow drift, patches that are simply wrong, fine grain,
-    all of them larger where the photo has no texture; inverse depth bleeds over edges; what is far away is no farther
-    than the network can say; and some pixels float in the air.
+    Errors are of the logarithm of depth: a bias of the view, a slow drift, wrong patches, and fine grain, all larger
+    where the photo has no texture; inverse depth bleeds over edges; depth is limited; and some pixels float in front
+    of their surface.
     """
     height, width = seen.depth.shape
     far = noise.far * float(np.median(seen.depth))
     depth, beyond = np.minimum(seen.depth, far), seen.depth > far
-    blank = 1 - textured(seen.image)
-    edge = edges(depth)
+    blank = 1 - texture_mask(seen.image)
+    edge = edge_mask(depth)
     soft = cv2.GaussianBlur(1 / depth, (0, 0), noise.bleed_width)
     near_edge = cv2.dilate(edge, np.ones((3, 3), np.uint8))
     bled = 1 / (1 / depth + noise.bleed * near_edge * (soft - 1 / depth))
@@ -88,7 +81,7 @@ def predicted_depth(seen: Seen, noise: Noise, rng: np.random.Generator) -> tuple
     return out.astype(np.float32), np.clip(np.where(floating, 0.5 * trust, trust), 0, 1).astype(np.float32)
 
 
-def facing(normals: Array) -> Array:
+def quats_facing(normals: Array) -> Array:
     """``[n,4]`` wxyz: the shortest rotations of +z onto normals or their opposites."""
     z = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + z[:, 2], -z[:, 1], z[:, 0], np.zeros(len(z))], 1)
@@ -96,30 +89,30 @@ def facing(normals: Array) -> Array:
 
 
 def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` with which Gaussians have their colours seen from their own camera."""
+    """sh0 ``[n,1,3]`` and shN ``[n,k-1,3]`` that give Gaussians their colours in their own view."""
     n, num = len(colors), (noise.sh_degree + 1) ** 2 - 1
     sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
-    common = rng.normal(0, 1, (1, num, 3))  # highlights of a view lie to one side
+    common = rng.normal(0, 1, (1, num, 3))  # highlights of a view are on one side
     shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num, 3)))).astype(np.float32)
     if num:
-        raised = np.full_like(sh0, 10 / SH_C0)  # colours are cut off at 0
-        found = np.empty((n, 3), np.float32)
-        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye.astype(np.float32), 0, n, found)
-        sh0 -= ((found - 10.5) / SH_C0)[:, None]
+        raised = np.full_like(sh0, 10 / SH_C0)  # colours are clamped at 0
+        seen_colors = np.empty((n, 3), np.float32)
+        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye.astype(np.float32), 0, n, seen_colors)
+        sh0 -= ((seen_colors - 10.5) / SH_C0)[:, None]
     return sh0, shN
 
 
-def pixel_gaussians(seen: Seen, lens: Lens, noise: Noise, rng: np.random.Generator) -> Gaussians:
+def pixel_gaussians(seen: TrueView, lens: Lens, noise: Noise, rng: np.random.Generator) -> Gaussians:
     """One Gaussian for each pixel of a view, in row-major order."""
     height, width = seen.depth.shape
     n = height * width
-    depth, confidence = (a.reshape(-1).astype(np.float64) for a in predicted_depth(seen, noise, rng))
+    depth, confidence = (a.reshape(-1).astype(np.float64) for a in predict_depth(seen, noise, rng))
     v, u = np.mgrid[:height, :width].reshape(2, -1) + 0.5 + rng.uniform(-noise.offset, noise.offset, (2, n))
     rays = np.stack([(u - width / 2) / lens.focal, (v - height / 2) / lens.focal, np.ones(n)], 1)
     means = (rays * depth[:, None]) @ seen.c2w[:3, :3].T + seen.c2w[:3, 3]
     normals = seen.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    quats = facing(
+    quats = quats_facing(
         np.where(length < 1e-6, rays, normals) / np.where(length < 1e-6, np.linalg.norm(rays, axis=1)[:, None], length)
     )
     shape = np.array([1.0, 1.0, noise.flatness]) * np.exp(rng.normal(0, noise.scale_jitter, (n, 3)))

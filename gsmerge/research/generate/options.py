@@ -1,4 +1,4 @@
-"""Settings of made scenes, and what is drawn of them for one scene."""
+"""Settings of synthetic scenes, and the values that one scene draws from them."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ MIXED = "mixed"
 ERRORS = (
     *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
     *("exposure", "tint", "oversized", "tilt"),
-)  # what --noise makes larger or smaller; the rest is the exporter's habit
-SPREAD = ("view_bias", "drift", "grain", "turn", "shift")  # drawn evenly over orders of magnitude
+)  # ranges that --noise scales; the others are habits of the exporter
+SPREAD = ("view_bias", "drift", "grain", "turn", "shift")  # drawn uniformly in their logarithm
 
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """Least and most of every error and habit; each scene draws its own values, evenly, those of depth by orders.
+    """Ranges of every error and habit of an exporter, from which each scene draws its values.
 
-    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/generator.md has what real
-    exports have.
+    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/internals/generator.md
+    compares them with real exports.
 
     Args:
         view_bias: Scale error of a view.
         drift: Slow error across a view.
-        patches: Share of a view that is simply wrong.
-        patch_error: By how much.
-        grain: Error of each pixel on its own.
-        blank: How many times as large errors get, in addition, where the photo has no texture.
-        bleed: Share of the way to a smoothed inverse depth at edges.
+        patches: Share of a view whose depth is wrong.
+        patch_error: Error of these patches.
+        grain: Independent error of each pixel.
+        blank: Factor of additional errors where the photo has no texture.
+        bleed: Blend towards a smoothed inverse depth at edges, 0 to 1.
         bleed_width: Deviation of that smoothing, pixels.
-        far: Greatest depth that the network predicts, medians of the depth.
-        floaters: Share of the pixels that float before their surface; eleven times as many at edges.
-        turn: Error of a pose, degrees.
-        shift: Error of a pose, of the median depth.
+        far: Largest depth that the network predicts, in medians of the depth.
+        floaters: Share of the pixels that float in front of their surface; eleven times as many at edges.
+        turn: Rotation error of a pose, degrees.
+        shift: Translation error of a pose, in median depths.
         exposure: Deviation of the logarithm of a photo's brightness.
         tint: The same for each colour.
         blur: Deviation of the lens's blur, pixels.
-        offset: Most that a mean lies beside its pixel's centre, pixels.
-        scale: Deviation of a Gaussian across its normal, of the pixel's footprint.
+        offset: Largest distance of a mean from its pixel's centre, pixels.
+        scale: Scale of a Gaussian across its normal, in footprints of its pixel.
         scale_jitter: Deviation of the scales' logarithms.
-        flatness: Thickness along the normal, of the other axes.
+        flatness: Thickness along the normal, relative to the other axes.
         tilt: Error of the normals, radians.
         oversized: Share of the Gaussians that are far too large.
-        oversize: Most times that they are too large, at least 2.
-        trust: Confidence where nothing speaks against it.
+        oversize: Largest factor of their size, at least 2.
+        trust: Confidence of pixels without errors.
         constant_opacity: Chance that all opacities are the same.
         opacity_low: Opacity where the confidence is 0.
         opacity_high: Opacity where the confidence is 1.
-        opacity_grain: Deviation of each opacity on its own.
+        opacity_grain: Independent deviation of each opacity.
         color_grain: Error of each colour.
         color_blur: Deviation of the smoothing of colours, pixels; below 0.2: none.
         sh_degrees: Degrees of the spherical harmonics, drawn with equal chances.
@@ -65,7 +65,7 @@ class NoiseOptions:
         unit: World units per metre.
 
     Raises:
-        ValueError: If a range is none.
+        ValueError: If a range is empty or impossible.
     """
 
     view_bias: Range = (0.0002, 0.02)
@@ -121,22 +121,22 @@ def read_ranges(path: Path) -> NoiseOptions:
     """Ranges from a TOML or JSON file: a table with some of the names, and two numbers for each.
 
     Raises:
-        SceneError: If the file cannot be read, or holds a name or value that is none.
+        SceneError: If the file cannot be read, or holds an unknown name or an impossible range.
     """
     table = read_table(path)
     unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
     if unknown:
-        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/generator.md has the names")
+        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/internals/generator.md has the names")
     values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
     try:
         return NoiseOptions(**values)
     except (ValueError, TypeError) as error:
-        raise SceneError(path, str(error), "docs/generator.md has the ranges") from error
+        raise SceneError(path, str(error), "docs/internals/generator.md has the ranges") from error
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What one scene drew of :class:`NoiseOptions`, under the same names."""
+    """The values that one scene drew from :class:`NoiseOptions`, under the same names."""
 
     view_bias: float
     drift: float
@@ -172,13 +172,7 @@ class Noise:
 
 
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
-    """Values for one scene.
-
-    Args:
-        options: The ranges.
-        rng: Source of randomness.
-        factor: Times the errors; the exporter's habits stay. Shares and ``bleed`` end at 1.
-    """
+    """Values for one scene, with all errors times ``factor``, but not habits; shares and ``bleed`` are limited to 1."""
     drawn: dict[str, float] = {}
     for f in fields(Noise):
         if f.name == "sh_degree":
@@ -199,15 +193,15 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
 
 @dataclass(frozen=True)
 class GenerateOptions:
-    """What made scenes are like.
+    """Settings of synthetic scenes.
 
     Args:
-        views: Least and most views of a scene; there is one target between any two.
+        views: Range of the number of views of a scene; there is one target between any two neighbours.
         width: Pixels.
         height: Pixels.
-        style: One of :data:`gsmerge.research.generate.styles.STYLES`, or "mixed": all in turn.
+        style: One of :data:`gsmerge.research.generate.styles.STYLES`, or "mixed": each in turn.
         path: One of :data:`gsmerge.research.generate.paths.PATHS`, or "mixed": any.
-        noise: Times the errors of :class:`NoiseOptions`.
+        noise: Factor on the errors of :class:`NoiseOptions`.
         ranges: The errors and habits.
 
     Raises:
@@ -236,7 +230,7 @@ class GenerateOptions:
             raise ValueError(f"noise: expected 0 to 10, got {self.noise:g}")
 
     def to_dict(self) -> dict[str, Any]:
-        """All settings as values of JSON."""
+        """All settings as JSON types."""
         return _lists(asdict(self))
 
 

@@ -1,4 +1,4 @@
-"""Where cameras stand: paths through a stage, and whether what they see is worth a photo."""
+"""Camera paths through a stage, and whether a view of it is usable."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from gsmerge.research.generate.photograph import FAR, Hits
 from gsmerge.research.generate.shapes import Array
 from gsmerge.research.generate.stage import Stage
 
-LEAST_NEAR = 0.22  # nearest per cent of the depths, of their median
-MOST_TURN = 50  # degrees from view to view
+MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
+MAX_TURN = 50  # degrees between neighbouring views
 Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
 Path = Callable[[Stage, np.random.Generator, int], Pose]
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """``[4,4]`` camera to world, OpenCV axes, the image's down near +y, turned by ``roll`` radians."""
+    """``[4,4]`` camera to world, OpenCV axes, the image's down near +y, rotated by ``roll`` radians."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
@@ -29,8 +29,8 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     return out
 
 
-def _round(stage: Stage, angle: float, distance: float, height: float) -> Array:
-    """A place seen from the focus in a direction, 0 degrees towards -z, at a height over the ground."""
+def _orbit_point(stage: Stage, angle: float, distance: float, height: float) -> Array:
+    """``[3]`` position at an angle (degrees, 0 towards -z) and distance from the focus, and above the ground."""
     return np.array([
         stage.focus[0] + distance * np.sin(np.deg2rad(angle)),
         -height,
@@ -38,45 +38,45 @@ def _round(stage: Stage, angle: float, distance: float, height: float) -> Array:
     ])  # fmt: skip
 
 
-def _sweep(stage: Stage, rng: np.random.Generator, least: float, most: float) -> Pose:
-    """Round the focus by so many degrees, rising and falling a little."""
-    span = min(rng.uniform(least, most), 2 * stage.swing)
+def _arc_path(stage: Stage, rng: np.random.Generator, low: float, high: float) -> Pose:
+    """Around the focus by ``low`` to ``high`` degrees, moving up and down a little."""
+    span = min(rng.uniform(low, high), 2 * stage.swing)
     start = rng.uniform(-stage.swing, stage.swing - span) if span < 2 * stage.swing else -span / 2
     distance, height = rng.uniform(*stage.distance), rng.uniform(*stage.height)
     swing = rng.uniform(0, 0.4) * (stage.height[1] - stage.height[0])
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
-        eye = _round(stage, start + span * s, distance * (1 + closer * s), height + swing * np.sin(6 * s + phase))
+        eye = _orbit_point(stage, start + span * s, distance * (1 + closer * s), height + swing * np.sin(6 * s + phase))
         return look_at(eye, stage.focus, 0.03 * np.sin(5 * s + phase))
 
     return pose
 
 
-def _spans(least: float, most: float, num_views: int) -> tuple[float, float]:
-    limit = MOST_TURN * max(1, num_views - 1)
-    return min(least, limit), min(most, limit)
+def _limit_span(low: float, high: float, num_views: int) -> tuple[float, float]:
+    limit = MAX_TURN * max(1, num_views - 1)
+    return min(low, limit), min(high, limit)
 
 
 def arc(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Along an arc, looking at the middle."""
-    return _sweep(stage, rng, *_spans(15, 60, num_views))
+    """Along an arc, aimed at the focus."""
+    return _arc_path(stage, rng, *_limit_span(15, 60, num_views))
 
 
 def wide(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Far apart."""
-    return _sweep(stage, rng, *_spans(60, 110, num_views))
+    """Along a wide arc, views far apart."""
+    return _arc_path(stage, rng, *_limit_span(60, 110, num_views))
 
 
 def orbit(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """All round, or as far as there is room."""
-    return _sweep(stage, rng, *_spans(200, 340, num_views))
+    """All around, or as far as there is room."""
+    return _arc_path(stage, rng, *_limit_span(200, 340, num_views))
 
 
 def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Back and forth in a plane, looking the same way."""
+    """Back and forth in a plane, in one direction of view."""
     angle, distance = rng.uniform(-0.5, 0.5) * min(stage.swing, 40), rng.uniform(*stage.distance)
-    eye = _round(stage, angle, distance, rng.uniform(*stage.height))
+    eye = _orbit_point(stage, angle, distance, rng.uniform(*stage.height))
     axes, reach = look_at(eye, stage.focus), rng.uniform(0.06, 0.2) * distance
     sways, turn = rng.integers(2, 4), rng.normal(0, 0.03, 3)
 
@@ -89,9 +89,9 @@ def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
 
 
 def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """From one place towards another, the eyes wandering."""
+    """From one position towards another, the direction of view varying."""
     side = min(stage.swing, 40)
-    a, b = (_round(stage, rng.uniform(-side, side), d, rng.uniform(*stage.height)) for d in stage.distance[::-1])
+    a, b = (_orbit_point(stage, rng.uniform(-side, side), d, rng.uniform(*stage.height)) for d in stage.distance[::-1])
     b = a + rng.uniform(0.3, 0.9) * (b - a)
     wander = rng.normal(0, 0.12, 3) * stage.distance[0]
     phase = rng.uniform(0, 6.28, 3)
@@ -105,9 +105,9 @@ def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
 PATHS: dict[str, Path] = {"arc": arc, "forward": forward, "walk": walk, "orbit": orbit, "wide": wide}
 
 
-def worth_a_photo(hits: Hits) -> bool:
-    """Whether a view is neither inside something nor held against it."""
+def is_usable(hits: Hits) -> bool:
+    """Whether a view is neither inside a shape nor too close to one."""
     depth = hits.depth[hits.depth < FAR]
     if depth.size < 0.6 * hits.depth.size:
         return False
-    return bool(np.percentile(depth, 1) > LEAST_NEAR * np.median(depth) or np.percentile(depth, 1) > 0.6)
+    return bool(np.percentile(depth, 1) > MIN_NEAR * np.median(depth) or np.percentile(depth, 1) > 0.6)

@@ -1,4 +1,4 @@
-"""Grey patterns that textures are made of: square, repeating without a seam, values 0 to 1, detail at every scale."""
+"""Grey patterns for textures: square, repeating without a seam, values 0 to 1, detail at every scale."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Grey: TypeAlias = NDArray[Any]  # float32
 
 
-def enlarged(cells: NDArray[np.float64], size: int) -> Grey:
-    """A small picture that repeats, enlarged smoothly to ``[size,size]``."""
+def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
+    """A small repeating picture, enlarged smoothly to ``[size,size]``."""
     rows, columns = cells.shape
     pad = 3
     wide = np.pad(cells, pad, mode="wrap").astype(np.float32)
@@ -25,19 +25,18 @@ def enlarged(cells: NDArray[np.float64], size: int) -> Grey:
 def noise(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Octaves of random cells, each ``fade`` times as strong as the one before.
+    """Octaves of random cells, each ``fade`` times as strong as the previous one.
 
     Args:
-        rng: Source of randomness.
         size: Side, pixels.
         first: Cells of the coarsest octave along a side.
         fade: 0.3 gives clouds, 0.9 grit.
-        stretch: How many times as long as high the cells are.
+        stretch: Ratio of length to height of the cells.
         ridged: Sharp crests, as of rock and bark.
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
-        layer = enlarged(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
+        layer = enlarge(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
         out += strength * (1 - 2 * np.abs(layer) if ridged else layer)
         strength, cells = strength * fade, cells * 2
     low, high = np.percentile(out, (1, 99))
@@ -51,8 +50,8 @@ def grid(size: int) -> tuple[Grey, Grey]:
     return x, y
 
 
-def warped(picture: Grey, dx: Grey, dy: Grey, amount: float) -> Grey:
-    """The picture drawn from beside: ``dx`` and ``dy`` (0 to 1) times ``amount``, of its side."""
+def warp(picture: Grey, dx: Grey, dy: Grey, amount: float) -> Grey:
+    """The picture displaced by ``dx`` and ``dy`` (0 to 1) times ``amount``, a share of its side."""
     size = len(picture)
     x, y = grid(size)
     at_x = (x + amount * (dx - 0.5)) * size - 0.5
@@ -63,15 +62,14 @@ def warped(picture: Grey, dx: Grey, dy: Grey, amount: float) -> Grey:
 def courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
 ) -> tuple[Grey, Grey]:
-    """Bricks or tiles: a tone of its own for each, and 1 on the joints.
+    """Bricks or tiles: a random tone for each, and 1 on the joints.
 
     Args:
-        rng: Source of randomness.
         size: Side, pixels.
         rows: Courses.
         columns: Stones in a course.
-        joint: Width of the joints, of a stone's height.
-        offset: By how much each second course is moved, of a stone's width.
+        joint: Width of the joints, as a share of a stone's height.
+        offset: Offset of each second course, as a share of a stone's width.
     """
     x, y = grid(size)
     row = np.floor(y * rows).astype(int)
@@ -84,7 +82,7 @@ def courses(
 
 
 def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
-    """Pebbles: a tone of its own for each of ``count``² cells, and how far a pixel is from the cell's edge."""
+    """Pebbles: a random tone for each of ``count``² cells, and the distance of a pixel from the cell's edge."""
     at = (np.stack(np.meshgrid(np.arange(count), np.arange(count)), -1) + rng.uniform(0, 1, (count, count, 2))) / count
     tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
     x, y = grid(size)
@@ -103,7 +101,7 @@ def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
 
 
 def glyphs(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
-    """``[count,7,5]`` letters of an alphabet that nobody reads: a few strokes each."""
+    """``[count,7,5]`` letters of an invented alphabet, a few strokes each."""
     out = np.zeros((count, 7, 5), np.uint8)
     for letter in out:
         for _ in range(rng.integers(2, 5)):

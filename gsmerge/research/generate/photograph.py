@@ -1,4 +1,4 @@
-"""Photos and exact depth of a stage: rays, textures, light with shade, and what a lens and a sensor do."""
+"""Photos and exact depth of a stage: rays, textures, light with shadows, exposure."""
 
 from __future__ import annotations
 
@@ -10,32 +10,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, cast, light_seen
-from gsmerge.research.generate.shapes import Array, Packed, bounds, packed
+from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
+from gsmerge.research.generate.shapes import Array, ShapeArrays, bounds, pack
 from gsmerge.research.generate.stage import Stage
 from gsmerge.research.generate.textures import Picture, pyramid
 
-FAR = 1e6  # depth where there is nothing
+FAR = 1e6  # depth of pixels without a surface
 NEAR_PLANE = 1e-3
 SAMPLES = 2  # rays per pixel and axis for the colours; depth is that of the pixel's centre
-KEY_MAPS, KEY_SIZE = 5, 640  # maps of the direct light, for soft shade, and their side
-AMBIENT_MAPS, AMBIENT_SIZE = 24, 256
-BEHIND = 1000.0  # radii that the eye of a light's map stands away, so that its rays are parallel
-GLOW = 0.7  # of what shines by itself, against a white wall in full light
-FROM_BELOW = 0.5  # light from below, against that from above
+KEY_MAPS, KEY_SIZE = 5, 640  # shadow maps of the direct light, several for soft shadows, and their side, pixels
+AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # the same for the light from all sides
+BEHIND = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
+GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
+FROM_BELOW = 0.5  # light from below, relative to that from above
 
 Float: TypeAlias = NDArray[Any]  # float32
 
 
 @dataclass(frozen=True)
 class Lens:
-    """An image size and its intrinsics.
-
-    Args:
-        width: Pixels.
-        height: Pixels.
-        focal: Focal length, pixels.
-    """
+    """An image size and focal length, pixels."""
 
     width: int
     height: int
@@ -49,53 +43,34 @@ class Lens:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays of a view meet; h x w samples.
+    """Hits of the rays of a view; h x w samples."""
 
-    Args:
-        depth: ``[h,w]`` along the camera's z.
-        ids: ``[h,w]`` int32 shape, -1 where there is none.
-        points: ``[h,w,3]`` in the shape's frame.
-        normals: ``[h,w,3]`` world, towards the camera.
-    """
-
-    depth: Array
-    ids: NDArray[np.int32]
-    points: Float
-    normals: Float
+    depth: Array  # [h,w] along the camera's z
+    ids: NDArray[np.int32]  # [h,w] shape, -1 where there is none
+    points: Float  # [h,w,3] in the shape's frame
+    normals: Float  # [h,w,3] world, towards the camera
 
 
 @dataclass(frozen=True)
-class Lit:
-    """A stage that is ready to be photographed.
-
-    Args:
-        stage: The stage.
-        shapes: Its shapes as arrays.
-        mips: Every texture with its halves.
-        axes: ``[k,3,3]`` of the lights, direct ones first.
-        middle: ``[3]`` of the lights' maps.
-        radius: Of the lights' maps.
-        key: Maps of the direct light.
-        ambient: Maps of the light from all sides.
-        weights: ``[k]`` of the ambient maps.
-    """
+class LitStage:
+    """A stage with its shadow maps, ready to be photographed."""
 
     stage: Stage
-    shapes: Packed
-    mips: tuple[list[Picture], ...]
-    axes: Array
-    middle: Array
-    radius: float
-    key: Float
-    ambient: Float
-    weights: Array
+    shapes: ShapeArrays
+    mips: tuple[list[Picture], ...]  # every texture with its halves
+    axes: Array  # [k,3,3] of the lights, direct ones first
+    middle: Array  # [3] of the shadow maps
+    radius: float  # of the shadow maps
+    key: Float  # shadow maps of the direct light
+    ambient: Float  # shadow maps of the light from all sides
+    weights: Array  # [k] of the ambient maps
 
 
-def rectangles(shapes: Packed, c2w: Array, lens: Lens, samples: int) -> NDArray[np.int32]:
+def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> NDArray[np.int32]:
     """``[m,4]`` x0, y0, x1, y1 of the samples that may see each shape."""
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
-    corners = np.einsum("mij,mcj->mci", shapes.turns, half[:, None] * signs) + shapes.centres[:, None]
+    corners = np.einsum("mij,mcj->mci", shapes.rotations, half[:, None] * signs) + shapes.centres[:, None]
     local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
@@ -111,7 +86,7 @@ def rectangles(shapes: Packed, c2w: Array, lens: Lens, samples: int) -> NDArray[
     return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
 
 
-def trace(shapes: Packed, c2w: Array, lens: Lens, samples: int) -> Hits:
+def trace(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(
@@ -123,8 +98,8 @@ def trace(shapes: Packed, c2w: Array, lens: Lens, samples: int) -> Hits:
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
-    table = shapes.kinds, shapes.turns, shapes.centres, shapes.sizes, shapes.waves
-    rects = rectangles(shapes, c2w, lens, samples)
+    table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
+    rects = screen_boxes(shapes, c2w, lens, samples)
     cast(eye, axes, intrinsics, 1.0 / samples, *table, rects, hits.depth, hits.ids, hits.points, hits.normals)
     return hits
 
@@ -137,42 +112,42 @@ def _axes(towards: Array) -> Array:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _map(shapes: Packed, axes: Array, middle: Array, radius: float, size: int) -> Float:
-    """``[size,size]`` how far forward of the middle the light gets."""
+def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
+    """``[size,size]`` shadow map: depth of the first surface, relative to the middle."""
     c2w = np.eye(4)
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - BEHIND * radius * axes[2]
     hits = trace(shapes, c2w, Lens(size, size, BEHIND * size / 2), 1)
     return (hits.depth - BEHIND * radius).astype(np.float32)
 
 
-def lit(stage: Stage) -> Lit:
-    """Prepare a stage: its arrays, smaller textures, and where the lights reach."""
-    opaque = packed([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
+def light_stage(stage: Stage) -> LitStage:
+    """Prepare a stage: its arrays, smaller textures, and shadow maps."""
+    opaque = pack([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
     low, high = (opaque.centres - reach[:, None]).min(0), (opaque.centres + reach[:, None]).max(0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     rng = np.random.default_rng(0)
     key = [stage.light.towards + stage.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
-    turns = np.arange(AMBIENT_MAPS) + 0.5  # evenly over the sphere (Fibonacci)
-    up, angle = 1 - 2 * turns / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * turns
+    rotations = np.arange(AMBIENT_MAPS) + 0.5  # evenly over the sphere (Fibonacci)
+    up, angle = 1 - 2 * rotations / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * rotations
     flat = np.sqrt(1 - up**2)
     ambient = np.stack([flat * np.cos(angle), -up, flat * np.sin(angle)], 1)
     axes = np.stack([_axes(towards) for towards in (*key, *ambient)])
-    return Lit(
+    return LitStage(
         stage,
-        packed(stage.shapes),
+        pack(stage.shapes),
         tuple(pyramid(texture) for texture in stage.textures),
         axes,
         middle,
         radius,
-        np.stack([_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
-        np.stack([_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
+        np.stack([_shadow_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
+        np.stack([_shadow_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
         np.where(up > 0, 1.0, FROM_BELOW) * 4 / AMBIENT_MAPS,
     )
 
 
-def coordinates(shapes: Packed, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
+def coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
     """Texture coordinates ``[n]`` of points in the frames of shapes, and texture repeats per world unit ``[n]``."""
     kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
@@ -186,19 +161,19 @@ def coordinates(shapes: Packed, ids: NDArray[np.int32], points: Float) -> tuple[
     v = np.where(top, z, y)
     wide = np.where(turned, np.pi * girth, np.where(side, half[:, 2], half[:, 0]))
     high = np.where(top, half[:, 2], half[:, 1])
-    looks = [s.look for s in shapes.shapes]
-    repeat = np.array([look.repeat for look in looks], np.float32)[ids]
-    shift = np.array([look.shift for look in looks], np.float32)[ids]
+    materials = [s.material for s in shapes.shapes]
+    repeat = np.array([material.repeat for material in materials], np.float32)[ids]
+    shift = np.array([material.shift for material in materials], np.float32)[ids]
     once = repeat == 0
     u = np.where(once, u / (2 * wide) + 0.5, u * repeat + shift[:, 0])
     v = np.where(once, v / (2 * high) + 0.5, v * repeat + shift[:, 1])
     return np.stack([u, v], 1).astype(np.float32), np.where(once, 0.5 / np.maximum(wide, high), repeat)
 
 
-def paint(view: Lit, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
+def paint(view: LitStage, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
     """``[n,3]`` colours of the textures, sRGB; ``spread`` is the size of a sample on the surface, world units."""
     uv, repeat = coordinates(view.shapes, ids, points)
-    textures = np.array([s.look.texture for s in view.shapes.shapes])[ids]
+    textures = np.array([s.material.texture for s in view.shapes.shapes])[ids]
     size = len(view.mips[0][0])
     levels = np.log2(np.maximum(spread * repeat * size, 1)).round().astype(int)
     levels = np.minimum(levels, len(view.mips[0]) - 1)
@@ -220,12 +195,12 @@ def _lookup(texture: Picture, uv: Float) -> Float:
     at = np.zeros((rows * width, 2), np.float32)
     at[: len(uv)] = (uv - np.floor(uv)) * size - 0.5
     x, y = at.reshape(rows, width, 2)[..., 0], at.reshape(rows, width, 2)[..., 1]
-    found = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return found.reshape(-1, 3)[: len(uv)]
+    colors = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return colors.reshape(-1, 3)[: len(uv)]
 
 
-def radiance(view: Lit, c2w: Array, lens: Lens, samples: int) -> tuple[Float, Hits]:
-    """Linear light ``[h,w,3]`` of every pixel, and the hits of all its samples."""
+def radiance(view: LitStage, c2w: Array, lens: Lens, samples: int) -> tuple[Float, Hits]:
+    """Linear light ``[h,w,3]`` of every pixel, and the hits of all samples."""
     hits = trace(view.shapes, c2w, lens, samples)
     h, w = hits.depth.shape
     seen = hits.ids.reshape(-1) >= 0
@@ -240,24 +215,24 @@ def radiance(view: Lit, c2w: Array, lens: Lens, samples: int) -> tuple[Float, Hi
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     albedo = paint(view, ids, points, spread) ** 2.2
     out = np.zeros((h * w, 3), np.float32)
-    out[seen] = _shaded(view, ids, albedo, world, normals, rays)
+    out[seen] = _shade(view, ids, albedo, world, normals, rays)
     return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3)), hits
 
 
-def _shaded(view: Lit, ids: NDArray[np.int32], albedo: Float, world: Float, normals: Float, rays: Float) -> Float:
-    """Linear light that leaves points towards the camera."""
+def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, normals: Float, rays: Float) -> Float:
+    """Linear light that points reflect or emit towards the camera."""
     light, shapes = view.stage.light, view.shapes.shapes
     direct, indirect = np.zeros((2, len(ids)), np.float32)
     bias = 2.0 * 2 * view.radius / KEY_SIZE
     even = np.full(KEY_MAPS, 1 / KEY_MAPS)
-    light_seen(world, normals, view.axes[:KEY_MAPS], view.middle, view.radius, view.key, bias, even, direct)
+    add_light(world, normals, view.axes[:KEY_MAPS], view.middle, view.radius, view.key, bias, even, direct)
     bias = 1.2 * 2 * view.radius / AMBIENT_SIZE
     around = view.axes[KEY_MAPS:], view.middle, view.radius, view.ambient, bias, view.weights
-    light_seen(world, normals, *around, indirect)
+    add_light(world, normals, *around, indirect)
     if light.lamp is not None:
         away = np.linalg.norm(world - light.lamp.astype(np.float32), axis=1)
         direct *= 2.5 / (1 + (away / np.linalg.norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
-    gloss = np.array([s.look.gloss for s in shapes], np.float32)[ids]
+    gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
     half = light.towards.astype(np.float32) - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     shine = gloss * direct * np.clip((normals * half).sum(1), 0, 1) ** (8 + 120 * gloss)
@@ -270,17 +245,17 @@ def _shaded(view: Lit, ids: NDArray[np.int32], albedo: Float, world: Float, norm
     return out
 
 
-def exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """The factor on linear light after which the pictures' mean is about ``brightness``, sRGB."""
+def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
+    """The factor on linear light that makes the pictures' mean about ``brightness``, sRGB."""
     values = np.concatenate([p.reshape(-1) for p in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if developed(values * middle).mean() < brightness else (low, middle)
+        low, high = (middle, high) if develop(values * middle).mean() < brightness else (low, middle)
     return float((low * high) ** 0.5)
 
 
-def developed(linear: Float) -> Float:
+def develop(linear: Float) -> Float:
     """sRGB in [0, 1] of linear light: a film curve (Narkowicz 2015), then gamma."""
     x = 0.6 * linear
     return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1) ** (1 / 2.2)

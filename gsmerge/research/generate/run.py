@@ -1,32 +1,41 @@
-"""Many made scenes, in folders; those that are there already are kept."""
+"""Many synthetic scenes in folders, each complete or absent; existing ones are not made again."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import write_ply
+from gsmerge.research.generate.noise import Float
 from gsmerge.research.generate.options import GenerateOptions
-from gsmerge.research.generate.scene import make_scene
-from gsmerge.research.generate.writing import check_replaceable, is_made, scene_key, write_scene
+from gsmerge.research.generate.scene import SyntheticScene, make_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.types import Cameras
 
 
 @dataclass(frozen=True)
-class Generated:
-    """One scene of a series.
-
-    Args:
-        folder: Where it is.
-        kept: It was there already.
-    """
+class SceneFolder:
+    """The folder of one scene of a series, and whether the scene existed already."""
 
     folder: Path
     kept: bool
 
 
-def plan(out: Path, count: int, options: GenerateOptions, *, seed: int = 0, overwrite: bool = False) -> list[Generated]:
-    """What :func:`generate` would do; nothing is written.
+def plan(
+    out: Path, count: int, options: GenerateOptions, *, seed: int = 0, overwrite: bool = False
+) -> list[SceneFolder]:
+    """The folders that :func:`generate` would write; nothing is written.
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
@@ -34,13 +43,13 @@ def plan(out: Path, count: int, options: GenerateOptions, *, seed: int = 0, over
     """
     if count < 1 or seed < 0:
         raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
-    found = []
+    folders = []
     for index in range(count):
         folder = out / f"scene_{index:04d}"
-        found.append(Generated(folder, is_made(folder, scene_key(seed, index, options))))
-        if not found[-1].kept:
+        folders.append(SceneFolder(folder, is_complete(folder, scene_key(seed, index, options))))
+        if not folders[-1].kept:
             check_replaceable(folder, overwrite=overwrite)
-    return found
+    return folders
 
 
 def generate_scene(
@@ -54,7 +63,7 @@ def generate_scene(
     """
     options = options or GenerateOptions()
     key = scene_key(seed, index, options)
-    if not is_made(folder, key):
+    if not is_complete(folder, key):
         check_replaceable(folder, overwrite=overwrite)
         write_scene(folder, make_scene(seed, index, options), key)
     return folder
@@ -69,19 +78,19 @@ def generate(
     overwrite: bool = False,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Generated]:
-    """Make scenes ``out/scene_0000`` and on, each different, the same bytes for the same arguments.
+) -> list[SceneFolder]:
+    """Make scenes ``out/scene_0000`` and so on, each different; the same arguments give the same bytes.
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
-    ``generated.json`` with what was drawn. A folder that holds the same scene already is kept, so a call that was
-    interrupted goes on where it was, and a call with a larger ``count`` adds to what is there.
+    ``generated.json`` with the random settings. A folder that holds the same scene already is left as it is, so an
+    interrupted call can be repeated, and a call with a larger ``count`` adds scenes.
 
     Args:
-        out: Folder of the scenes; made where it does not exist.
+        out: Folder of the scenes, created if it does not exist.
         count: Number of scenes, at least 1.
-        options: What the scenes are like.
-        seed: Everything random hangs on it and on the scene's number.
-        overwrite: Replace made scenes of other options.
+        options: Settings of the scenes.
+        seed: Random numbers depend only on it and on the scene's number.
+        overwrite: Replace scenes of other options.
         threads: Threads; None: all processors.
         progress: Called with scenes done and scenes in all.
 
@@ -106,3 +115,96 @@ def generate(
             if progress is not None:
                 progress(count - len(todo) + min(first + workers, len(todo)), count)
     return planned
+
+
+RECORD = "generated.json"
+RECORD_VERSION = 1  # increases when the same seed and options give other scenes
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
+
+
+def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
+    """Everything that a scene depends on."""
+    return {"record_version": RECORD_VERSION, "seed": seed, "index": index, "options": options.to_dict()}
+
+
+def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
+    """Whether a folder holds this scene."""
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(record, dict) and {name: record.get(name) for name in key} == dict(key)
+
+
+def check_replaceable(folder: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a folder that holds something else.
+
+    Raises:
+        UsageError: If it holds a scene of other options and ``overwrite`` is False, or no synthetic scene.
+    """
+    if not os.path.lexists(folder):
+        return
+    if not (folder / RECORD).is_file():
+        raise UsageError(
+            f"{folder}: expected no folder, or a synthetic scene, found something else; choose another OUT"
+        )
+    if not overwrite:
+        raise UsageError(
+            f"{folder}: holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
+        )
+
+
+def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a scene, in place of an existing one, and return its record.
+
+    Raises:
+        SceneError: If the folder cannot be written.
+    """
+    record = {
+        **key,
+        "style": scene.style,
+        "path": scene.path,
+        "num_views": len(scene.cameras),
+        "num_gaussians": len(scene.gaussians),
+        "noise": asdict(scene.noise),
+    }
+    with _folder(folder) as temporary:
+        _write_views(temporary, scene.cameras, scene.images)
+        _write_views(temporary / "targets", scene.targets, scene.target_images)
+        write_ply(temporary / "scene.ply", scene.gaussians)
+        (temporary / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return record
+
+
+@contextmanager
+def _folder(folder: Path) -> Iterator[Path]:
+    """A hidden folder next to the final one, which takes its place when the block succeeds."""
+    temporary = folder.with_name(f".{folder.name}-{secrets.token_hex(4)}")
+    try:
+        temporary.mkdir(parents=True)
+        yield temporary
+        if folder.exists():
+            shutil.rmtree(folder)
+        temporary.rename(folder)
+    except OSError as error:
+        raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
+    """``images/`` and ``transforms.json`` (nerfstudio: camera to world, OpenGL axes)."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i, image in enumerate(images):
+        name = f"images/view_{i:03d}.png"
+        ok, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
+        if not ok:
+            raise RuntimeError("the image library could not write a PNG")
+        (folder / name).write_bytes(data.tobytes())
+        c2w = np.linalg.inv(cameras.viewmats[i].numpy()) @ FLIP
+        frames.append({"file_path": name, "transform_matrix": c2w.tolist()})
+    K = cameras.Ks[0].numpy()
+    shared = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": cameras.width, "h": cameras.height}
+    document = {"camera_model": "PINHOLE", **shared, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""One made scene in memory: a stage, its photos, and the Gaussians that a network would make of them."""
+"""One synthetic scene in memory: a stage, its photos, and the Gaussians that a network would predict from them."""
 
 from __future__ import annotations
 
@@ -10,69 +10,68 @@ import cv2
 import numpy as np
 import torch
 
-from gsmerge.research.generate.noise import Float, Seen, pixel_gaussians
+from gsmerge.research.generate.noise import Float, TrueView, pixel_gaussians
 from gsmerge.research.generate.options import MIXED, GenerateOptions, Noise, draw_noise
-from gsmerge.research.generate.paths import PATHS, Pose, worth_a_photo
-from gsmerge.research.generate.photograph import FAR, SAMPLES, Lens, Lit, developed, exposure, lit, radiance, trace
+from gsmerge.research.generate.paths import PATHS, Pose, is_usable
+from gsmerge.research.generate.photograph import (
+    FAR,
+    SAMPLES,
+    Lens,
+    LitStage,
+    develop,
+    find_exposure,
+    light_stage,
+    radiance,
+    trace,
+)
 from gsmerge.research.generate.shapes import Array
 from gsmerge.research.generate.stage import Palette
 from gsmerge.research.generate.styles import STYLES
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
-PATH_TRIES, STAGE_TRIES = 6, 6
-SMALL = 8  # views are judged, and exposures found, at an eighth of the size
+PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
+SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
 
 
 @dataclass(frozen=True)
-class MadeScene:
-    """A scene as a network would export it, with held-out views.
+class SyntheticScene:
+    """A scene as a network would export it, with held-out views."""
 
-    Args:
-        gaussians: One for each pixel, view-major and row-major.
-        cameras: As the network believes them.
-        images: The photos, ``[h,w,3]`` sRGB in [0, 1] each.
-        targets: True cameras half-way between the views.
-        target_images: Their photos.
-        style: What was built.
-        path: How the cameras stand.
-        noise: The strengths of the errors.
-    """
-
-    gaussians: Gaussians
-    cameras: Cameras
-    images: tuple[Float, ...]
-    targets: Cameras
-    target_images: tuple[Float, ...]
+    gaussians: Gaussians  # one for each pixel, view-major and row-major
+    cameras: Cameras  # as the network estimates them
+    images: tuple[Float, ...]  # the photos, [h,w,3] sRGB in [0, 1] each
+    targets: Cameras  # true cameras half-way between the views
+    target_images: tuple[Float, ...]  # their photos
     style: str
     path: str
     noise: Noise
 
 
-def make_scene(seed: int, index: int, options: GenerateOptions) -> MadeScene:
-    """Scene ``index`` of a series; the same arguments make the same bits, on any number of threads."""
+def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
+    """Scene ``index`` of a series; the same arguments give the same bits, on any number of threads."""
     rng = np.random.default_rng([seed, index])
     num_views = int(rng.integers(options.views[0], options.views[1] + 1))
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
     noise = draw_noise(options.ranges, rng, options.noise)
     lens = Lens(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
-    view, pose = _found(rng, style, path, lens, num_views)
+    view, pose = _find_stage(rng, style, path, lens, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
-    gain = exposure([radiance(view, p, _smaller(lens), 1)[0] for p in poses[::2]], rng.uniform(0.22, 0.62))
+    gain = find_exposure([radiance(view, p, _shrink(lens), 1)[0] for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
     photos = parallel_map(partial(_photo, view, lens, noise, gain), list(zip(poses, seeds, strict=True)))
-    world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # many exporters begin at the first camera
-    moved = [_moved(pose, world, noise.unit) for pose in poses]
+    world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
+    moved = [_move_pose(pose, world, noise.unit) for pose in poses]
     seen = []
-    for (image, depth, normals), pose_there in zip(photos[::2], moved[::2], strict=True):
+    for (image, depth, normals), true_pose in zip(photos[::2], moved[::2], strict=True):
         depth = np.minimum(depth, FAR) * noise.unit
-        believed = _shaken(pose_there, noise, float(np.median(depth)), rng)
-        turned = (normals @ world[:3, :3].T).astype(np.float32)
-        seen.append((Seen(image, depth, turned, believed), int(rng.integers(2**63))))
+        estimate = _perturb_pose(true_pose, noise, float(np.median(depth)), rng)
+        rotated = (normals @ world[:3, :3].T).astype(np.float32)
+        seen.append((TrueView(image, depth, rotated, estimate), int(rng.integers(2**63))))
     parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, _rng(given[1])), seen)
-    return MadeScene(
+    return SyntheticScene(
         gaussians=Gaussians.concat(parts),
         cameras=_cameras([view.c2w for view, _ in seen], lens),
         images=tuple(image for image, _, _ in photos[::2]),
@@ -88,25 +87,27 @@ def _rng(seed: int) -> np.random.Generator:
     return np.random.default_rng(int(seed))
 
 
-def _smaller(lens: Lens) -> Lens:
+def _shrink(lens: Lens) -> Lens:
     return Lens(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
 
-def _found(rng: np.random.Generator, style: str, path: str, lens: Lens, num_views: int) -> tuple[Lit, Pose]:
-    """A stage and a path through it of which all views are worth a photo; the last one tried where none is found."""
+def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num_views: int) -> tuple[LitStage, Pose]:
+    """A stage and a path through it with usable views only, or the last ones tried."""
     size = 1 << int(np.clip(np.log2(1.6 * max(lens.width, lens.height)), 7, 10))
     for _ in range(STAGE_TRIES):
-        view = lit(STYLES[style](Palette(rng, size)))
+        view = light_stage(STYLES[style](Palette(rng, size)))
         for _ in range(PATH_TRIES):
             pose = PATHS[path](view.stage, rng, num_views)
-            views = (trace(view.shapes, pose(s), _smaller(lens), 1) for s in np.linspace(0, 1, 2 * num_views - 1))
-            if all(worth_a_photo(hits) for hits in views):
+            views = (trace(view.shapes, pose(s), _shrink(lens), 1) for s in np.linspace(0, 1, 2 * num_views - 1))
+            if all(is_usable(hits) for hits in views):
                 return view, pose
     return view, pose
 
 
-def _photo(view: Lit, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]) -> tuple[Float, Array, Float]:
-    """The photo from a pose, with the faults of lens, sensor and exposure, and exact depth and normals."""
+def _photo(
+    view: LitStage, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
+) -> tuple[Float, Array, Float]:
+    """The photo from a pose, with the errors of lens, sensor and exposure, and exact depth and normals."""
     pose, seed = given
     rng = _rng(seed)
     linear, _ = radiance(view, pose, lens, SAMPLES)
@@ -114,14 +115,14 @@ def _photo(view: Lit, lens: Lens, noise: Noise, gain: float, given: tuple[Array,
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = np.hypot(x - lens.width / 2, y - lens.height / 2) / np.hypot(lens.width, lens.height)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
-    image = cv2.GaussianBlur(developed(linear), (0, 0), noise.blur)
+    image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
     hits = trace(view.shapes, pose, lens, 1)
     return np.round(image * 255) / np.float32(255), hits.depth, hits.normals
 
 
-def _shaken(pose: Array, noise: Noise, depth: float, rng: np.random.Generator) -> Array:
-    """A pose with the network's error."""
+def _perturb_pose(pose: Array, noise: Noise, depth: float, rng: np.random.Generator) -> Array:
+    """The pose with the network's error."""
     turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * rng.normal(0, 1, 3) / 3**0.5)
     out = pose.copy()
     out[:3, :3] = pose[:3, :3] @ turn
@@ -129,8 +130,8 @@ def _shaken(pose: Array, noise: Noise, depth: float, rng: np.random.Generator) -
     return out
 
 
-def _moved(pose: Array, world: Array, unit: float) -> Array:
-    """A pose in metres, in the world of the exporter."""
+def _move_pose(pose: Array, world: Array, unit: float) -> Array:
+    """The pose in the world of the exporter, in its units."""
     out = world @ pose
     out[:3, 3] *= unit
     return out

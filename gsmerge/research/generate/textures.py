@@ -1,6 +1,6 @@
-"""Textures: square colour pictures that repeat without a seam, made from random numbers alone.
+"""Textures: square colour pictures that repeat without a seam, from random numbers alone.
 
-Every maker is ``(rng, size) -> [size,size,3]`` float32 sRGB in [0, 1]; ``KINDS`` names them by what they look like.
+Every function of ``KINDS`` is ``(rng, size) -> [size,size,3]`` float32 sRGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.research.generate.patterns import Grey, cells, courses, enlarged, glyphs, grid, noise, text_line, warped
+from gsmerge.research.generate.patterns import Grey, cells, courses, enlarge, glyphs, grid, noise, text_line, warp
 
 Picture: TypeAlias = NDArray[Any]  # float32
 Color: TypeAlias = NDArray[Any]
@@ -25,7 +25,7 @@ def color(
     strength: tuple[float, float] = (0.05, 0.6),
     light: tuple[float, float] = (0.2, 0.85),
 ) -> Color:
-    """``[3]`` a random colour: hue 0 to 1 around the circle (None: all, warm ones most), saturation, value."""
+    """``[3]`` a random colour: hue 0 to 1 around the circle (None: all, mostly warm ones), saturation, value."""
     h = rng.uniform(*hue) % 1 if hue is not None else rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()
     s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
     ramp = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)
@@ -44,7 +44,7 @@ def mix(low: Color, high: Color, amount: Grey) -> Picture:
 
 
 def plain(rng: np.random.Generator, size: int) -> Picture:
-    """Paint: next to no texture."""
+    """Paint: almost no texture."""
     low, high = shades(rng, color(rng, light=(0.35, 0.95), strength=(0, 0.5)), rng.uniform(0.01, 0.05))
     return mix(low, high, noise(rng, size, first=2, fade=0.5))
 
@@ -108,7 +108,7 @@ def bricks(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, base, 0.35)
     tone, joint = courses(rng, size, rows, rows // 2, joint=rng.uniform(0.05, 0.1), offset=0.5)
     dx, dy = (noise(rng, size, first=16, fade=0.6) for _ in range(2))
-    tone, joint = (warped(picture, dx, dy, 0.01) for picture in (tone, joint))
+    tone, joint = (warp(picture, dx, dy, 0.01) for picture in (tone, joint))
     out = mix(low, high, 0.5 * tone + 0.5 * noise(rng, size, first=8, fade=0.85))
     return out + (color(rng, strength=(0, 0.15), light=(0.4, 0.8)) - out) * joint[..., None]
 
@@ -132,7 +132,7 @@ def carpet(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, color(rng, strength=(0.1, 0.7), light=(0.2, 0.6)), 0.4)
     out = mix(low, high, noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
-        motif = enlarged(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
+        motif = enlarge(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
         mask = np.mod(3 * motif, 1)[..., None] > 0.5
         out = np.where(mask, out, 0.3 * out + 0.7 * color(rng, strength=(0.2, 0.8)))
     return out.astype(np.float32)
@@ -175,7 +175,7 @@ def foliage(rng: np.random.Generator, size: int) -> Picture:
 
 
 def crown(rng: np.random.Generator, size: int) -> Picture:
-    """Leaves from afar: what bushes and trees are made of."""
+    """Leaves from afar, for bushes and trees."""
     tone, edge = cells(rng, size, int(rng.integers(24, 56)))
     base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
@@ -270,7 +270,7 @@ KINDS: dict[str, Maker] = {
 
 
 def pyramid(texture: Picture) -> list[Picture]:
-    """The texture, and halves of it down to 8 pixels, so that what is far away does not flicker."""
+    """The texture, and halves of it down to 8 pixels, so that far surfaces do not alias."""
     out: list[Picture] = [np.ascontiguousarray(texture, np.float32)]
     while len(out[-1]) > 8:
         half = len(out[-1]) // 2

@@ -1,4 +1,4 @@
-"""A scene under bad conditions: what a user's own scene would do if its views, poses, photos or rows were worse."""
+"""How a scene is compacted under bad conditions: with worse views, poses, photos or rows."""
 
 from gsmerge.research.stress.cases import CASES, Case
 from gsmerge.research.stress.run import StressOutcome, stress

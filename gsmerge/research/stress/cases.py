@@ -1,20 +1,29 @@
-"""The cases: what is changed, for which scenes, and the property that must hold."""
+"""The cases: how a scene is changed, which scenes they are for, and the property that must hold.
+
+Every change returns a new scene and applies to the views that results are compared with, too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from gsmerge.io.cameras.camera_file import CONVENTIONS
-from gsmerge.research.stress import changes
-from gsmerge.research.stress.changes import Judged
+from gsmerge.measure.evaluate import Views
+from gsmerge.stages.prepare import scene_frame
+from gsmerge.types import SH_C0, Cameras, PixelScene, UnalignedScene
+from gsmerge.views import even_views, subset
 
 Needs = Literal["anything", "pixels", "photos", "file"]
 Check = Literal["better", "same", "near", "once", "bits", "again", "convention"]
 
-UTM = (4.0e5, 5.0e6, 100.0)
+UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
 
 PROPERTIES: dict[Check, str] = {
     "better": "not below its own input by more than {worse:g} dB",
@@ -25,32 +34,160 @@ PROPERTIES: dict[Check, str] = {
     "again": "compacted again to the same count, not more than {same:g} dB below",
     "convention": "recognised, with every Gaussian at its pixel, or refused in one line",
 }
+SEED = 7  # of all random choices
+FAR_SHARE = 2.5e-5  # share of the Gaussians that are moved far away
+LARGE_SHARE, LARGE_FACTOR = 0.01, 8.0  # share of the Gaussians that are enlarged, and the factor
+BROKEN_SHARE = 0.01  # share of the rows that become NaN
+
+
+@dataclass(frozen=True)
+class StressScene:
+    """A scene and the views that its results are compared with."""
+
+    scene: PixelScene | UnalignedScene
+    views: Views | None  # held-out views in its world; None: its own views
+
+
+def fewer_views(given: StressScene, count: int) -> StressScene:
+    """``count`` of the views, at equal intervals."""
+    return replace(given, scene=subset(given.scene, even_views(len(given.scene), min(count, len(given.scene)))))
+
+
+def halve_views(given: StressScene) -> StressScene:
+    """About every second view."""
+    return fewer_views(given, max(1, len(given.scene) // 2))
+
+
+def reorder(given: StressScene) -> StressScene:
+    """The views in another order."""
+    order = np.random.default_rng(SEED).permutation(len(given.scene)).tolist()
+    return replace(given, scene=subset(given.scene, order))
+
+
+def repeat_views(given: StressScene) -> StressScene:
+    """Every view twice."""
+    return replace(given, scene=subset(given.scene, [*range(len(given.scene))] * 2))
+
+
+def move(given: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
+    """The world scaled, and moved by ``shift`` in units of its own size."""
+    offset = torch.tensor(shift, dtype=torch.float64) * scene_frame(given.scene).unit * factor
+    scene, views = given.scene, given.views
+    means = factor * scene.gaussians.means.double() + offset
+    gaussians = replace(scene.gaussians, means=means, scales=scene.gaussians.scales * factor)
+    scene = replace(scene, gaussians=gaussians, cameras=_move_cameras(scene.cameras, factor, offset))
+    if views is not None:
+        views = replace(views, cameras=_move_cameras(views.cameras, factor, offset))
+    return StressScene(scene, views)
+
+
+def _move_cameras(cameras: Cameras, factor: float, offset: Tensor) -> Cameras:
+    viewmats = cameras.viewmats.double().clone()
+    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ offset
+    return replace(cameras, viewmats=viewmats)
+
+
+def perturb_poses(given: StressScene, degrees: float) -> StressScene:
+    """Every view, with its Gaussians, rotated about its camera centre by a random axis."""
+    scene = given.scene
+    assert isinstance(scene, PixelScene)
+    rng = np.random.default_rng(SEED)
+    means = scene.gaussians.means.double().clone().reshape(len(scene), -1, 3)
+    viewmats = scene.cameras.viewmats.double().clone()
+    for view in range(len(scene)):
+        turn = torch.from_numpy(_rotation(rng.normal(size=3), np.deg2rad(degrees)))
+        old = viewmats[view].clone()
+        viewmats[view, :3] = turn @ old[:3]
+        camera = means[view] @ old[:3, :3].T + old[:3, 3]
+        means[view] = (camera - viewmats[view, :3, 3]) @ viewmats[view, :3, :3]
+    gaussians = replace(scene.gaussians, means=means.reshape(-1, 3))
+    return replace(given, scene=replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats)))
+
+
+def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+
+
+def change_exposure(given: StressScene, share: float) -> StressScene:
+    """Photos, and the Gaussians of their views, alternately brighter and darker."""
+    scene = given.scene
+    assert isinstance(scene, PixelScene)
+    assert scene.images is not None
+    gains = torch.tensor([1 + share if view % 2 else 1 - share for view in range(len(scene))], dtype=torch.float32)
+    rows = gains.repeat_interleave(scene.pixels_per_view)[:, None, None]
+    g = scene.gaussians
+    sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
+    gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
+    images = (scene.images * gains[:, None, None, None]).clamp(0, 1)
+    return replace(given, scene=replace(scene, gaussians=gaussians, images=images))
+
+
+def break_rows(given: StressScene) -> StressScene:
+    """Rows without finite numbers, which the reader leaves out."""
+    scene = given.scene
+    chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
+    if isinstance(scene, UnalignedScene):
+        return replace(given, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
+    opacities = torch.where(chosen, torch.zeros(()), scene.gaussians.opacities)
+    return replace(
+        given,
+        scene=replace(
+            scene,
+            gaussians=replace(scene.gaussians, opacities=opacities),
+            valid=scene.valid & ~chosen.reshape(scene.valid.shape),
+        ),
+    )
+
+
+def throw_away(given: StressScene) -> StressScene:
+    """A few Gaussians a thousand times as far away."""
+    scene = given.scene
+    chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
+    means = torch.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
+    return replace(given, scene=replace(scene, gaussians=replace(scene.gaussians, means=means)))
+
+
+def enlarge(given: StressScene) -> StressScene:
+    """Some Gaussians many times as large."""
+    gaussians = given.scene.gaussians
+    chosen = _choose(len(gaussians), LARGE_SHARE)[:, None]
+    scales = torch.where(chosen, LARGE_FACTOR * gaussians.scales, gaussians.scales)
+    return replace(given, scene=replace(given.scene, gaussians=replace(gaussians, scales=scales)))
+
+
+def _choose(count: int, share: float) -> Tensor:
+    """``[count]`` bool: a random share of them, at least one."""
+    chosen = torch.zeros(count, dtype=torch.bool)
+    chosen[np.random.default_rng(SEED).choice(count, max(1, round(share * count)), replace=False)] = True
+    return chosen
 
 
 @dataclass(frozen=True)
 class Case:
-    """One way to make life hard.
+    """One bad condition.
 
     Args:
         name: On the command line.
-        words: What is changed, for people.
+        words: The change in words.
         check: Which property must hold, see ``PROPERTIES``.
-        needs: "pixels": a Gaussian for each pixel; "photos": those and photos; "file": a scene with cameras in a file.
-        change: Gives the changed scene; None: the scene stays, the run differs.
-        threads: To run with; None: as told.
-        convention: How poses are to be written, in the words of camera files.
+        needs: "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file.
+        change: Returns the changed scene; None: the scene stays, the run differs.
+        threads: Threads of the run; None: as in the options.
+        convention: Pose convention to write, in the terms of camera files.
     """
 
     name: str
     words: str
     check: Check
     needs: Needs = "anything"
-    change: Callable[[Judged], Judged] | None = None
+    change: Callable[[StressScene], StressScene] | None = None
     threads: int | None = None
     convention: tuple[str, str] | None = None
 
 
-def _rewritten(direction: str, axes: str) -> Case:
+def _rewrite_poses(direction: str, axes: str) -> Case:
     """Poses in another convention; "camera-to-world" and "OpenCV" make "c2w-opencv"."""
     name = direction[0] + "2" + direction.split("-")[2][0] + "-" + axes.lower()
     return Case(name, f"poses written {direction}, {axes} axes", "convention", "file", convention=(direction, axes))
@@ -60,23 +197,23 @@ CASES: dict[str, Case] = {
     case.name: case
     for case in (
         Case("unchanged", "the scene as it is", "better"),
-        Case("views-half", "half of the views", "better", "pixels", changes.half_the_views),
-        Case("views-3", "three views", "better", "pixels", partial(changes.fewer_views, count=3)),
-        Case("views-1", "one view", "better", "pixels", partial(changes.fewer_views, count=1)),
-        Case("order", "views in another order", "same", "pixels", changes.reordered),
-        Case("twice", "every view twice", "once", "pixels", changes.repeated),
-        Case("poses-0.2", "poses 0.2 degrees off", "better", "photos", partial(changes.wrong_poses, degrees=0.2)),
-        Case("poses-1", "poses 1 degree off", "better", "photos", partial(changes.wrong_poses, degrees=1.0)),
-        Case("poses-5", "poses 5 degrees off", "better", "photos", partial(changes.wrong_poses, degrees=5.0)),
-        Case("exposure", "exposure +-20 % by turns", "better", "photos", partial(changes.other_exposure, share=0.2)),
-        Case("utm", "moved to map coordinates", "same", "anything", partial(changes.moved, factor=1.0, shift=UTM)),
-        Case("small", "scaled by 1e-4", "same", "anything", partial(changes.moved, factor=1e-4, shift=(0, 0, 0))),
-        Case("large", "scaled by 1e4", "same", "anything", partial(changes.moved, factor=1e4, shift=(0, 0, 0))),
-        Case("broken", "1 % of the rows not finite", "near", "anything", changes.broken_rows),
-        Case("flyaways", "0.0025 % of the Gaussians far away", "near", "anything", changes.flyaways),
-        Case("oversized", "1 % of the Gaussians 8 times as large", "near", "anything", changes.oversized),
+        Case("views-half", "half of the views", "better", "pixels", halve_views),
+        Case("views-3", "three views", "better", "pixels", partial(fewer_views, count=3)),
+        Case("views-1", "one view", "better", "pixels", partial(fewer_views, count=1)),
+        Case("order", "views in another order", "same", "pixels", reorder),
+        Case("twice", "every view twice", "once", "pixels", repeat_views),
+        Case("poses-0.2", "poses 0.2 degrees off", "better", "photos", partial(perturb_poses, degrees=0.2)),
+        Case("poses-1", "poses 1 degree off", "better", "photos", partial(perturb_poses, degrees=1.0)),
+        Case("poses-5", "poses 5 degrees off", "better", "photos", partial(perturb_poses, degrees=5.0)),
+        Case("exposure", "exposure +-20 % by turns", "better", "photos", partial(change_exposure, share=0.2)),
+        Case("utm", "moved to map coordinates", "same", "anything", partial(move, factor=1.0, shift=UTM)),
+        Case("small", "scaled by 1e-4", "same", "anything", partial(move, factor=1e-4, shift=(0, 0, 0))),
+        Case("large", "scaled by 1e4", "same", "anything", partial(move, factor=1e4, shift=(0, 0, 0))),
+        Case("broken", "1 % of the rows not finite", "near", "anything", break_rows),
+        Case("flyaways", "0.0025 % of the Gaussians far away", "near", "anything", throw_away),
+        Case("oversized", "1 % of the Gaussians 8 times as large", "near", "anything", enlarge),
         Case("threads", "one thread", "bits", threads=1),
         Case("again", "the result compacted once more", "again"),
-        *(_rewritten(*convention) for convention in CONVENTIONS),
+        *(_rewrite_poses(*convention) for convention in CONVENTIONS),
     )
 }  # fmt: skip

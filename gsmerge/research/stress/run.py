@@ -1,4 +1,4 @@
-"""Runs the cases on a scene and judges each by its property."""
+"""Runs the cases on a scene and checks the property of each."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +19,13 @@ from gsmerge.io.hints import AUTO, ReadHints
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
-from gsmerge.research.stress.cases import CASES, PROPERTIES, Case
-from gsmerge.research.stress.changes import Judged
+from gsmerge.research.stress.cases import CASES, PROPERTIES, Case, StressScene
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
-WORSE = 0.1  # dB that a result may be below its input
-SAME, NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
-FITTED = 1.0  # dB more after a full fit, which rounding alone sends another way: thin poles show it
-SAME_COUNT, ONCE_COUNT = 0.005, 1.05
+MAX_WORSE = 0.1  # dB that a result may be below its input
+MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that a changed scene's result may be below the unchanged one's
+FIT_SLACK = 1.0  # dB more after a full fit, whose result rounding alone changes this much on thin structures
+SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and ratio, of counts
 _QUICK = EvaluateOptions(lpips=())
 _FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 Progress = Callable[[str, int, int], None]
@@ -33,23 +33,28 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class StressOutcome:
-    """What one case did to a scene.
+    """The outcome of one case.
 
     Args:
         case: Its name.
-        words: What was changed.
-        wanted: The property that must hold.
-        held: Whether it does; None where the case makes no sense for the scene.
-        found: What was measured, or why it makes no sense.
-        seconds: What it took.
+        change: How the scene was changed, in words.
+        expected: The property that must hold.
+        passed: Whether it does; None where the case does not apply to the scene.
+        measured: The figures, or why the case does not apply.
+        seconds: Wall time.
     """
 
     case: str
-    words: str
-    wanted: str
-    held: bool | None
-    found: str
+    change: str
+    expected: str
+    passed: bool | None
+    measured: str
     seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The outcome under the keys of the report."""
+        keys = ("case", "words", "wanted", "held", "found", "seconds")
+        return dict(zip(keys, vars(self).values(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -79,10 +84,10 @@ def stress(
     Args:
         load: The scene, with views.
         options: Settings of every run.
-        targets: Held-out views that results are judged by; None: the input views, by their photos, or by renders of
-            the input where there are none.
+        targets: Held-out views that results are compared with; None: the input views with their photos, or with renders
+            of the input where there are none.
         cases: Names of ``CASES``; None: all.
-        hints: What was told when the scene was read.
+        hints: Given when the scene was read.
         progress: Called with (case, done, total).
 
     Raises:
@@ -95,45 +100,50 @@ def stress(
     if len(load.scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
-    given = Judged(load.scene, targets)
-    usual = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None
+    given = StressScene(load.scene, targets)
+    base = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
         if progress:
             progress(case.words, i, len(names))
-        held, found = _judged(case, load, given, usual, options, hints)
+        passed, measured = _check_case(case, load, given, base, options, hints)
         seconds = time.perf_counter() - start
-        out.append(StressOutcome(name, case.words, _wanted(case, options), held, found, seconds))
+        out.append(StressOutcome(name, case.words, _property_text(case, options), passed, measured, seconds))
     if progress:
         progress("done", len(names), len(names))
     return tuple(out)
 
 
-def _judged(
-    case: Case, load: SceneLoad, given: Judged, usual: _Result | None, options: CompactOptions, hints: ReadHints
+def _check_case(
+    case: Case,
+    load: SceneLoad,
+    given: StressScene,
+    base: _Result | None,
+    options: CompactOptions,
+    hints: ReadHints,
 ) -> tuple[bool | None, str]:
-    """Whether the case's property holds, and what was measured."""
-    problem = _unfit(case, load)
+    """Whether the case's property holds, and the figures."""
+    problem = _inapplicable(case, load)
     if problem is not None:
         return None, problem
     if case.check == "convention":
-        return _convention(case, load, hints)
-    assert usual is not None
+        return _check_convention(case, load, hints)
+    assert base is not None
     try:
         if case.check == "again":
-            return _again(given, usual, options)
+            return _check_again(given, base, options)
         changed = given if case.change is None else case.change(given)
         settings = options if case.threads is None else replace(options, threads=case.threads)
-        result = usual if case.name == "unchanged" else _run(changed, settings)
-    except (GsmergeError, ValueError) as error:  # what one case does to a scene must not end the others
+        result = base if case.name == "unchanged" else _run(changed, settings)
+    except (GsmergeError, ValueError) as error:  # a case that fails must not end the others
         return False, f"ended with: {error}"
-    unsound = _unsound(result.gaussians, changed.scene)
-    return (False, unsound) if unsound else _compared(case, usual, result, _slack(options))
+    defect = _find_defect(result.gaussians, changed.scene)
+    return (False, defect) if defect else _check_result(case, base, result, _slack(options))
 
 
-def _unfit(case: Case, load: SceneLoad) -> str | None:
-    """Why a case makes no sense for a scene; None where it does."""
+def _inapplicable(case: Case, load: SceneLoad) -> str | None:
+    """Why a case does not apply to a scene; None where it does."""
     scene = load.scene
     if case.needs in ("pixels", "photos") and not isinstance(scene, PixelScene):
         return "needs a Gaussian for each pixel"
@@ -147,58 +157,58 @@ def _unfit(case: Case, load: SceneLoad) -> str | None:
     return None
 
 
-def _run(given: Judged, options: CompactOptions) -> _Result:
+def _run(given: StressScene, options: CompactOptions) -> _Result:
     result = compact(given.scene, options)
     return _Result(result.gaussians, *_quality(given, result.gaussians))
 
 
-def _quality(given: Judged, gaussians: Gaussians) -> tuple[float, float]:
-    """PSNR (dB) of the input and of a result on the judging views; the input's is infinite where it judges itself."""
-    found = evaluate(given.scene, {"result": gaussians}, given.judges, replace(_QUICK, context=given.judges is None))
-    split = "context" if given.judges is None else "target"
-    before, after = (one.mean(split)[1].psnr for one in found.results)
+def _quality(given: StressScene, gaussians: Gaussians) -> tuple[float, float]:
+    """PSNR (dB) of the input and of a result on the views; the input's is infinite where it is the reference itself."""
+    evaluation = evaluate(given.scene, {"result": gaussians}, given.views, replace(_QUICK, context=given.views is None))
+    split = "context" if given.views is None else "target"
+    before, after = (one.mean(split)[1].psnr for one in evaluation.results)
     return (math.inf if before is None else before), (math.nan if after is None else after)
 
 
 def _slack(options: CompactOptions) -> float:
-    return FITTED if options.fit.fit == "full" else 0.0
+    return FIT_SLACK if options.fit.fit == "full" else 0.0
 
 
-def _wanted(case: Case, options: CompactOptions) -> str:
+def _property_text(case: Case, options: CompactOptions) -> str:
     slack = _slack(options)
-    return PROPERTIES[case.check].format(same=SAME + slack, near=NEAR + slack, worse=WORSE)
+    return PROPERTIES[case.check].format(same=MAX_SAME + slack, near=MAX_NEAR + slack, worse=MAX_WORSE)
 
 
-def _compared(case: Case, usual: _Result, result: _Result, slack: float) -> tuple[bool, str]:
+def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
     figures = f"{result.count:,} Gaussians, {result.after:.2f} dB"
-    beside = f"{figures}; unchanged {usual.count:,}, {usual.after:.2f} dB"
+    both = f"{figures}; unchanged {base.count:,}, {base.after:.2f} dB"
     if case.check == "better":
         if math.isinf(result.before):
             return True, f"{figures} against renders of the input"
-        return result.after >= result.before - WORSE, f"{figures}; its input {result.before:.2f} dB"
+        return result.after >= result.before - MAX_WORSE, f"{figures}; its input {result.before:.2f} dB"
     if case.check == "bits":
-        same = all(torch.equal(getattr(usual.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
-        return same, "equal" if same else f"differs: {beside}"
+        same = all(torch.equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
+        return same, "equal" if same else f"differs: {both}"
     if case.check == "near":
-        return result.after >= usual.after - NEAR - slack, beside
-    near = result.after >= usual.after - SAME - slack
+        return result.after >= base.after - MAX_NEAR - slack, both
+    near = result.after >= base.after - MAX_SAME - slack
     if case.check == "once":
-        return near and result.count <= ONCE_COUNT * usual.count, beside
-    return near and abs(result.count - usual.count) <= max(1, SAME_COUNT * usual.count), beside
+        return near and result.count <= ONCE_COUNT * base.count, both
+    return near and abs(result.count - base.count) <= max(1, SAME_COUNT * base.count), both
 
 
-def _again(given: Judged, usual: _Result, options: CompactOptions) -> tuple[bool, str]:
+def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
     """The result as a scene of its own, compacted to as many Gaussians as it has."""
     scene = given.scene
-    loose = UnalignedScene(usual.gaussians, scene.cameras, scene.images, scene.names)
-    plain = replace(options.target, budget=usual.count, max_bytes=None, preset=None, max_drop=None, target_psnr=None)
+    unaligned = UnalignedScene(base.gaussians, scene.cameras, scene.images, scene.names)
+    plain = replace(options.target, budget=base.count, max_bytes=None, preset=None, max_drop=None, target_psnr=None)
     once = replace(options, target=replace(plain, levels=1), decode=replace(options.decode, k=1))
-    after = _quality(given, compact(loose, once).gaussians)[1]
-    return after >= usual.after - SAME - _slack(options), f"{after:.2f} dB; before {usual.after:.2f} dB"
+    after = _quality(given, compact(unaligned, once).gaussians)[1]
+    return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 
-def _convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
-    """The scene read from cameras whose poses are written in another convention than their format has."""
+def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
+    """The scene read from cameras whose poses are in another convention than that of their format."""
     assert load.cameras is not None
     assert case.convention is not None
     stored = from_viewmats(load.cameras.viewmats.numpy(), case.convention)
@@ -208,8 +218,10 @@ def _convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, st
         read = align_scene(ply, load.files, wrong, hints=hints).scene
     except SceneError as error:
         return True, f"refused: {error.problem}"
-    expected, found = load.scene.cameras.viewmats.numpy(), read.cameras.viewmats.numpy()
-    same = expected.shape == found.shape and np.allclose(expected, found, atol=1e-3 * (1 + np.abs(expected).max()))
+    expected, viewmats = load.scene.cameras.viewmats.numpy(), read.cameras.viewmats.numpy()
+    same = expected.shape == viewmats.shape and np.allclose(
+        expected, viewmats, atol=1e-3 * (1 + np.abs(expected).max())
+    )
     return bool(same), "recognised" if same else "taken for something else"
 
 
@@ -217,8 +229,8 @@ def _encoding(load: SceneLoad) -> OpacityChoice:
     return "raw" if load.ply.opacity_encoding == "raw" else "logit"
 
 
-def _unsound(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:
-    """What is wrong with a result whatever the scene; None where nothing is."""
+def _find_defect(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:
+    """What is wrong with a result for any scene; None where nothing is."""
     for name in _FIELDS:
         if not bool(torch.isfinite(getattr(gaussians, name)).all()):
             return f"{name} are not finite"

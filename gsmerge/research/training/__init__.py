@@ -1,19 +1,18 @@
-"""Training of the networks on what the fit itself finds out about scenes, and on renders against photos."""
+"""Training of the networks on the corrections that the full fit makes, and on renders compared with photos."""
 
 from gsmerge.research.training.examples import Example, make_example, read_examples
-from gsmerge.research.training.loop import Trained, network_device, train
-from gsmerge.research.training.options import TrainOptions, read_config
-from gsmerge.research.training.presets import preset_options
-from gsmerge.research.training.subjects import Subject, make_subject
+from gsmerge.research.training.loop import TrainResult, choose_device, train
+from gsmerge.research.training.options import TrainOptions, preset_options, read_config
+from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 
 __all__ = [
     "Example",
-    "Subject",
     "TrainOptions",
-    "Trained",
+    "TrainResult",
+    "TrainingScene",
+    "choose_device",
     "make_example",
-    "make_subject",
-    "network_device",
+    "make_training_scene",
     "preset_options",
     "read_config",
     "read_examples",

@@ -1,15 +1,16 @@
-"""The training run: AdamW on random crops, validation, checkpoints; killed at any time, it goes on where it was.
+"""The training run: AdamW on random crops, validation, checkpoints; an interrupted run can be resumed.
 
-The first steps, if so wanted, learn from what the fit changed alone. Regression to a mean overshoots what is ambiguous,
-so all others compare renders with photos.
+The first steps can learn from the corrections of the fit alone. Regression overshoots where the corrections are
+ambiguous, so all other steps compare renders with photos.
 
-Every random number hangs on the seed and the step, and crops are worked on alone and added up in order. So a run that
-was interrupted ends with the same bytes as one that was not, on any number of threads.
+Random numbers depend only on seed and step, and the gradients of crops are added in order. So an interrupted run ends
+with the same bytes as one that was not, on any number of threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,48 +18,55 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
+from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks import Networks, save_checkpoint
 from gsmerge.research.training.examples import Example
-from gsmerge.research.training.objective import compared, correction_loss, target_scales, window_loss
+from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
 from gsmerge.research.training.options import TrainOptions
-from gsmerge.research.training.predict import random_crop
-from gsmerge.research.training.record import REMEDY, Learner, Row, load_state, save_state, write_losses
-from gsmerge.research.training.validation import judged_by, make_judge, write_pictures
-from gsmerge.research.training.windows import random_window
+from gsmerge.research.training.predict import sample_crop
+from gsmerge.research.training.validation import Row, make_validation_set, validate, write_pictures
+from gsmerge.research.training.windows import sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-Told = Callable[[int, int, float], None]  # step, steps, loss
+Progress = Callable[[int, int, float], None]  # step, steps, loss
+FORMAT = "gsmerge-training"
+REMEDY = "choose another --out, or remove it to start again"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingState:
+    """Networks, the running mean of their weights, and the optimiser's moments: everything that a step changes."""
+
+    networks: Networks
+    smooth: Networks
+    optimizer: torch.optim.Optimizer
+
+    def pairs(self) -> Iterator[tuple[str, Parameter, Parameter]]:
+        """Name, parameter, and its running mean."""
+        for (name, parameter), mean in zip(self.networks.named_parameters(), self.smooth.parameters(), strict=True):
+            yield name, parameter, mean
 
 
 @dataclass(frozen=True)
-class Trained:
-    """What a run left behind.
+class TrainResult:
+    """The files and figures of a run."""
 
-    Args:
-        best: Checkpoint of the highest PSNR of validation since renders are compared; before, of the least loss.
-        last: Checkpoint of the last step.
-        losses: CSV, one row for each time that it was validated.
-        step: Steps done.
-        loss: The last training loss.
-        validation_loss: The least validation loss.
-        psnr_analytic: PSNR (dB) of the windows of validation without networks.
-        psnr_learned: The best with them.
-        resumed: Step that the run went on from; 0 for a new one.
-    """
-
-    best: Path
-    last: Path
-    losses: Path
-    step: int
-    loss: float
-    validation_loss: float
-    psnr_analytic: float
-    psnr_learned: float
-    resumed: int
+    best: Path  # checkpoint with the highest PSNR of validation; before renders are compared, with the least loss
+    last: Path  # checkpoint of the last step
+    losses: Path  # CSV, one row for each validation
+    step: int  # steps done
+    loss: float  # the last training loss
+    validation_loss: float  # the least validation loss
+    psnr_analytic: float  # PSNR (dB) of the windows of validation without networks
+    psnr_learned: float  # the best PSNR with networks
+    resumed: int  # step from which the run was resumed; 0 for a new one
 
 
 def train(
@@ -69,9 +77,9 @@ def train(
     *,
     threads: int | None = None,
     device: str = "cpu",
-    progress: Told | None = None,
-) -> Trained:
-    """Train networks, or go on with the run that the folder holds.
+    progress: Progress | None = None,
+) -> TrainResult:
+    """Train networks, or resume the run in the folder.
 
     Args:
         examples: Scenes to learn from, at least one.
@@ -80,13 +88,13 @@ def train(
             of each validation scene.
         options: Settings.
         threads: Threads to use; None: all processors. The result does not depend on it.
-        device: Where the networks run: ``"cpu"``, ``"cuda"``, or ``"auto"``, CUDA where torch finds it. Windows are
-            rendered on the CPU. On CUDA a run repeats to rounding, not to the bit.
+        device: Where the networks run: ``"cpu"``, ``"cuda"``, or ``"auto"``: CUDA if torch finds it. Windows are
+            rendered on the CPU. On CUDA a run repeats up to rounding, not to the bit.
         progress: Called after every step.
 
     Raises:
-        ValueError: If there are no examples, or torch finds no CUDA device and is told to use it.
-        GsmergeError: If LPIPS has a weight, and its own are not installed.
+        ValueError: If there are no examples, or torch finds no CUDA device and ``device`` asks for it.
+        GsmergeError: If LPIPS has a weight, and its networks are not installed.
         SceneError: If the folder holds another run, or cannot be written.
     """
     options = options or TrainOptions()
@@ -96,21 +104,21 @@ def train(
         require_lpips("vgg")
     out.mkdir(parents=True, exist_ok=True)
     with use_threads(threads):
-        return _run(examples, validation or examples, out, options, network_device(device), progress)
+        return _run(examples, validation or examples, out, options, choose_device(device), progress)
 
 
-def network_device(wanted: str) -> str:
+def choose_device(name: str) -> str:
     """The device that ``"cpu"``, ``"cuda"`` or ``"auto"`` means on this machine.
 
     Raises:
-        ValueError: If the name is unknown, or torch finds no CUDA device and it is wanted.
+        ValueError: If the name is unknown, or is "cuda" and torch finds no CUDA device.
     """
-    if wanted not in ("cpu", "cuda", "auto"):
-        raise ValueError(f'device: expected "cpu", "cuda" or "auto", got {wanted!r}')
-    found = wanted != "cpu" and torch.cuda.is_available()
-    if wanted == "cuda" and not found:
+    if name not in ("cpu", "cuda", "auto"):
+        raise ValueError(f'device: expected "cpu", "cuda" or "auto", got {name!r}')
+    has_cuda = name != "cpu" and torch.cuda.is_available()
+    if name == "cuda" and not has_cuda:
         raise ValueError('device: expected a CUDA device, torch finds none; use "cpu"')
-    return "cuda" if found else "cpu"
+    return "cuda" if has_cuda else "cpu"
 
 
 def _run(
@@ -119,38 +127,38 @@ def _run(
     out: Path,
     options: TrainOptions,
     device: str,
-    progress: Told | None,
-) -> Trained:
-    learner = _fresh(options, device)
-    scales, judge = target_scales(examples), make_judge(validation, options)
+    progress: Progress | None,
+) -> TrainResult:
+    state = _new_state(options, device)
+    scales, validation_set = target_scales(examples), make_validation_set(validation, options)
     hashes = {kind: [e.sha256 for e in part] for kind, part in (("data", examples), ("validation", validation))}
-    step, rows = _resumed(out, learner, {"options": options.to_dict(), **hashes})
+    step, rows = _resume(out, state, {"options": options.to_dict(), **hashes})
     resumed, losses = step, list[Tensor]()
     while step < options.steps:
-        losses.append(_step(learner, examples, scales, options, step))
+        losses.append(_step(state, examples, scales, options, step))
         step += 1
         if progress:
             progress(step, options.steps, float(losses[-1]))
         if step % options.save_every == 0 or step == options.steps:
-            judged = judged_by(learner.smooth, judge, scales, options)
+            scores = validate(state.smooth, validation_set, scales, options)
             mean = float(torch.stack(losses).mean())
-            rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **judged})
+            rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
             losses = []
-            told = {"step": step, "loss": mean, "figures": judged, "options": options.to_dict(), **hashes}
+            training = {"step": step, "loss": mean, "figures": scores, "options": options.to_dict(), **hashes}
             if is_best(rows, options):
-                save_checkpoint(out / "best.safetensors", learner.smooth, told)
-            save_checkpoint(out / "last.safetensors", learner.smooth, told)
+                save_checkpoint(out / "best.safetensors", state.smooth, training)
+            save_checkpoint(out / "last.safetensors", state.smooth, training)
             write_losses(out / "losses.csv", rows)
-            write_pictures(out, learner.smooth, judge)
-            state = {"step": step, "rows": rows, "options": options.to_dict(), **hashes}
-            save_state(out / "state.safetensors", learner, state)
+            write_pictures(out, state.smooth, validation_set)
+            facts = {"step": step, "rows": rows, "options": options.to_dict(), **hashes}
+            save_state(out / "state.safetensors", state, facts)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     least, most = min(row["validation_loss"] for row in rows), max(row["psnr_learned"] for row in rows)
-    return Trained(*paths, step, rows[-1]["loss"], least, rows[-1]["psnr_analytic"], most, resumed)
+    return TrainResult(*paths, step, rows[-1]["loss"], least, rows[-1]["psnr_analytic"], most, resumed)
 
 
 def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
-    """Whether the last row is better than all before it: those that compared renders, as soon as one did."""
+    """Whether the last row is the best: of the rows that compared renders, if it did."""
     *before, last = rows
     if last["step"] > options.photo_step:
         earlier = [row["psnr_learned"] for row in before if row["step"] > options.photo_step]
@@ -158,36 +166,36 @@ def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
     return last["validation_loss"] < min((row["validation_loss"] for row in before), default=float("inf"))
 
 
-def _fresh(options: TrainOptions, device: str) -> Learner:
-    """New networks that hang on the seed alone."""
+def _new_state(options: TrainOptions, device: str) -> TrainingState:
+    """New networks, which depend only on the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         networks = Networks(options.network).to(device)
     optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
-    return Learner(networks, deepcopy(networks).requires_grad_(False), optimizer)
+    return TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
 
 
-def _resumed(out: Path, learner: Learner, wanted: dict[str, Any]) -> tuple[int, list[Row]]:
-    """Step and table of the run in the folder; those of a new one where there is none."""
+def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[Row]]:
+    """Step and table of losses of the run in the folder; those of a new run if there is none."""
     path = out / "state.safetensors"
     if not path.exists():
         return 0, []
-    told = load_state(path, learner)
-    for name, value in wanted.items():
-        if told.get(name) != value:
+    facts = load_state(path, state)
+    for name, value in expected.items():
+        if facts.get(name) != value:
             raise SceneError(path, f"expected a run with the same {name}, found another", REMEDY)
-    return int(told["step"]), list(told["rows"])
+    return int(facts["step"]), list(facts["rows"])
 
 
 def _step(
-    learner: Learner,
+    state: TrainingState,
     examples: Sequence[Example],
     scales: Mapping[int, Tensor],
     options: TrainOptions,
     step: int,
 ) -> Tensor:
-    """One step -> its loss."""
-    networks, optimizer = learner.networks, learner.optimizer
+    """Do one step; returns its loss."""
+    networks, optimizer = state.networks, state.optimizer
     parameters = list(networks.parameters())
 
     def work(index: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
@@ -195,10 +203,10 @@ def _step(
         example = examples[int(rng.integers(len(examples)))]
         with torch.enable_grad():
             if step < options.photo_step:
-                crop = random_crop(example, options.crop, options.inner, rng)
-                loss = correction_loss(*compared(crop, networks, scales, options, step), options)
+                crop = sample_crop(example, options.crop, options.inner, rng)
+                loss = correction_loss(*scaled_corrections(crop, networks, scales, options, step), options)
             else:
-                window = random_window(example, options.window, options.most, options.novel, rng)
+                window = sample_window(example, options.window, options.most, options.novel, rng)
                 loss = window_loss(networks, window, scales, options, step, rng)
             return loss.detach(), torch.autograd.grad(loss, parameters, allow_unused=True)
 
@@ -212,6 +220,49 @@ def _step(
     optimizer.step()
     share = min(options.average, (1 + step) / (10 + step))
     with torch.no_grad():
-        for _, parameter, mean in learner.pairs():
+        for _, parameter, mean in state.pairs():
             mean.lerp_(parameter, 1 - share)
     return torch.stack(losses).mean()
+
+
+def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
+    """Write weights, their means, moments and facts about the run; an existing file is replaced."""
+    tensors: dict[str, torch.Tensor] = {}
+    for name, parameter, mean in state.pairs():
+        moments = state.optimizer.state[parameter]
+        named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
+        tensors |= {f"{kind}.{name}": tensor.detach().cpu() for kind, tensor in named.items()}
+    with atomic_output(path, overwrite=True) as temporary:
+        save_file(tensors, temporary, {FORMAT: json.dumps(dict(facts))})
+
+
+def load_state(path: Path, state: TrainingState) -> dict[str, Any]:
+    """Read weights, means and moments into ``state``; returns the facts about the run.
+
+    Raises:
+        SceneError: If the file is damaged or of other networks.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            facts = json.loads((file.metadata() or {})[FORMAT])
+            with torch.no_grad():
+                for name, parameter, mean in state.pairs():
+                    parameter.copy_(file.get_tensor(f"weight.{name}"))
+                    mean.copy_(file.get_tensor(f"mean.{name}"))
+                    kept = (file.get_tensor(f"{kind}.{name}") for kind in ("first", "second"))
+                    first, second = (tensor.to(parameter.device) for tensor in kept)
+                    step = torch.tensor(float(facts["step"]))
+                    state.optimizer.state[parameter] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise SceneError(
+            path, "expected the state of a training run, found a damaged file or another", REMEDY
+        ) from error
+    return dict(facts)
+
+
+def write_losses(path: Path, rows: Sequence[Row]) -> None:
+    """Write the table of losses as CSV; an existing file is replaced."""
+    lines = [",".join(rows[0])] if rows else []
+    lines += [",".join(f"{value:.8g}" for value in row.values()) for row in rows]
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")

@@ -1,4 +1,4 @@
-"""Settings of a training run: one table, every value with a default."""
+"""Settings of a training run, each with a default, and settings under a name."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from gsmerge.errors import SceneError
@@ -17,48 +18,48 @@ from gsmerge.stages.fit.loss import LOSS_WINDOW
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How networks are trained to begin where the fit ends.
+    """How networks are trained to predict what the fit changes.
 
     Args:
         network: Sizes of the networks.
-        views: Numbers of views that a scene is an example with, evenly spread; 0 means all. The photos of the others
-            are novel views.
-        densities: Superpixels per pixel; every scene is an example at each. The full fit begins with 57 % of the
-            usual number, which is why the defaults are two.
+        views: Numbers of views, evenly spread; 0 means all. A scene gives an example for each. The photos of the
+            other views are novel views.
+        densities: Superpixels per pixel; a scene gives an example for each. Two by default, since the full fit starts
+            with 57 % of the usual number.
         match: Merging across views of the examples, see :class:`gsmerge.stages.match.MatchOptions`.
         fit_steps: Steps of the full fit whose result is the target.
-        levels: Numbers of children K whose heads are trained, of 1, 2 and 4; each costs a fit of every scene.
+        levels: Numbers of children K whose heads are trained, of 1, 2 and 4; each needs a fit of every scene.
         steps: Steps of the training.
-        warmup: Steps over which the rate rises.
+        warmup: Steps over which the learning rate increases.
         rate: Highest learning rate.
         least_rate: Rate at the end of the cosine.
         decay: Weight decay (AdamW).
         clip: Largest norm of the gradient.
-        average: Weight of the old in the running mean of the weights, which is what is validated and kept; less in
+        average: Weight of the previous mean in the running mean of the weights, which is validated and saved; less in
             the first steps.
         crops: Crops per step, worked on in parallel.
-        crop: Merged Feature Gaussians of a crop: the nearest to one of them.
-        inner: Share of a crop that is judged; the rest are neighbours.
-        turn_weight: Weight of the rotation in the loss: axes of like length have none.
+        crop: Merged Feature Gaussians of a crop: those nearest to one of them.
+        inner: Share of a crop that is scored; the rest are neighbours.
+        turn_weight: Weight of the rotation in the loss; it is small because axes of similar length have no direction.
         photo_start: Share of the steps after which renders are compared with photos; 1: never. Of two runs of
             400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.
-        novel: Share of the windows that are in novel views, where there are any.
-        photo_scale: Sides of the photos are divided by it.
+        novel: Share of the windows in novel views, if there are any.
+        photo_scale: Factor by which the sides of the photos are divided.
         window: Side of a window of a photo that is rendered, pixels.
-        most: Most Feature Gaussians that may reach into a window; one with more is halved.
-        photo_loss: Difference of colours: ``"l1"`` or ``"mse"`` (the paper's).
-        photo_weight: Weight of the difference of colours.
+        most: Feature Gaussians that may reach into a window; a window with more is halved.
+        photo_loss: Colour loss: ``"l1"`` or ``"mse"`` (as in the paper).
+        photo_weight: Weight of the colour loss.
         ssim_weight: Weight of 1 - SSIM.
-        lpips_weight: Weight of LPIPS (VGG), whose weights are then needed; a step takes twice as long with it.
-        regression_weight: Weight of the regression where renders are compared, falling to 0 at the end of the run.
+        lpips_weight: Weight of LPIPS (VGG), whose networks must be installed; a step takes twice as long with it.
+        regression_weight: Weight of the regression when renders are compared; it falls to 0 until the end of the run.
         teacher_weight: Weight of the distance from the analytic Gaussians.
         teacher_steps: Steps that compare renders over which it falls to 0.
         diversity_weight: Weight of the diversification of several children.
         diversity_steps: Steps that compare renders over which it falls to 0.
         save_every: Steps between checkpoints, validation and lines of the table.
-        validation_crops: Crops of each scene that validation looks at, always the same.
-        validation_windows: Windows of each scene that validation renders, always the same.
-        seed: Everything random hangs on it.
+        validation_crops: Crops of each scene for validation, always the same.
+        validation_windows: Windows of each scene for validation, always the same.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: If a setting is out of range.
@@ -133,19 +134,18 @@ class TrainOptions:
             raise ValueError(f'match: expected "overlap", "aabb" or "none", got {self.match!r}')
 
     @staticmethod
-    def _expect(name: str, value: Any, least: float, most: float, *, whole: bool = False) -> None:
+    def _expect(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
         kind = int if whole else int | float
-        if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
-            raise ValueError(
-                f"{name}: expected {'a whole number' if whole else 'a number'} from {least:g}, got {value!r}"
-            )
+        if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
+            number = "a whole number" if whole else "a number"
+            raise ValueError(f"{name}: expected {number} from {low:g}, got {value!r}")
 
     @property
     def photo_step(self) -> int:
         """The first step, counted from 0, that compares renders with photos."""
         return math.ceil(self.photo_start * self.steps)
 
-    def held_by(self, step: int) -> tuple[float, float, float]:
+    def regularizer_weights(self, step: int) -> tuple[float, float, float]:
         """Weights of regression, teacher and diversification in a step that compares renders."""
         done = step - self.photo_step
 
@@ -159,7 +159,7 @@ class TrainOptions:
         )
 
     def rate_at(self, step: int) -> float:
-        """Learning rate of a step, counted from 0: a linear rise, then half a cosine."""
+        """Learning rate of a step, counted from 0: a linear increase, then half a cosine."""
         if step < self.warmup:
             return self.rate * (step + 1) / self.warmup
         part = (step - self.warmup) / max(1, self.steps - self.warmup)
@@ -167,11 +167,7 @@ class TrainOptions:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as plain values."""
-        return asdict(self) | {
-            "levels": list(self.levels),
-            "densities": list(self.densities),
-            "views": list(self.views),
-        }
+        return asdict(self) | {name: list(getattr(self, name)) for name in ("levels", "densities", "views")}
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> TrainOptions:
@@ -198,11 +194,7 @@ class TrainOptions:
 
 
 def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
-    """Training settings from a TOML or JSON file whose keys are the fields of :class:`TrainOptions`.
-
-    Args:
-        path: The file.
-        start: Settings that it does not name; None: the defaults.
+    """``start``, or the defaults, with settings of a TOML or JSON file, named as the fields of :class:`TrainOptions`.
 
     Raises:
         SceneError: If the file cannot be read or a setting is unknown or out of range.
@@ -212,3 +204,41 @@ def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
         return (start or TrainOptions()).with_settings(table)
     except (TypeError, ValueError) as error:
         raise SceneError(path, str(error).splitlines()[0]) from error
+
+
+# Table of hyperparameters and section 5.1 of the paper; settings that it does not give are the defaults.
+PAPER: Mapping[str, Any] = MappingProxyType(
+    {
+        "network": {"outputs": "absolute"},
+        "views": tuple(range(1, 13)),
+        "match": "aabb",
+        "levels": (1, 2, 4),
+        "steps": 300_000,
+        "warmup": 2_000,
+        "rate": 5e-5,
+        "least_rate": 1e-6,
+        "clip": 10.0,
+        "photo_start": 0.0,
+        "photo_loss": "mse",
+        "photo_weight": 1.0,
+        "ssim_weight": 0.05,
+        "lpips_weight": 0.05,
+        "regression_weight": 0.0,
+        "teacher_weight": 0.25,
+        "teacher_steps": 2_000,
+        "diversity_weight": 1.0,
+        "diversity_steps": 50_000,
+    }
+)
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType({"default": MappingProxyType({}), "paper": PAPER})
+
+
+def preset_options(name: str) -> TrainOptions:
+    """The settings under a name.
+
+    Raises:
+        ValueError: If the name is unknown.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
+    return TrainOptions.from_dict(PRESETS[name])

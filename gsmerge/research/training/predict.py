@@ -1,4 +1,4 @@
-"""Crops of examples through all networks, with gradients: the sum of the corrections of every stage."""
+"""Crops of examples through all networks, with gradients: the sum of the corrections of all stages."""
 
 from __future__ import annotations
 
@@ -21,32 +21,24 @@ from gsmerge.networks.apply import (
 )
 from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
 from gsmerge.networks.tokens import GroupFeatures
-from gsmerge.research.training.examples import Example, differences
+from gsmerge.research.training.examples import Example, corrections_between
 from gsmerge.stages.merge import cluster_runs, pool_runs, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Neighbouring Feature Gaussians of an example, with K children each.
-
-    Args:
-        example: Where they are from.
-        k: Which of its levels.
-        rows: ``[r]`` rising rows of its merged Feature Gaussians.
-        children: ``[n]`` rising rows of the level's children.
-        judged: ``[n]`` whether their targets count.
-    """
+    """Neighbouring Feature Gaussians of an example, with K children each."""
 
     example: Example
-    k: int
-    rows: Tensor
-    children: Tensor
-    judged: Tensor
+    k: int  # which of its levels
+    rows: Tensor  # [r] ascending rows of its merged Feature Gaussians
+    children: Tensor  # [n] ascending rows of the level's children
+    scored: Tensor  # [n] bool, whether their targets count
 
 
-def random_crop(example: Example, count: int, inner: float, rng: np.random.Generator) -> Crop:
-    """The ``count`` Feature Gaussians that are nearest to a random one; the nearest of them are judged."""
+def sample_crop(example: Example, count: int, inner: float, rng: np.random.Generator) -> Crop:
+    """The ``count`` Feature Gaussians nearest to a random one, of which the share ``inner`` nearest to it is scored."""
     k = list(example.levels)[int(rng.integers(len(example.levels)))]
     level, centre = example.levels[k], example.centres[int(rng.integers(len(example.centres)))]
     distances = (example.centres - centre).square().sum(1)
@@ -54,46 +46,41 @@ def random_crop(example: Example, count: int, inner: float, rng: np.random.Gener
     inside, close = torch.zeros(2, len(distances), dtype=torch.bool)
     inside[order], close[order[: max(1, int(inner * len(order)))]] = True, True
     children = torch.nonzero(inside[level.parents])[:, 0]
-    judged = close[level.parents[children]] & level.mask[children]
-    return Crop(example, k, torch.nonzero(inside)[:, 0], children, judged)
+    scored = close[level.parents[children]] & level.mask[children]
+    return Crop(example, k, torch.nonzero(inside)[:, 0], children, scored)
 
 
-def owners(matches: Matches) -> Tensor:
-    """``[g]`` row after merging of every Feature Gaussian before it."""
+def merged_rows(matches: Matches) -> Tensor:
+    """``[g]`` row after merging of every Feature Gaussian before merging."""
     alone, order, cuts = cluster_runs(matches)
-    found = torch.empty(len(matches.clusters), dtype=torch.int64)
-    found[alone] = torch.arange(len(alone))
+    rows = torch.empty(len(matches.clusters), dtype=torch.int64)
+    rows[alone] = torch.arange(len(alone))
     first = torch.zeros(len(order), dtype=torch.int64)
     first[torch.from_numpy(cuts)] = 1
-    found[order] = len(alone) + first.cumsum(0) - 1
-    return found
+    rows[order] = len(alone) + first.cumsum(0) - 1
+    return rows
 
 
 @dataclass(frozen=True, eq=False)
-class Foreseen:
-    """What the networks make of a crop's children.
+class Prediction:
+    """A crop's children, corrected by the networks."""
 
-    Args:
-        corrections: ``[n,13]`` of all stages together, as the targets are: from the analytic children.
-        gaussians: The children as the stages would make them, with gradients.
-    """
-
-    corrections: Tensor
-    gaussians: Gaussians
+    corrections: Tensor  # [n,13] of all stages together, from the analytic children as the targets
+    gaussians: Gaussians  # the corrected children, with gradients
 
 
-def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
+def predict(crop: Crop, networks: Networks, seed: int) -> Prediction:
     """A crop through all networks.
 
-    Each stage looks at what the ones before it made; gradients go through the latents and the corrections. At K = 1
-    the corrections of all stages add up; the children of a larger K are pooled anew from the members, so what reaches
-    them from the stages before their head is the latent.
+    Each stage reads the results of those before it; gradients go through the latents and the corrections. At K = 1 the
+    corrections of all stages add up; the children of a larger K are pooled again from the members, so the stages before
+    their head reach them through the latent alone.
 
-    The Gaussians of K = 1 are those that the stages make, one after the other; their gradient is that of the sum.
+    The Gaussians of K = 1 are the results of the stages, one after the other; their gradient is that of the sum.
     """
     example = crop.example
     context = NetworkContext(networks, example.members, example.cameras, seed)
-    owner = owners(example.matches)
+    owner = merged_rows(example.matches)
     parts = take(example.features, torch.nonzero(torch.isin(owner, crop.rows))[:, 0])
     local = torch.searchsorted(crop.rows, owner[torch.isin(owner, crop.rows)])
     group_features = context.describe(parts)
@@ -110,22 +97,22 @@ def foreseen(crop: Crop, networks: Networks, seed: int) -> Foreseen:
     children = prepare_children(children, parents.numpy(), refined, group_features, networks)
     heads = run_heads(children, parents.numpy(), refined, group_features, context)
     before = corrections + residuals if single else torch.zeros_like(heads)
-    last = heads + (before - before.detach())  # what was done to the base has a gradient, and is not done again
+    last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
     gaussians = move_gaussians(children, last, frames)
     if networks.options.outputs == "absolute":
-        return Foreseen(differences(analytic, gaussians, frames), gaussians)
-    return Foreseen(before + heads, gaussians)
+        return Prediction(corrections_between(analytic, gaussians, frames), gaussians)
+    return Prediction(before + heads, gaussians)
 
 
-def predicted(crop: Crop, networks: Networks, seed: int) -> Tensor:
-    """``[n,13]`` corrections that the networks make of a crop's children, see :func:`foreseen`."""
-    return foreseen(crop, networks, seed).corrections
+def predict_corrections(crop: Crop, networks: Networks, seed: int) -> Tensor:
+    """``[n,13]`` corrections of a crop's children by the networks, see :func:`predict`."""
+    return predict(crop, networks, seed).corrections
 
 
 def _merged(
     parts: FeatureGaussians, group_features: GroupFeatures, shifts: Tensor, matches: Matches, context: NetworkContext
 ) -> tuple[FeatureGaussians, Tensor]:
-    """Merged Feature Gaussians, and what encoder and merger did to each."""
+    """Merged Feature Gaussians, and the corrections of each by encoder and merger."""
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return parts, shifts

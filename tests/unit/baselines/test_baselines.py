@@ -1,4 +1,4 @@
-"""Every rival method: its count, its order, and what defines it."""
+"""Every baseline: its count, its order, and what defines it."""
 
 from __future__ import annotations
 

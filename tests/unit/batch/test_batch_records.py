@@ -16,9 +16,9 @@ from batches import rows
 
 from gsmerge.batch import BatchOptions, Job, locks, plan
 from gsmerge.batch.locks import LOCKS, BusyError, run_lock, scene_lock
-from gsmerge.batch.plan import estimate_seconds, make_shape
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, Index, Known, check_folder, record
-from gsmerge.batch.summary import COLUMNS, SHOWN, Totals, summary_lines, write_summary
+from gsmerge.batch.plan import estimate_seconds, make_schedule
+from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
+from gsmerge.batch.summary import COLUMNS, MAX_LISTED, Totals, summary_lines, write_summary
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
@@ -45,22 +45,22 @@ def done(output: str, key: str = "k", **report: Any) -> dict[str, Any]:
 
 def test_results_are_known_by_what_they_were_made_of_and_what_they_are(tmp_path: Path) -> None:
     append_line(tmp_path / RECORDS, done("a.ply"))
-    index = Index(tmp_path)
+    index = RecordIndex(tmp_path)
     index.read_on()
     known = index.known["a.ply"]
-    assert known == Known("k", (("a.ply", SHA),))
+    assert known == DoneResult("k", (("a.ply", SHA),))
     assert not known.holds(tmp_path, "k")  # there is no file
     (tmp_path / "a.ply").write_bytes(b"abc")
     assert known.holds(tmp_path, "k")
     assert not known.holds(tmp_path, "other")
     (tmp_path / "a.ply").write_bytes(b"abd")
     assert not known.holds(tmp_path, "k")
-    assert index.results() == {os.path.realpath(tmp_path / "a.ply")}
+    assert index.result_paths() == {os.path.realpath(tmp_path / "a.ply")}
 
 
 def test_an_index_reads_on_and_past_what_is_damaged(tmp_path: Path) -> None:
     path = tmp_path / RECORDS
-    index = Index(tmp_path)
+    index = RecordIndex(tmp_path)
     index.read_on()
     append_line(path, done("a.ply"))
     append_line(path, record(FAILED, "in/b.ply", "b.ply", error="no"))
@@ -155,7 +155,7 @@ def test_a_lock_survives_that_its_file_is_removed_while_it_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Between opening and locking, who held it finishes: the file that is locked then is nobody's any more."""
-    locked, calls = locks._locked, []
+    locked, calls = locks._lock, []
 
     def removed_first(descriptor: int, path: Path, *, shared: bool) -> bool:
         if not calls:
@@ -163,7 +163,7 @@ def test_a_lock_survives_that_its_file_is_removed_while_it_is_waited_for(
         calls.append(path)
         return locked(descriptor, path, shared=shared)
 
-    monkeypatch.setattr(locks, "_locked", removed_first)
+    monkeypatch.setattr(locks, "_lock", removed_first)
     with scene_lock(tmp_path, ["a.ply"]) as lock:
         assert len(calls) == 2
         assert lock.path.exists()
@@ -237,8 +237,8 @@ def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) ->
 
     def spread(count: int, processors: int, **told: Any) -> tuple[int, int]:
         settings = CompactOptions().with_settings({"threads": told.pop("threads", None)})
-        shape = make_shape(jobs(*[1000] * count), BatchOptions(settings, **told), processors=processors)
-        return shape.jobs, shape.threads
+        schedule = make_schedule(jobs(*[1000] * count), BatchOptions(settings, **told), processors=processors)
+        return schedule.jobs, schedule.threads
 
     assert spread(100, 8) == (8, 1)
     assert spread(3, 8) == (3, 2)
@@ -257,23 +257,23 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     scenes = jobs(small, large, small, large, small)
     need = memory_bytes(large, photos=True)
 
-    def shape(limit: int | None, **told: Any) -> plan.Shape:
-        return make_shape(scenes, BatchOptions(max_memory=limit, **told), processors=4)
+    def schedule(limit: int | None, **told: Any) -> plan.Schedule:
+        return make_schedule(scenes, BatchOptions(max_memory=limit, **told), processors=4)
 
-    assert shape(3 * need).jobs == 4
-    assert shape(2 * need).jobs == 2  # the two large ones may come together
-    assert (shape(2 * need - 1).jobs, shape(2 * need - 1).threads) == (1, 4)
-    assert shape(2 * need).memory == 2 * need
-    assert shape(2 * need).notes == ()
-    assert "2 at once instead of 3" in shape(2 * need, jobs=3).notes[0]
-    alone = shape(need // 2)
+    assert schedule(3 * need).jobs == 4
+    assert schedule(2 * need).jobs == 2  # the two large ones may come together
+    assert (schedule(2 * need - 1).jobs, schedule(2 * need - 1).threads) == (1, 4)
+    assert schedule(2 * need).memory == 2 * need
+    assert schedule(2 * need).notes == ()
+    assert "2 at once instead of 3" in schedule(2 * need, jobs=3).notes[0]
+    alone = schedule(need // 2)
     assert alone.jobs == 1
     assert "the largest scene alone may take" in alone.notes[0]
     monkeypatch.setattr(plan, "free_memory", lambda: need)
-    assert shape(None).jobs == 1
-    assert shape(None, jobs=3).jobs == 3  # who asks for it gets it
+    assert schedule(None).jobs == 1
+    assert schedule(None, jobs=3).jobs == 3  # who asks for it gets it
     monkeypatch.setattr(plan, "free_memory", lambda: None)
-    assert shape(None).jobs == 4
+    assert schedule(None).jobs == 4
 
 
 def test_the_system_tells_its_memory() -> None:
@@ -284,7 +284,7 @@ def test_the_system_tells_its_memory() -> None:
 def test_estimates_grow_with_scenes_and_shrink_with_processors(made_scene: Path) -> None:
     one = [Job(0, str(made_scene), "a.ply", 30_000)]
     options = BatchOptions()
-    seconds = [estimate_seconds(one * count, options, plan.Shape(at_once, 1, 0)) for count, at_once in
+    seconds = [estimate_seconds(one * count, options, plan.Schedule(at_once, 1, 0)) for count, at_once in
                ((0, 1), (1, 1), (8, 1), (8, 4))]  # fmt: skip
     assert seconds[0] == 0 < seconds[1] < seconds[3] < seconds[2]
 
@@ -316,7 +316,7 @@ def test_totals_do_not_grow_with_the_number_of_scenes(tmp_path: Path) -> None:
         totals.add(record(FAILED, f"{number}", f"{number}.ply", error="no"))
         totals.add(record(SKIPPED, f"{number}", f"{number}.ply"))
     totals.add(done("x.ply", unmet="too few"))
-    assert (len(totals.rows), len(totals.failures)) == (SHOWN, SHOWN)
+    assert (len(totals.rows), len(totals.failures)) == (MAX_LISTED, MAX_LISTED)
     assert (totals.num_input, totals.num_output, totals.ended, totals.unmet) == (30100, 1204, 901, 1)
     *table, last = summary_lines(totals, tmp_path / "summary.csv")
     assert table[0].split() == ["result", "Gaussians", "of", "kept", "dB", "before", "after", "seconds"]

@@ -21,8 +21,8 @@ from gsmerge.batch import Job
 from gsmerge.batch import task as tasks
 from gsmerge.batch.locks import scene_lock
 from gsmerge.batch.records import BUSY, DONE, FAILED, LOST, SKIPPED, STUCK, record
-from gsmerge.batch.run import hand_out
-from gsmerge.batch.task import Task, Work, give_up, run_task, tidy
+from gsmerge.batch.run import dispatch
+from gsmerge.batch.task import BatchContext, Task, clean_up, record_failure, run_task
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic
 
@@ -163,20 +163,20 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
 
 
 def test_what_another_run_has_done_meanwhile_is_skipped(scene: Path, out: Path) -> None:
-    task, work, later = one_task(scene, out)
+    task, context, later = one_task(scene, out)
     assert run(scene, out)["status"] == DONE
-    assert run_task(task, work, later)["status"] == SKIPPED
-    task, work, later = one_task(scene, out, replace(QUICK, rerun=True))
-    assert run_task(task, work, later)["status"] == DONE
-    assert run_task(task, work, later)["status"] == SKIPPED  # done again since the run began
+    assert run_task(task, context, later)["status"] == SKIPPED
+    task, context, later = one_task(scene, out, replace(QUICK, rerun=True))
+    assert run_task(task, context, later)["status"] == DONE
+    assert run_task(task, context, later)["status"] == SKIPPED  # done again since the run began
 
 
 def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
-    task, work, later = one_task(scene, out)
+    task, context, later = one_task(scene, out)
     with scene_lock(out, ["room.ply"]) as lock:
-        assert run_task(task, work, later)["status"] == BUSY
-        assert give_up(task, work, "died")["status"] == BUSY
-        tidy(task, work)
+        assert run_task(task, context, later)["status"] == BUSY
+        assert record_failure(task, context, "died")["status"] == BUSY
+        clean_up(task, context)
         assert lock.path.exists()
     assert not (out / "batch.jsonl").exists()
 
@@ -277,9 +277,9 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
     found = run(scene, out)
     assert found["status"] == STUCK
     assert "batch.jsonl: cannot be written (No space left" in found["error"]
-    task, work, _ = one_task(scene, out)
-    assert give_up(task, work, "died")["status"] == STUCK
-    tidy(task, work)
+    task, context, _ = one_task(scene, out)
+    assert record_failure(task, context, "died")["status"] == STUCK
+    clean_up(task, context)
     monkeypatch.undo()
     assert run(scene, out)["status"] == DONE  # the result is there without a record, and known as ours
     assert results(out) == undisturbed
@@ -300,35 +300,35 @@ def test_a_folder_that_cannot_be_written_fails_the_scene(
 
 
 def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
-    task, work, _ = one_task(scene, out)
+    task, context, _ = one_task(scene, out)
     with scene_lock(out, ["room.ply"]):
         (out / ".room-00112233.ply").touch()  # its process died here
         (out / ".room-mine.ply").touch()
-    found = give_up(replace(task, attempt=2), work, "killed")
+    found = record_failure(replace(task, attempt=2), context, "killed")
     assert (found["status"], found["error"], found["attempt"]) == (FAILED, "killed", 2)
     assert records(out) == [found]
     assert list(results(out)) == [".room-mine.ply"]
 
 
 def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
-    task, work, _ = one_task(scene, out)
+    task, context, _ = one_task(scene, out)
     with scene_lock(out, ["room.ply"]):
         (out / ".room-00112233.ply").touch()
-    tidy(task, work)
+    clean_up(task, context)
     assert list(out.iterdir()) == []
 
 
 def test_who_is_stopped_between_result_and_record_leaves_the_lock_that_says_whose_it_is(scene: Path, out: Path) -> None:
-    task, work, _ = one_task(scene, out)
+    task, context, _ = one_task(scene, out)
     with scene_lock(out, ["room.ply"]) as lock:
         (out / "room.ply").write_bytes(b"ours")
-    tidy(task, work)
+    clean_up(task, context)
     assert lock.path.exists()
     assert run(scene, out)["status"] == DONE
     assert not lock.path.exists()
     with scene_lock(out, ["room.ply"]):
         pass  # killed when the record was written
-    tidy(task, work)
+    clean_up(task, context)
     assert list(results(out)) == ["room.ply"]
 
 
@@ -356,45 +356,45 @@ class Script:
         pass
 
 
-def handed_out(pool: Script, work: Work, count: int) -> list[tuple[str, str]]:
+def handed_out(pool: Script, context: BatchContext, count: int) -> list[tuple[str, str]]:
     def each() -> Iterator[Task]:
         for number in range(count):
             assert len(pool.tasks) < pool.room  # nothing is asked for before there is room
             yield Task(Job(number, str(number), f"{number}.ply", 0), None)
 
-    return [(found["scene"], found["status"]) for found in hand_out(each(), pool, work)]
+    return [(found["scene"], found["status"]) for found in dispatch(each(), pool, context)]
 
 
 @pytest.fixture
-def work(tmp_path: Path) -> Work:
-    return Work(tmp_path, replace(QUICK, retries=2), 0)
+def context(tmp_path: Path) -> BatchContext:
+    return BatchContext(tmp_path, replace(QUICK, retries=2), 0)
 
 
-def test_what_was_lost_is_tried_again_as_often_as_told(work: Work) -> None:
+def test_what_was_lost_is_tried_again_as_often_as_told(context: BatchContext) -> None:
     pool = Script({"1": [LOST, LOST], "2": [LOST, LOST, LOST]})
-    assert sorted(handed_out(pool, work, 4)) == [("0", DONE), ("1", DONE), ("2", FAILED), ("3", DONE)]
+    assert sorted(handed_out(pool, context, 4)) == [("0", DONE), ("1", DONE), ("2", FAILED), ("3", DONE)]
     assert [attempt for scene, attempt in pool.seen if scene == "2"] == [1, 2, 3]
-    assert [(r["scene"], r["error"], r["attempt"]) for r in records(work.folder)] == [("2", "told so", 3)]
+    assert [(r["scene"], r["error"], r["attempt"]) for r in records(context.folder)] == [("2", "told so", 3)]
 
 
-def test_what_failed_is_not_tried_again(work: Work) -> None:
+def test_what_failed_is_not_tried_again(context: BatchContext) -> None:
     pool = Script({"0": [FAILED]})
-    assert handed_out(pool, work, 2) == [("0", FAILED), ("1", DONE)]
+    assert handed_out(pool, context, 2) == [("0", FAILED), ("1", DONE)]
     assert len(pool.seen) == 2
 
 
-def test_what_others_work_on_comes_last(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.AGAIN", 0.05)
+def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.batch.run.BUSY_RETRY_SECONDS", 0.05)
     pool = Script({"0": [BUSY, BUSY, SKIPPED]})
     start = time.monotonic()
-    assert handed_out(pool, work, 3) == [("1", DONE), ("2", DONE), ("0", SKIPPED)]
+    assert handed_out(pool, context, 3) == [("1", DONE), ("2", DONE), ("0", SKIPPED)]
     assert time.monotonic() - start >= 0.1
 
 
-def test_a_batch_that_cannot_record_ends(work: Work) -> None:
+def test_a_batch_that_cannot_record_ends(context: BatchContext) -> None:
     with pytest.raises(SceneError, match=r"batch\.jsonl: the batch cannot go on: told so"):
-        handed_out(Script({"1": [STUCK]}), work, 3)
+        handed_out(Script({"1": [STUCK]}), context, 3)
 
 
-def test_nothing_to_do_is_done_at_once(work: Work) -> None:
-    assert handed_out(Script({}), work, 0) == []
+def test_nothing_to_do_is_done_at_once(context: BatchContext) -> None:
+    assert handed_out(Script({}), context, 0) == []

@@ -121,11 +121,11 @@ def broken(kind: str, folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Pat
         ("another camera", "the same cameras, found only one for elsewhere"),
         ("no matrix", "expected entries of 'camera_id' and 'matrix'"),
         ("ragged", "line 4: expected 12 or 16 numbers, found 3"),
-        ("no intrinsics", "expected the intrinsics beside it in intrinsic.txt"),
+        ("no intrinsics", "expected the intrinsics next to it in intrinsic.txt"),
         ("no focal", "expected w2c, fx, fy, cx, cy, w, h as numbers"),
         ("a frame too many", "expected frames 0 to 2, found 7"),
     ],
 )
-def test_what_is_wrong_is_told(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], kind: str, message: str) -> None:
+def test_what_is_wrong_is_named(tmp_path: Path, truth: tuple[np.ndarray, np.ndarray], kind: str, message: str) -> None:
     with pytest.raises(SceneError, match=message):
         read_cameras(broken(kind, tmp_path, *truth))

@@ -1,4 +1,4 @@
-"""Limits on what a file may ask for, and the sizes that image headers tell."""
+"""Limits on what a file may ask for, and the sizes that image headers say."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file, check_pixels, read_text
 from gsmerge.io.formats.npz import array_names, read_arrays
-from gsmerge.io.image_header import stored_size
-from gsmerge.io.photos import natural_key
+from gsmerge.io.photos import image_size, natural_key
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm", ".pgm"])
@@ -23,18 +22,18 @@ def test_stored_size_is_that_of_the_decoded_image(suffix: str, size: tuple[int, 
     picture = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     path = tmp_path / f"a{suffix}"
     assert cv2.imwrite(str(path), picture[..., 0] if suffix == ".pgm" else picture)
-    assert stored_size(path) == size
+    assert image_size(path) == size
 
 
 @pytest.mark.parametrize("flags", [[cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]])
 def test_stored_size_of_other_jpegs(flags: list[int], tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((33, 17, 3), np.uint8), flags)
-    assert stored_size(tmp_path / "a.jpg") == (17, 33)
+    assert image_size(tmp_path / "a.jpg") == (17, 33)
 
 
 def test_stored_size_of_webp_without_loss(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.webp"), np.zeros((33, 17, 3), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])
-    assert stored_size(tmp_path / "a.webp") == (17, 33)
+    assert image_size(tmp_path / "a.webp") == (17, 33)
 
 
 def test_images_beyond_all_use_are_refused(tmp_path: Path) -> None:

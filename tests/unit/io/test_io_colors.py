@@ -13,17 +13,17 @@ from tiny_scene import make_tiny, write_images
 
 from gsmerge.io import load_scene
 from gsmerge.io.alignment.recover import COLOR_MARGIN, Recovery, recover
-from gsmerge.io.alignment.score import Clues
+from gsmerge.io.alignment.score import AlignmentInput
 from gsmerge.types import SH_C0, Cameras
 
 
-def clues_of(smooth: Smooth, images: np.ndarray | None, labellings: list[list[int]] | None = None) -> Clues:
+def clues_of(smooth: Smooth, images: np.ndarray | None, labellings: list[list[int]] | None = None) -> AlignmentInput:
     """Three cameras, the Gaussians and any photos."""
     w2c, Ks = torch.from_numpy(smooth.w2c), torch.from_numpy(np.tile(smooth.K, (3, 1, 1)))
     photos = None if images is None else torch.from_numpy(images).float() / 255
     valid = torch.ones(len(smooth.gaussians), dtype=torch.bool)
     cameras = Cameras(w2c, Ks, smooth.width, smooth.height)
-    return Clues(smooth.gaussians, valid, cameras, photos, labellings or [[0, 1, 2]], lambda: None)
+    return AlignmentInput(smooth.gaussians, valid, cameras, photos, labellings or [[0, 1, 2]], lambda: None)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_colours_tell_views_from_one_place_apart(twins: Smooth, true: list[int])
     assert found.margin == pytest.approx(1, abs=0.1)
     assert found.color_margin is not None
     assert found.color_margin > COLOR_MARGIN
-    assert "which fits the pixels as well" in found.words
+    assert "which fits the pixels as well" in found.description
     assert found.confirmed
 
 
@@ -84,7 +84,7 @@ def test_colours_do_not_overrule_pixels() -> None:
     found = recover(clues_of(tiny, tiny.images))
     assert found is not None
     assert found.confirmed is False
-    assert found.words.endswith("the photos' colours do not confirm it")
+    assert found.description.endswith("the photos' colours do not confirm it")
 
 
 def test_photos_that_agree_or_cannot_tell() -> None:
@@ -95,7 +95,7 @@ def test_photos_that_agree_or_cannot_tell() -> None:
         found = recover(clues_of(scene, images))
         assert found is not None
         assert found.confirmed is confirmed
-        assert "confirm" not in found.words
+        assert "confirm" not in found.description
 
 
 def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def test_no_opacity_and_full_opacity(tmp_path: Path, made: dict[str, np.ndarray]
     assert ply.gaussians.opacities[:2].tolist() == [0, 1]
 
 
-def test_damage_is_told(tmp_path: Path, made: dict[str, np.ndarray]) -> None:
+def test_damage_is_refused(tmp_path: Path, made: dict[str, np.ndarray]) -> None:
     path = tmp_path / "a.ply"
     write_compressed(path, made)
     data = PlyData.read(str(path), mmap=False)

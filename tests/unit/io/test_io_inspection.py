@@ -14,7 +14,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
 from gsmerge.measure.extents import extents
 from gsmerge.measure.inspect import inspect
-from gsmerge.report import inspection_lines
+from gsmerge.measure.inspection_lines import inspection_lines
 
 
 def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
@@ -126,8 +126,8 @@ def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
     assert found.alignment_margin is not None
     assert found.alignment_margin > 2
     assert found.num_saturated == 70
-    assert found.sight is not None
-    assert found.sight.share_seen == 1
+    assert found.check_cameras is not None
+    assert found.check_cameras.share_seen == 1
 
 
 def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
@@ -148,8 +148,8 @@ def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     folder = replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
     found = inspect(folder)
     assert found.alignment_score is None
-    assert found.sight is not None
-    assert found.sight.ok
+    assert found.check_cameras is not None
+    assert found.check_cameras.ok
     assert [view.share_of_pixels for view in found.coverage] == [None] * 3
     assert min(view.share_of_gaussians for view in found.coverage) > 0.2
     assert found.estimate is not None
@@ -161,7 +161,7 @@ def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     (folder / "transforms.json").unlink()
     alone = inspect(folder, order="none")
     assert alone.coverage == ()
-    assert alone.sight is None
+    assert alone.check_cameras is None
     assert alone.estimate is not None
     assert "coverage" not in "\n".join(inspection_lines(alone.to_dict()))
     none = inspect(folder)

@@ -12,7 +12,7 @@ from tiny_scene import write_npz
 
 from gsmerge.io import read_ply, write_ply
 from gsmerge.measure.inspect import inspect
-from gsmerge.report import inspection_lines
+from gsmerge.measure.inspection_lines import inspection_lines
 
 SMOOTH = smooth_scene(48, 36)
 PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)

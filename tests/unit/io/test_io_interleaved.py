@@ -42,6 +42,6 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
     assert any("view-fastest" in note for note in loaded.notes)
 
 
-def test_rows_in_no_order_stay_loose(tmp_path: Path, smooth: Smooth) -> None:
+def test_rows_in_no_order_stay_unaligned(tmp_path: Path, smooth: Smooth) -> None:
     kept = np.random.default_rng(1).permutation(view_fastest(smooth, 0.3))
     assert isinstance(load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene, UnalignedScene)

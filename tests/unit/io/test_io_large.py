@@ -31,7 +31,7 @@ def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
 
 
 @pytest.mark.parametrize("order", ["auto", "none"])
-def test_views_of_loose_scenes_are_resized(tmp_path: Path, order: str) -> None:
+def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> None:
     loaded = load_scene(save(tmp_path), order=order, max_side=96)
     scene = loaded.scene
     assert isinstance(scene, UnalignedScene)
@@ -72,7 +72,7 @@ def test_memory_is_bounded_before_pixels_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
 ) -> None:
     """More photos than fit are resized first; a grid that they were resized to is found all the same."""
-    monkeypatch.setattr("gsmerge.io.photo_size._MAX_BYTES", 3 * 100 * 75 * 12)
+    monkeypatch.setattr("gsmerge.io.views._MAX_BYTES", 3 * 100 * 75 * 12)
     loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
     assert NOTE in loaded.notes
     assert isinstance(loaded.scene, UnalignedScene) == shuffled
@@ -81,7 +81,7 @@ def test_memory_is_bounded_before_pixels_are_known(
 
 
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.io.photo_size._MAX_BYTES", 0)
+    monkeypatch.setattr("gsmerge.io.views._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
     assert loaded.pixel_scene().valid.all()
     assert loaded.notes == ()

@@ -15,7 +15,8 @@ from tiny_scene import Tiny, frames_of, write_colmap_binary, write_colmap_text, 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
 from gsmerge.io.cameras import select_views
-from gsmerge.io.cameras.lens import fisheye, perspective, undistorted
+from gsmerge.io.cameras.camera_file import fisheye, perspective
+from gsmerge.io.cameras.lens import undistort_photos
 from gsmerge.measure.inspect import inspect
 
 SMOOTH = smooth_scene(60, 45)
@@ -53,7 +54,7 @@ def test_a_pinhole_s_pixel_shows_what_the_lens_puts_elsewhere(model: str, coeffi
     y, x = np.mgrid[:height, :width].astype(np.float64)
     photo = np.stack([x, y, 0 * x], -1).astype(np.uint8)  # every pixel says where it is
     lens = perspective("A", coefficients) if model == "perspective" else fisheye("B", coefficients)
-    (straight,) = undistorted([photo], K[None], [lens])
+    (straight,) = undistort_photos([photo], K[None], [lens])
     u, v = bent((x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], model, coefficients)
     expected = np.stack([u * K[0, 0] + K[0, 2] - 0.5, v * K[1, 1] + K[1, 2] - 0.5], -1)
     expected = expected.clip(0, (width - 1, height - 1))  # beyond the photo its border is repeated
@@ -64,7 +65,7 @@ def test_zero_coefficients_are_a_pinhole_but_not_of_a_fisheye() -> None:
     assert perspective("A", [0, 0.0, 0]) is None
     assert fisheye("B", [0, 0]).coefficients == (0, 0)
     photo = np.zeros((2, 3, 3), np.uint8)
-    assert undistorted([photo], K[None], [None])[0] is photo
+    assert undistort_photos([photo], K[None], [None])[0] is photo
 
 
 def bent_photos(tiny: Tiny, coefficients: list[float]) -> Tiny:
@@ -122,9 +123,9 @@ def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
     as_transforms(tmp_path, SMOOTH, [0.1, 0, 0, 0])
     with pytest.raises(
         SceneError, match=r"to undistort, found OPENCV with lens distortion and no images; name"
-    ) as told:
+    ) as caught:
         load_scene(tmp_path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     assert "no images" in str(inspect(tmp_path).alignment_problem)
     with pytest.raises(SceneError, match="found OPENCV with lens distortion; undistort the images first"):
         to_cameras(read_cameras(tmp_path))

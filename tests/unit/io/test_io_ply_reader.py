@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply, write_ply
-from gsmerge.io.formats.ply_file import let_go, open_ply, promised
+from gsmerge.io.formats.ply_file import header_counts, open_ply, release_block
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
 
@@ -119,7 +119,7 @@ def test_extra_columns_elements_and_comments_do_no_harm(tmp_path: Path) -> None:
     assert torch.equal(found.gaussians.means, read_ply(save(tmp_path / "b.ply", rows)).gaussians.means)
 
 
-def test_activated_opacities_are_told_from_logits(tmp_path: Path) -> None:
+def test_activated_opacities_are_recognised(tmp_path: Path) -> None:
     rows = columns(3)
     rows["opacity"] = (0.0, 0.25, 1.0)
     path = save(tmp_path / "a.ply", rows)
@@ -258,9 +258,9 @@ def test_rows_that_were_let_go_are_still_there(tmp_path: Path) -> None:
     stored = open_ply(save(tmp_path / "a.ply", rows))["vertex"].data
     assert isinstance(stored, np.memmap)
     for block in (slice(0, 7), slice(7, 12_345), slice(12_345, 20_000)):
-        let_go(stored, block)
+        release_block(stored, block)
     assert np.array_equal(np.asarray(stored), rows)
-    let_go(rows, slice(0, 5))  # of no file: nothing to do
+    release_block(rows, slice(0, 5))  # of no file: nothing to do
     assert (rows["x"] != 0).any()
 
 
@@ -270,7 +270,7 @@ def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
     assert float(np.asarray(stored)["x"].sum()) != 0
     before = resident(stored.filename)
     for first in range(0, len(stored), 9000):
-        let_go(stored, slice(first, min(first + 9000, len(stored))))
+        release_block(stored, slice(first, min(first + 9000, len(stored))))
     assert before > 0.9 * stored.nbytes
     assert resident(stored.filename) < 0.1 * stored.nbytes
 
@@ -287,9 +287,9 @@ def resident(path: str) -> int:
 
 
 def test_what_a_header_promises(tmp_path: Path) -> None:
-    assert promised(save(tmp_path / "a.ply", columns(7))) == (7, 0)
-    assert promised(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
-    assert promised(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
+    assert header_counts(save(tmp_path / "a.ply", columns(7))) == (7, 0)
+    assert header_counts(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
+    assert header_counts(save(tmp_path / "c.ply", columns(3, num_rest=9), text=True)) == (3, 9)
     (tmp_path / "d.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\nelement vertex 5\n")
-    assert promised(tmp_path / "d.ply") == (0, 0)
-    assert promised(tmp_path / "none.ply") == (0, 0)
+    assert header_counts(tmp_path / "d.ply") == (0, 0)
+    assert header_counts(tmp_path / "none.ply") == (0, 0)

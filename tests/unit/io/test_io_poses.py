@@ -14,7 +14,7 @@ from tiny_scene import Tiny, make_tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene
-from gsmerge.io.alignment.poses import other_readings, seen_poses
+from gsmerge.io.alignment.poses import choose_poses, other_conventions
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
 from gsmerge.types import Cameras, UnalignedScene
 
@@ -75,7 +75,7 @@ def test_a_tie_is_said() -> None:
     c2w[:, :3, 3] *= 0.1
     wide = np.array([[3.0, 0, 10], [0, 3, 7], [0, 0, 1]])
     cameras = Cameras(torch.from_numpy(np.linalg.inv(c2w)), torch.from_numpy(wide).repeat(3, 1, 1), 20, 14)
-    poses, seen, said = seen_poses(gaussians, torch.ones(4000, dtype=torch.bool), cameras, None, W2C_OPENCV)
+    poses, seen, said = choose_poses(gaussians, torch.ones(4000, dtype=torch.bool), cameras, None, W2C_OPENCV)
     assert poses is None
     assert seen.ok
     assert said is not None
@@ -84,7 +84,7 @@ def test_a_tie_is_said() -> None:
 
 def test_one_pose_without_turn_has_fewer_readings() -> None:
     """At the origin without a turn, both directions are the same."""
-    assert [p.words for p in other_readings(np.eye(4)[None], W2C_OPENCV)] == [
+    assert [p.description for p in other_conventions(np.eye(4)[None], W2C_OPENCV)] == [
         "world-to-camera matrices with OpenGL axes"
     ]
 
@@ -93,9 +93,11 @@ def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.M
     """Both other directions fit equally well: nobody can tell."""
     folder = SMOOTH.save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, W2C_OPENCV)
-    true = other_readings(SMOOTH.w2c, C2W_OPENGL)[0]
+    true = other_conventions(SMOOTH.w2c, C2W_OPENGL)[0]
     same = replace(true, viewmats=SMOOTH.w2c)
-    monkeypatch.setattr("gsmerge.io.alignment.poses.other_readings", lambda *_: [same, replace(same, words="another")])
+    monkeypatch.setattr(
+        "gsmerge.io.alignment.poses.other_conventions", lambda *_: [same, replace(same, description="another")]
+    )
     with pytest.raises(SceneError, match=r"expected poses that fit in one reading, found that they fit as .* another"):
         load_scene(folder)
 

@@ -32,7 +32,7 @@ def test_pixels_dropped_at_random(tmp_path: Path, nested: float, dropped: float,
     assert float(right.double().mean()) > 0.99
 
 
-def test_a_scale_that_cannot_be_told_is_not_guessed(tmp_path: Path) -> None:
+def test_a_scale_that_cannot_be_measured_is_not_guessed(tmp_path: Path) -> None:
     """Gaussians anywhere in their pixels: of several scales that fit as well, none is taken."""
     tiny, rng = smooth_scene(64, 48), np.random.default_rng(2)
     means = tiny.gaussians.means + torch.from_numpy(rng.normal(0, 0.02, tiny.gaussians.means.shape)).float()

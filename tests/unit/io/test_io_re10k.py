@@ -17,7 +17,7 @@ from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files, load_scene, read_cameras
-from gsmerge.io.alignment.crop import cover
+from gsmerge.io.photos import resize_and_crop
 
 SMOOTH = smooth_scene(48, 36)
 
@@ -77,7 +77,7 @@ def test_the_only_scene_needs_no_name(tmp_path: Path) -> None:
 def test_photos_that_were_cropped(tmp_path: Path) -> None:
     """DepthSplat's file beside its dataset: resized, cropped and trimmed, turned into the first camera."""
     tiny = smooth_scene(48, 48)
-    mapping = cover((96, 54), (48, 48))
+    mapping = resize_and_crop((96, 54), (48, 48))
     matrix = np.array([[mapping.scale_x, 0, -mapping.left], [0, mapping.scale_y, -mapping.top], [0, 0, 1]])
     photos = np.stack([
         cv2.warpAffine(image, np.linalg.inv(matrix)[:2], (96, 54), borderMode=cv2.BORDER_REPLICATE)

@@ -70,13 +70,13 @@ def test_the_root_is_found(tmp_path: Path, noise: float) -> None:
     assert covariance_error(stored, tiny).mean() > 0.3
 
 
-def test_it_can_be_told(tmp_path: Path) -> None:
+def test_it_can_be_given(tmp_path: Path) -> None:
     tiny = discs(0.0)
     rows = applied_twice(tiny)
     rows["opacity"] = tiny.gaussians.opacities.numpy()
     folder = save_export(tmp_path, tiny, rows)
-    for told in ({"quats": "xyzw-root"}, {"exporter": "splatt3r"}):
-        assert covariance_error(read_scene(folder, **told).gaussians.quats, tiny).median() < 0.01
+    for hints in ({"quats": "xyzw-root"}, {"exporter": "splatt3r"}):
+        assert covariance_error(read_scene(folder, **hints).gaussians.quats, tiny).median() < 0.01
 
 
 @pytest.mark.parametrize("noise", [0.0, 20.0, 40.0])

@@ -141,7 +141,7 @@ def test_one_and_many_threads_read_alike(tiny_folder: Path) -> None:
 def test_no_cameras(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path, cameras=False, images=False)
     with pytest.raises(
-        SceneError, match=r"no cameras found beside it \(looked for views\.npz, transforms\.json.*--cameras"
+        SceneError, match=r"no cameras found next to it \(looked for views\.npz, transforms\.json.*--cameras"
     ):
         read_scene(folder)
 

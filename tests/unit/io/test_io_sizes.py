@@ -14,8 +14,9 @@ from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.io.alignment.crop import Mapping, counted, cover, patched, stretch
+from gsmerge.io.alignment.grid import grids_of_count, patch_grids
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats, make_camera_file
+from gsmerge.io.photos import PhotoTransform, resize_and_crop, resize_to
 from gsmerge.types import PixelScene
 
 SMOOTH = smooth_scene(48, 36)
@@ -32,7 +33,7 @@ def write_cameras(folder: Path, tiny: Tiny, K: np.ndarray, size: tuple[int, int]
     (folder / "transforms.json").write_text(json.dumps(data | {"w": size[0], "h": size[1]}))
 
 
-def original(tiny: Tiny, mapping: Mapping, size: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
+def original(tiny: Tiny, mapping: PhotoTransform, size: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Intrinsics and photos that the mapping makes the scene's of."""
     matrix = np.array([[mapping.scale_x, 0, -mapping.left], [0, mapping.scale_y, -mapping.top], [0, 0, 1]])
     photos = [
@@ -45,14 +46,14 @@ def original(tiny: Tiny, mapping: Mapping, size: tuple[int, int]) -> tuple[np.nd
 @pytest.mark.parametrize(
     ("size", "map_photo", "words"),
     [
-        ((96, 72), stretch, "resized to 48 x 36"),
-        ((98, 72), stretch, "resized to 48 x 36"),
-        ((128, 72), cover, "resized and centre-cropped to 48 x 36"),
+        ((96, 72), resize_to, "resized to 48 x 36"),
+        ((98, 72), resize_to, "resized to 48 x 36"),
+        ((128, 72), resize_and_crop, "resized and centre-cropped to 48 x 36"),
     ],
     ids=["half", "rounded", "cropped"],
 )
 def test_photos_and_cameras_larger_than_the_grid(tmp_path: Path, size: tuple, map_photo, words: str) -> None:  # type: ignore[no-untyped-def]
-    tiny = smooth_scene(48, 40) if map_photo is cover else SMOOTH
+    tiny = smooth_scene(48, 40) if map_photo is resize_and_crop else SMOOTH
     to = tiny.width, tiny.height
     K, photos = original(tiny, map_photo(size, to), size)
     tiny.save(tmp_path, images=False)
@@ -63,7 +64,7 @@ def test_photos_and_cameras_larger_than_the_grid(tmp_path: Path, size: tuple, ma
     assert (scene.cameras.width, scene.cameras.height) == to
     assert np.allclose(scene.cameras.Ks, tiny.K)
     assert loaded.alignment.ok
-    if map_photo is stretch:
+    if map_photo is resize_to:
         assert np.abs(scene.images.numpy() * 255 - tiny.images).mean() < 8
     said = words.replace("36", str(tiny.height))
     assert loaded.notes == (f"photos and cameras of {size[0]} x {size[1]} are {said}, the Gaussian grid's size",)
@@ -71,7 +72,7 @@ def test_photos_and_cameras_larger_than_the_grid(tmp_path: Path, size: tuple, ma
 
 def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
     """An npz at the grid's size, photos as they were taken: stretched or cropped, as their colours say."""
-    for name, mapping in (("stretch", stretch((110, 72), (48, 36))), ("crop", cover((110, 72), (48, 36)))):
+    for name, mapping in (("stretch", resize_to((110, 72), (48, 36))), ("crop", resize_and_crop((110, 72), (48, 36)))):
         _, photos = original(SMOOTH, mapping, (110, 72))
         folder = tmp_path / name
         SMOOTH.save(folder, cameras=False, images=False)
@@ -80,11 +81,12 @@ def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
         loaded = load_scene(folder, images=folder / "images")
         scene = loaded.pixel_scene()
         assert np.abs(scene.images.numpy() * 255 - SMOOTH.images).mean() < 8, name
-        assert f"photos of 110 x 72 are {mapping.words}, the cameras' and the Gaussian grid's size" in loaded.notes
+        note = f"photos of 110 x 72 are {mapping.description}, the cameras' and the Gaussian grid's size"
+        assert note in loaded.notes
 
 
 def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
-    K, _ = original(SMOOTH, cover((96, 54), (48, 36)), (96, 54))
+    K, _ = original(SMOOTH, resize_and_crop((96, 54), (48, 36)), (96, 54))
     SMOOTH.save(tmp_path)
     write_cameras(tmp_path, SMOOTH, K, (96, 54))
     loaded = load_scene(tmp_path)
@@ -98,8 +100,8 @@ def test_photos_of_another_size_and_poses_read_in_another_way(
     tmp_path: Path, true: tuple[str, str], shape: str
 ) -> None:
     """Larger photos with their cameras; cameras of the uncropped pictures."""
-    size, mapping = ((96, 72), stretch((96, 72), (48, 36))) if shape == "larger" else ((96, 54), None)
-    K, photos = original(SMOOTH, mapping or cover((96, 54), (48, 36)), size)
+    size, mapping = ((96, 72), resize_to((96, 72), (48, 36))) if shape == "larger" else ((96, 54), None)
+    K, photos = original(SMOOTH, mapping or resize_and_crop((96, 54), (48, 36)), size)
     SMOOTH.save(tmp_path, images=mapping is None)
     write_cameras(tmp_path, SMOOTH, K, size)
     if mapping is not None:
@@ -119,7 +121,7 @@ def test_photos_of_another_size_and_poses_read_in_another_way(
 
 
 def test_cameras_larger_than_the_grid_and_no_photos(tmp_path: Path) -> None:
-    K, _ = original(SMOOTH, stretch((96, 72), (48, 36)), (96, 72))
+    K, _ = original(SMOOTH, resize_to((96, 72), (48, 36)), (96, 72))
     SMOOTH.save(tmp_path, cameras=False, images=False)
     larger = Tiny(SMOOTH.c2w, K, 96, 72, SMOOTH.images, SMOOTH.gaussians, SMOOTH.names)
     write_colmap_text(tmp_path / "sparse", larger)
@@ -129,7 +131,7 @@ def test_cameras_larger_than_the_grid_and_no_photos(tmp_path: Path) -> None:
 
 
 def test_a_trimmed_grid_of_another_size(tmp_path: Path) -> None:
-    K, photos = original(SMOOTH, stretch((96, 72), (48, 36)), (96, 72))
+    K, photos = original(SMOOTH, resize_to((96, 72), (48, 36)), (96, 72))
     grid = np.arange(3 * 36 * 48).reshape(3, 36, 48)[:, 8:-8, 8:-8]
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH, grid.reshape(-1)))
     write_photos(tmp_path, SMOOTH, photos)
@@ -142,7 +144,7 @@ def test_a_trimmed_grid_of_another_size(tmp_path: Path) -> None:
 def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     """Depth Anything 3 beside COLMAP cameras at the photos' own size: 504 pixels, border and far pixels dropped."""
     tiny = smooth_scene(504, 28)
-    K, photos = original(tiny, stretch((1008, 56), (504, 28)), (1008, 56))
+    K, photos = original(tiny, resize_to((1008, 56), (504, 28)), (1008, 56))
     keep = np.ones((3, 28, 504), bool)
     keep[:, :, :15] = keep[:, :, -15:] = False
     keep[:, np.random.default_rng(0).random((28, 504)) > 0.9] = False
@@ -158,7 +160,7 @@ def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
 def test_mappings_move_a_point_and_its_photo_alike() -> None:
     photo = np.zeros((60, 100, 3), np.uint8)
     photo[24:36, 64:72] = 255
-    for mapping in (stretch((100, 60), (50, 24)), cover((100, 60), (30, 30))):
+    for mapping in (resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))):
         (small,) = mapping.photos([photo])
         assert small.shape == (mapping.height, mapping.width, 3)
         y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
@@ -169,21 +171,21 @@ def test_mappings_move_a_point_and_its_photo_alike() -> None:
 
 
 def test_sizes_that_the_number_of_rows_allows() -> None:
-    found = [(m.width, m.height) for m in counted(2 * 64 * 48, 2, (640, 480))]
+    found = [(m.width, m.height) for m in grids_of_count(2 * 64 * 48, 2, (640, 480))]
     assert found[0] == (64, 48)
     assert (64, 48) in found
-    assert list(counted(2 * 97 * 89, 2, (640, 480))) == []
-    assert (256, 256) in [(m.width, m.height) for m in counted(3 * 256 * 256, 3, (640, 360))]
+    assert list(grids_of_count(2 * 97 * 89, 2, (640, 480))) == []
+    assert (256, 256) in [(m.width, m.height) for m in grids_of_count(3 * 256 * 256, 3, (640, 360))]
 
 
 def test_sizes_of_patches() -> None:
-    words = {m.words for m in patched((4032, 3024))}
-    assert "resized to 504 x 378" in words
-    assert "resized to 518 x 392" in words
-    assert {(m.width, m.height) for m in patched((1920, 1080))} >= {(504, 280), (518, 294), (518, 280)}
-    crop = next(m for m in patched((1920, 1080)) if m.top)
+    descriptions = {m.description for m in patch_grids((4032, 3024))}
+    assert "resized to 504 x 378" in descriptions
+    assert "resized to 518 x 392" in descriptions
+    assert {(m.width, m.height) for m in patch_grids((1920, 1080))} >= {(504, 280), (518, 294), (518, 280)}
+    crop = next(m for m in patch_grids((1920, 1080)) if m.top)
     assert (crop.width, crop.height, crop.top) == (504, 280, 2)
-    assert list(patched((400, 300))) == []
+    assert list(patch_grids((400, 300))) == []
 
 
 def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:

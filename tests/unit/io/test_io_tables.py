@@ -21,12 +21,12 @@ def test_json_and_toml(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["[1]", "{", "3", "[" * 100_000, "\x00"])
-def test_what_is_no_table_is_told_in_one_line(tmp_path: Path, text: str) -> None:
+def test_what_is_no_table_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
-    with pytest.raises(SceneError, match="expected") as told:
+    with pytest.raises(SceneError, match="expected") as caught:
         read_table(path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:

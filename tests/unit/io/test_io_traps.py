@@ -34,7 +34,7 @@ ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
 
 
 def home(scene: PixelScene, tiny: Tiny) -> float:
-    """Share of the valid pixels whose Gaussian is the one made for them, told by its opacity."""
+    """Share of the valid pixels whose Gaussian is the one made for them, recognised by its opacity."""
     same = (scene.gaussians.opacities - tiny.gaussians.opacities).abs() < 1e-5
     return float(same[scene.valid.reshape(-1)].double().mean())
 

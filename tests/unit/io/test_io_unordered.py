@@ -12,7 +12,9 @@ from exports import export_rows, save_export, turned
 from tiny_scene import Tiny, make_tiny, rotation
 
 from gsmerge.io import load_scene
-from gsmerge.io.alignment.similarity import SAME
+from gsmerge.io.alignment.projected_rows import ProjectedRows
+from gsmerge.io.alignment.similarity import IDENTITY
+from gsmerge.io.alignment.unordered import unordered_layout
 from gsmerge.types import SH_C0, UnalignedScene
 
 MANY_OR_FEW = [3, pytest.param(8, marks=pytest.mark.slow)]  # views
@@ -83,19 +85,16 @@ def test_rows_sorted_by_opacity_come_to_their_pixels(tmp_path: Path, views: int,
 
 def test_colours_decide_between_near_views() -> None:
     """Two hundredths of a pixel off, eight views: some rows are nearer to a centre of another view."""
-    from functools import partial
-
-    from gsmerge.io.alignment.unordered import unordered_layout
-
     tiny = scene_on_rays(8, 0.02)
     tiny = replace(tiny, images=np.random.default_rng(0).integers(0, 256, tiny.images.shape, np.uint8))
     kept = by_opacity(tiny, 0.2)
     points, base = tiny.gaussians.means.double().numpy()[kept], tiny.images.reshape(-1, 3)[kept] / 255
     photos = tiny.images.reshape(8, -1, 3) / 255
-    read = partial(unordered_layout, points, tiny.w2c, np.tile(tiny.K, (8, 1, 1)), tiny.width, tiny.height)
+    Ks = np.tile(tiny.K, (8, 1, 1))
+    projected = ProjectedRows(points, np.arange(len(points)), tiny.w2c, Ks, tiny.width, tiny.height)
     wrong = []
     for color_of in (None, lambda rows, view, pixels: np.abs(base[rows] - photos[view, pixels]).mean(1)):
-        layout = read(color_of=color_of)
+        layout = unordered_layout(projected, color_of=color_of)
         assert layout is not None
         at = np.full(len(kept), -1)
         for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
@@ -117,7 +116,7 @@ def test_a_turned_world(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("views", MANY_OR_FEW)
 @pytest.mark.parametrize("jitter", [0.25, 0.5])
-def test_rows_anywhere_in_their_pixels_stay_loose(tmp_path: Path, views: int, jitter: float) -> None:
+def test_rows_anywhere_in_their_pixels_stay_unaligned(tmp_path: Path, views: int, jitter: float) -> None:
     tiny = scene_on_rays(views, jitter)
     folder = save_export(tmp_path, tiny, export_rows(tiny, by_opacity(tiny, 0.3)))
     for order in ("auto", "unordered"):
@@ -132,17 +131,17 @@ def test_many_views_make_chance(tmp_path: Path) -> None:
     assert isinstance(load_scene(folder, exporter="vicasplat").scene, UnalignedScene)
 
 
-def test_the_told_order_and_dialect(tmp_path: Path) -> None:
+def test_the_given_order_and_exporter(tmp_path: Path) -> None:
     tiny = scene_on_rays(3)
     kept = by_opacity(tiny, 0.3)
     rows = export_rows(tiny, kept, rest=45, normals="u1")
     folder = save_export(tmp_path, tiny, rows)
-    for told in ({"order": "unordered"}, {"exporter": "longlrm-sorted"}, {"scene_scale": 1.0}):
-        loaded = load_scene(folder, **told)
+    for hints in ({"order": "unordered"}, {"exporter": "longlrm-sorted"}, {"scene_scale": 1.0}):
+        loaded = load_scene(folder, **hints)
         assert share_at_home(loaded, tiny, kept) >= 0.99
         assert [d.name for d in loaded.exporters] == ["longlrm-sorted"]
     assert loaded.recovery is not None
-    assert loaded.recovery.best.frame.scale == SAME.scale
+    assert loaded.recovery.best.frame.scale == IDENTITY.scale
     assert isinstance(load_scene(folder, order="view-major").scene, UnalignedScene)
 
 

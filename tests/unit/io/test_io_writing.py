@@ -179,11 +179,11 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
     assert float((found.means - means).abs().max()) < 0.5
 
 
-def test_harmonics_that_have_no_room_are_told() -> None:
+def test_harmonics_without_room_are_noted() -> None:
     assert lost_harmonics("a.ply", 4) is None
     assert lost_harmonics("a.spz", 3) is None
-    told = lost_harmonics("a.splat", 1)
-    assert told == ".splat has no room for harmonics above degree 0: left out"
+    note = lost_harmonics("a.splat", 1)
+    assert note == ".splat has no room for harmonics above degree 0: left out"
     assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
 
 

@@ -158,25 +158,25 @@ def test_vgg_is_the_default(package: Path) -> None:
 
 
 def test_references_that_are_remembered_change_nothing(package: Path) -> None:
-    photos = [RNG.random((32, 32, 3), np.float32) for _ in range(perceptual.REMEMBERED + 2)]
+    photos = [RNG.random((32, 32, 3), np.float32) for _ in range(perceptual.MAX_CACHED + 2)]
     fresh = []
     for photo in photos:
-        perceptual._REMEMBERED.clear()
+        perceptual._CACHE.clear()
         fresh.append(lpips(FIRST[:32, :32], photo, "vgg"))
-    perceptual._REMEMBERED.clear()
+    perceptual._CACHE.clear()
     for _ in range(2):
         assert [lpips(FIRST[:32, :32], photo, "vgg") for photo in photos] == fresh
-        assert len(perceptual._REMEMBERED) == perceptual.REMEMBERED
+        assert len(perceptual._CACHE) == perceptual.MAX_CACHED
     changed = photos[-1].copy()
     changed[0, 0, 0] += 0.5
     assert lpips(FIRST[:32, :32], changed, "vgg") != fresh[-1]
 
 
 def test_large_references_are_not_remembered(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perceptual, "MOST_REMEMBERED", 32 * 32)
-    perceptual._REMEMBERED.clear()
+    monkeypatch.setattr(perceptual, "MAX_CACHED_PIXELS", 32 * 32)
+    perceptual._CACHE.clear()
     lpips(FIRST, SECOND, "vgg")
-    assert not perceptual._REMEMBERED
+    assert not perceptual._CACHE
 
 
 def test_tensors_and_odd_arrays_give_the_same(package: Path) -> None:

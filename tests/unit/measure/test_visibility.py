@@ -29,7 +29,7 @@ def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
 
 @pytest.mark.parametrize("rows", [100, 1 << 18])
 def test_mask_is_that_of_the_slow_loop(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(visibility, "_ROWS", rows)
+    monkeypatch.setattr(visibility, "_CHUNK", rows)
     scene = scenes.make_scene(scenes.two_planes(), scenes.arc(2, 24, 18))
     held_out = scenes.arc(3, 24, 18, span=3.0)
     points = context_points(scene, 0.01)

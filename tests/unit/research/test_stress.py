@@ -13,12 +13,12 @@ import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
-from gsmerge.io import load_scene, read_targets
+from gsmerge.io import load_scene, read_held_out
 from gsmerge.io.scene import SceneLoad
 from gsmerge.measure.evaluate import Views
 from gsmerge.options import CompactOptions
-from gsmerge.research.stress import CASES, changes, run, stress
-from gsmerge.research.stress.changes import Judged
+from gsmerge.research.stress import CASES, cases, run, stress
+from gsmerge.research.stress.cases import StressScene
 from gsmerge.types import PixelScene, UnalignedScene
 
 FAST = CompactOptions().with_settings({"fit": "none", "robust": False})
@@ -43,14 +43,14 @@ def offsets(scene: PixelScene) -> float:
     return float((own - torch.stack([x, y], -1)).abs().max())
 
 
-def pixel_scene(judged: Judged) -> PixelScene:
+def pixel_scene(judged: StressScene) -> PixelScene:
     assert isinstance(judged.scene, PixelScene)
     return judged.scene
 
 
 @pytest.mark.parametrize("degrees", [0.2, 5.0])
 def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: PixelScene) -> None:
-    turned = pixel_scene(changes.wrong_poses(Judged(scene, None), degrees))
+    turned = pixel_scene(cases.perturb_poses(StressScene(scene, None), degrees))
     assert offsets(turned) < 1e-3
     for old, new in zip(scene.cameras.viewmats, turned.cameras.viewmats, strict=True):
         cosine = (torch.trace(new[:3, :3] @ old[:3, :3].T) - 1) / 2
@@ -61,15 +61,15 @@ def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: Pix
 @pytest.mark.parametrize(("factor", "shift"), [(1e-4, (0, 0, 0)), (1e4, (0, 0, 0)), (1.0, (4e5, 5e6, 100))])
 def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...], scene: PixelScene) -> None:
     assert scene.images is not None
-    judges = Views(scene.cameras, scene.images, scene.names)
-    moved = changes.moved(Judged(scene, judges), factor, shift)
-    assert offsets(pixel_scene(moved)) < 1e-2
-    assert moved.judges is not None
-    assert torch.allclose(moved.judges.cameras.viewmats, moved.scene.cameras.viewmats)
+    views = Views(scene.cameras, scene.images, scene.names)
+    move = cases.move(StressScene(scene, views), factor, shift)
+    assert offsets(pixel_scene(move)) < 1e-2
+    assert move.views is not None
+    assert torch.allclose(move.views.cameras.viewmats, move.scene.cameras.viewmats)
 
 
 def test_exposure_changes_photos_and_colours_alike(scene: PixelScene) -> None:
-    changed = pixel_scene(changes.other_exposure(Judged(scene, None), 0.2))
+    changed = pixel_scene(cases.change_exposure(StressScene(scene, None), 0.2))
     assert changed.images is not None
     assert scene.images is not None
     assert torch.allclose(changed.images[0], 0.8 * scene.images[0])
@@ -78,30 +78,30 @@ def test_exposure_changes_photos_and_colours_alike(scene: PixelScene) -> None:
 
 
 def test_rows_that_are_spoilt(scene: PixelScene) -> None:
-    given, n = Judged(scene, None), len(scene.gaussians)
-    broken = pixel_scene(changes.broken_rows(given))
+    scene_in, n = StressScene(scene, None), len(scene.gaussians)
+    broken = pixel_scene(cases.break_rows(scene_in))
     assert int((~broken.valid).sum()) == round(0.01 * n)
     assert float(broken.gaussians.opacities[~broken.valid.reshape(-1)].max()) == 0
-    large = changes.oversized(given).scene.gaussians.scales / scene.gaussians.scales
+    large = cases.enlarge(scene_in).scene.gaussians.scales / scene.gaussians.scales
     assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
-    away = (changes.flyaways(given).scene.gaussians.means != scene.gaussians.means).any(1)
+    away = (cases.throw_away(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)
     assert int(away.sum()) == 1
     loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
-    assert len(changes.broken_rows(Judged(loose, None)).scene.gaussians) == n - round(0.01 * n)
+    assert len(cases.break_rows(StressScene(loose, None)).scene.gaussians) == n - round(0.01 * n)
 
 
 def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
-    given = Judged(scene, None)
-    assert len(changes.half_the_views(given).scene) == 1
-    assert len(changes.fewer_views(given, 2).scene) == 2
-    assert len(changes.fewer_views(given, 9).scene) == 3
-    assert sorted(changes.reordered(given).scene.names) == sorted(scene.names)
-    assert changes.repeated(given).scene.names == scene.names * 2
+    scene_in = StressScene(scene, None)
+    assert len(cases.halve_views(scene_in).scene) == 1
+    assert len(cases.fewer_views(scene_in, 2).scene) == 2
+    assert len(cases.fewer_views(scene_in, 9).scene) == 3
+    assert sorted(cases.reorder(scene_in).scene.names) == sorted(scene.names)
+    assert cases.repeat_views(scene_in).scene.names == scene.names * 2
 
 
 @pytest.mark.slow
 def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
-    read = read_targets(load, made_scene / "targets")
+    read = read_held_out(load, made_scene / "targets")
     told: list[tuple[str, int, int]] = []
     found = stress(
         load,
@@ -110,9 +110,9 @@ def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: 
         progress=lambda *step: told.append(step),
     )
     assert [outcome.case for outcome in found] == list(CASES)
-    failed = {o.case: o.found for o in found if o.held is False}
+    failed = {o.case: o.measured for o in found if o.passed is False}
     assert failed == {}
-    assert [o.case for o in found if o.held is None] == ["c2w-opengl"]
+    assert [o.case for o in found if o.passed is None] == ["c2w-opengl"]
     assert told[-1] == ("done", len(CASES), len(CASES))
 
 
@@ -120,14 +120,14 @@ def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
     assert isinstance(load.scene, PixelScene)
     loose = UnalignedScene(load.scene.gaussians, load.scene.cameras, load.scene.images, load.scene.names)
     found = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
-    assert [outcome.held for outcome in found] == [None, None, True, None]
+    assert [outcome.passed for outcome in found] == [None, None, True, None]
 
 
 def test_without_photos(load: SceneLoad) -> None:
     bare = replace(load, scene=replace(load.scene, images=None))
     found = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
-    assert [outcome.held for outcome in found] == [True, None, True]
-    assert "renders of the input" in found[0].found
+    assert [outcome.passed for outcome in found] == [True, None, True]
+    assert "renders of the input" in found[0].measured
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
@@ -158,13 +158,13 @@ def test_what_does_not_hold_is_noticed(
 ) -> None:
     spoilt(monkeypatch, change)
     outcome = stress(load, FAST, cases=["large"])[0]
-    assert outcome.held is False
-    assert words in outcome.found
+    assert outcome.passed is False
+    assert words in outcome.measured
 
 
 def test_threads_that_change_a_bit_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, lambda g: replace(g, opacities=g.opacities * (1 - 1e-6)))
-    assert stress(load, FAST, cases=["threads"])[0].held is False
+    assert stress(load, FAST, cases=["threads"])[0].passed is False
 
 
 def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,14 +173,14 @@ def test_an_error_is_an_outcome(load: SceneLoad, monkeypatch: pytest.MonkeyPatch
 
     spoilt(monkeypatch, broken)
     outcome = stress(load, FAST, cases=["views-3"])[0]
-    assert (outcome.held, outcome.found) == (False, "ended with: scene.ply: expected mercy")
+    assert (outcome.passed, outcome.measured) == (False, "ended with: scene.ply: expected mercy")
 
 
 def test_wrong_conventions_that_are_believed_are_noticed(load: SceneLoad, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = replace(load, scene=replace(load.scene, cameras=load.scene.cameras[[1, 0, 2, 3, 4]]))
     monkeypatch.setattr(run, "align_scene", lambda *_, **__: wrong)
     outcome = stress(load, FAST, cases=["w2c-opencv"])[0]
-    assert (outcome.held, outcome.found) == (False, "taken for something else")
+    assert (outcome.passed, outcome.measured) == (False, "taken for something else")
 
 
 def test_bad_arguments(load: SceneLoad) -> None:

@@ -12,7 +12,7 @@ from gsmerge.errors import GsmergeError
 if TYPE_CHECKING:
     from gsmerge.research.charts.figures import Figure
 
-INSTALL = 'pip install "gsmerge[chart]"'
+INSTALL_HINT = 'pip install "gsmerge[chart]"'
 
 
 def require_matplotlib() -> None:
@@ -22,7 +22,7 @@ def require_matplotlib() -> None:
         GsmergeError: If it is.
     """
     if find_spec("matplotlib") is None:
-        raise GsmergeError(f"charts need matplotlib, which is not installed: {INSTALL}")
+        raise GsmergeError(f"charts need matplotlib, which is not installed: {INSTALL_HINT}")
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
@@ -37,12 +37,12 @@ def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
     """
     require_matplotlib()
     from gsmerge.io import atomic_output
-    from gsmerge.research.charts.draw.figures import common_looks, draw
+    from gsmerge.research.charts.draw.figures import common_styles, draw
 
     folder.mkdir(parents=True, exist_ok=True)
-    drawn, looks = {}, common_looks(figures)
+    drawn, styles = {}, common_styles(figures)
     for figure in figures:
-        png, svg = draw(figure, looks)
+        png, svg = draw(figure, styles)
         for suffix, data in (("png", png), ("svg", svg)):
             with atomic_output(folder / f"{figure.name}.{suffix}", overwrite=True) as temporary:
                 temporary.write_bytes(data)

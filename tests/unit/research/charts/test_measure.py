@@ -10,7 +10,7 @@ import pytest
 import scenes
 
 from gsmerge.research.charts.measure import keep_pictures
-from gsmerge.research.charts.store import picture_path
+from gsmerge.research.charts.record import picture_path
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e4])

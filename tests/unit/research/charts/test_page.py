@@ -12,11 +12,9 @@ import pytest
 from experiments import make_grid, make_proxies
 
 from gsmerge.research.charts.draw import draw_figures
-from gsmerge.research.charts.figures import make_figures, make_verdicts
-from gsmerge.research.charts.markup import inline_svg, table
-from gsmerge.research.charts.page import make_page
-from gsmerge.research.charts.record import RunRecord
-from gsmerge.research.charts.store import picture_path
+from gsmerge.research.charts.figures import make_figures, make_verdict_tables
+from gsmerge.research.charts.page import inline_svg, make_page, table
+from gsmerge.research.charts.record import RunRecord, picture_path
 
 EVIL = "<script>alert('x')</script>\"&</title>"
 
@@ -61,7 +59,9 @@ def outline(page: str) -> Outline:
 def page_of(records: list[RunRecord], folder: Path, most_figures: int = 1) -> str:
     figures = make_figures(records, make_proxies())[-most_figures:]
     drawings = draw_figures(figures, folder / "charts")
-    return make_page(records, figures, drawings, make_verdicts(records), folder, command="gsmerge chart --draw-only")
+    return make_page(
+        records, figures, drawings, make_verdict_tables(records), folder, command="gsmerge chart --draw-only"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_every_reference_inside_the_page_is_there(page: str) -> None:
 
 def test_the_page_says_what_was_found(page: str) -> None:
     assert "54 runs on 3 scene(s): apples, fern, fox" in page
-    assert "PSNR (dB) at equal size: no rival&#x27;s point lies above ours (6 points; 6 below ours" in page
+    assert "PSNR (dB) at equal size: no baseline&#x27;s point lies above ours (6 points; 6 below ours" in page
     assert "gsmerge chart scenes --budgets 1%,4.4%" in page
     assert '<td class="text">processor</td><td class="text">one</td>' in page
     assert "Failed runs" not in page

@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.research.charts.estimate import estimate_seconds
 from gsmerge.research.charts.experiment import Experiment
-from gsmerge.research.charts.places import Place, find_places, scene_names
 from gsmerge.research.charts.proxies import (
     SEGMENTATIONS,
     SHARES,
     measure_proxies,
+    proxy_points,
     proxy_psnr,
     read_proxies,
-    wanted_proxies,
 )
+from gsmerge.research.charts.run import estimate_seconds
+from gsmerge.research.charts.scenes import SceneSource, find_scenes, scene_names
 
 
 def test_names_are_as_short_as_can_be() -> None:
@@ -38,18 +38,18 @@ def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
         (scene_copy, "{parent}/targets/transforms.json"),
         (ply, str(scene_copy / "targets" / "transforms.json")),
     ):
-        (place,) = find_places([scene], template)
+        (place,) = find_scenes([scene], template)
         assert place.targets == scene_copy / "targets" / "transforms.json"
         assert place.num_views == 5
-    (named,) = find_places([ply], "{parent}/{stem}.ply")
+    (named,) = find_scenes([ply], "{parent}/{stem}.ply")
     assert named.targets == ply
     (scene_copy / "transforms.json").write_text("{")  # told when the scene is read
-    assert find_places([scene_copy])[0].num_views is None
+    assert find_scenes([scene_copy])[0].num_views is None
     with pytest.raises(SceneError, match="expected cameras of held-out views"):
-        find_places([scene_copy], "{scene}/nothing.json")
+        find_scenes([scene_copy], "{scene}/nothing.json")
     for template in ("{}/targets", "{scene.foo}/targets", "{stem[foo]}", "{"):
         with pytest.raises(UsageError, match="in braces"):
-            find_places([scene_copy], template)
+            find_scenes([scene_copy], template)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
 )
 def test_the_hash_knows_all_that_is_read(name: str, counts: bool, scene_copy: Path) -> None:
     def sha256() -> str:
-        return find_places([scene_copy], "{scene}/targets/transforms.json")[0].sha256
+        return find_scenes([scene_copy], "{scene}/targets/transforms.json")[0].sha256
 
     before = sha256()
     assert before == sha256()
@@ -75,26 +75,26 @@ def test_the_hash_knows_all_that_is_read(name: str, counts: bool, scene_copy: Pa
 
 
 def test_results_beside_targets_do_not_count(scene_copy: Path) -> None:
-    before = find_places([scene_copy], "{scene}/targets")[0].sha256
+    before = find_scenes([scene_copy], "{scene}/targets")[0].sha256
     (scene_copy / "targets" / "charts").mkdir()
     (scene_copy / "targets" / "charts" / "runs.jsonl").write_text("{}")
-    assert find_places([scene_copy], "{scene}/targets")[0].sha256 == before
+    assert find_scenes([scene_copy], "{scene}/targets")[0].sha256 == before
     (scene_copy / "targets" / "transforms.json").write_text("{}")
-    assert find_places([scene_copy], "{scene}/targets")[0].sha256 != before
+    assert find_scenes([scene_copy], "{scene}/targets")[0].sha256 != before
 
 
 def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
-    assert find_places([scene_copy])[0].sha256 == find_places([made_scene])[0].sha256
+    assert find_scenes([scene_copy])[0].sha256 == find_scenes([made_scene])[0].sha256
 
 
-def estimate(place: Place, **options: object) -> float:
+def estimate(place: SceneSource, **options: object) -> float:
     method = str(options.pop("method", "gsmerge"))
     experiment = Experiment(place.path, method, options.pop("settings", {}), options.pop("views", None))  # type: ignore[arg-type]
     return estimate_seconds([("key", experiment, place)], {}, threads=2, **options)  # type: ignore[arg-type]
 
 
 def test_estimates_grow_with_the_work(made_scene: Path) -> None:
-    (place,) = find_places([made_scene])
+    (place,) = find_scenes([made_scene])
     usual = estimate(place)
     assert estimate(place, settings={"fit": "none"}) < usual < estimate(place, settings={"effort": "best"})
     assert estimate(place, views=2) < usual < estimate(place, lpips=("vgg",))
@@ -125,11 +125,11 @@ def test_proxies_fill_superpixels_with_their_means(made_scene: Path, tmp_path: P
     assert images is not None
     coarse, fine = (proxy_psnr(images[0], count, "rdseg") for count in (20, 600))
     assert 10 < coarse < fine - 3
-    wanted = wanted_proxies("ab" * 32, 2)
+    wanted = proxy_points("ab" * 32, 2)
     assert len(wanted) == len(SEGMENTATIONS) * len(SHARES)
     some = {key: point for key, point in wanted.items() if point in (("rdseg", 0.01), ("slic", 0.01))}
     done: list[int] = []
-    measure_proxies(tmp_path, "room", images, some, most_views=2, progress=lambda: done.append(1))
+    measure_proxies(tmp_path, "room", images, some, max_views=2, progress=lambda: done.append(1))
     found, notes = read_proxies(tmp_path)
     assert (set(found), notes, len(done)) == (set(some), (), 2)
     rdseg, slic = (next(p for p in found.values() if p.segmentation == name) for name in ("rdseg", "slic"))

@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 from experiments import SCENES, make_grid, make_proxies, make_record
 
-from gsmerge.research.charts.figures import Bars, Curves, Payback, make_figures, make_verdicts
+from gsmerge.research.charts.figures import Bars, BreakEven, Curves, make_figures, make_verdict_tables
 from gsmerge.research.charts.series import (
-    best_part,
     by_size,
     by_views,
+    choose_part,
     input_mean,
     line_key,
     line_names,
-    metrics_of,
+    list_metrics,
     newest,
-    score_of,
+    score_getter,
     size_label,
-    usual_size,
-    usual_views,
+    typical_size,
+    typical_views,
 )
 
-PSNR = score_of("psnr", "target_visible")
+PSNR = score_getter("psnr", "target_visible")
 
 
 def test_lines_are_methods_with_their_settings() -> None:
@@ -85,10 +85,10 @@ def test_one_bad_setting_does_not_cost_the_scenes_of_the_others() -> None:
 
 
 def test_usual_size_and_views() -> None:
-    assert usual_size(make_grid(("0.5%", "5%", "20%"), views=(None,))) == "5%"
-    assert usual_views(make_grid()) is None
-    assert usual_views(make_grid(views=(3, 6))) == 6
-    assert (usual_size([]), usual_views([])) == ("", None)
+    assert typical_size(make_grid(("0.5%", "5%", "20%"), views=(None,))) == "5%"
+    assert typical_views(make_grid()) is None
+    assert typical_views(make_grid(views=(3, 6))) == 6
+    assert (typical_size([]), typical_views([])) == ("", None)
 
 
 def test_views_make_lines_where_there_are_several() -> None:
@@ -108,12 +108,12 @@ def test_scenes_with_fewer_views_do_not_end_the_line() -> None:
 
 def test_parts_and_metrics() -> None:
     records = make_grid()
-    assert best_part(records) == "target_visible"
-    assert metrics_of(records, "target_visible") == ["psnr", "ssim", "lpips_vgg"]
+    assert choose_part(records) == "target_visible"
+    assert list_metrics(records, "target_visible") == ["psnr", "ssim", "lpips_vgg"]
     without = [replace(r, psnr_target_visible=None) for r in records]
-    assert best_part(without) == "context"
-    assert best_part(without[:2] + records[2:]) == "target_visible"  # nine of ten are enough
-    assert best_part([]) == "context"
+    assert choose_part(without) == "context"
+    assert choose_part(without[:2] + records[2:]) == "target_visible"  # nine of ten are enough
+    assert choose_part([]) == "context"
 
 
 def test_the_input_is_a_level() -> None:
@@ -132,7 +132,7 @@ def test_all_figures() -> None:
     assert stages.rows == ("gsmerge", "gsmerge, no fit", "voxel", "random")
     assert stages.stages["fit"][0] == pytest.approx(4.8)
     assert "score" not in stages.stages
-    assert isinstance(payback, Payback)
+    assert isinstance(payback, BreakEven)
     assert payback.rows[0][3] == pytest.approx(6 / 0.055)
     assert isinstance(counts, Curves)
     assert [line.name for line in counts.panels[0].lines] == ["gsmerge", "input"]  # all others meet the same budget
@@ -142,9 +142,9 @@ def test_bars_and_break_even_are_over_the_same_scenes() -> None:
     records = [r for r in make_grid() if not (r.scene == "fox" and r.method == "voxel")]
     records = [r for r in records if not (r.scene != "fern" and r.method == "random")]
     slow = [replace(r, seconds=100.0, stages={"fit": 100.0}) if r.scene == "fox" and r.seconds else r for r in records]
-    stages, payback = (f for f in make_figures(slow) if isinstance(f, Bars | Payback))
+    stages, payback = (f for f in make_figures(slow) if isinstance(f, Bars | BreakEven))
     assert isinstance(stages, Bars)
-    assert isinstance(payback, Payback)
+    assert isinstance(payback, BreakEven)
     assert stages.rows == tuple(name for name, *_ in payback.rows) == ("gsmerge", "gsmerge, no fit", "voxel")
     assert stages.stages["fit"][0] == pytest.approx(4.8)
     assert payback.rows[0][1] == pytest.approx(6)
@@ -160,7 +160,7 @@ def test_figures_need_their_data() -> None:
 
 
 def test_verdicts() -> None:
-    tables = make_verdicts(make_grid())
+    tables = make_verdict_tables(make_grid())
     assert [t.title for t in tables[3:]] == [
         "PSNR (dB) at equal size",
         "SSIM at equal size",
@@ -174,4 +174,4 @@ def test_verdicts() -> None:
     voxel = tables[3].rows[1][1]
     assert voxel.ahead is not None
     assert voxel.ahead.mean == pytest.approx(7)
-    assert make_verdicts([r for r in make_grid() if r.method != "gsmerge"]) == []
+    assert make_verdict_tables([r for r in make_grid() if r.method != "gsmerge"]) == []

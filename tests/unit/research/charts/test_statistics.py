@@ -103,12 +103,13 @@ OURS = {scene: [(1.0, 20.0 + i), (10.0, 24.0 + i)] for i, scene in enumerate("ab
 
 
 @pytest.mark.parametrize(
-    ("shift", "words"), [((-1.0, -1.1, -0.9), "ours above"), ((1, 1.1, 0.9), "rival above"), ((-1, 1, 0), "undecided")]
+    ("shift", "words"),
+    [((-1.0, -1.1, -0.9), "ours above"), ((1, 1.1, 0.9), "baseline above"), ((-1, 1, 0), "undecided")],
 )
 def test_verdicts(shift: tuple[float, ...], words: str) -> None:
     points = {scene: (10.0, 24.0 + i + shift[i]) for i, scene in enumerate("abc")}
     found = judge("voxel", points, OURS)
-    assert (found.rival, found.words) == ("voxel", words)
+    assert (found.baseline, found.words) == ("voxel", words)
     assert found.ahead is not None
     assert found.ahead.mean == pytest.approx(-np.mean(shift))
     assert found.ours == pytest.approx(25)

@@ -12,8 +12,7 @@ import pytest
 import gsmerge
 from gsmerge.errors import SceneError
 from gsmerge.io.content_hash import content_hash
-from gsmerge.research.charts.record import SCORES, RunRecord
-from gsmerge.research.charts.store import RUNS, append_run, experiment_key, read_runs
+from gsmerge.research.charts.record import RUNS, SCORES, RunRecord, append_run, experiment_key, read_runs
 from gsmerge.runtime.jsonl import append_line, read_lines
 
 
@@ -124,13 +123,13 @@ def test_keys_do_not_depend_on_order_and_do_on_everything_else(monkeypatch: pyte
         experiment_key("aa", "gsmerge", {"k": 1, "budget": "1%"}, 3),
         experiment_key("aa", "gsmerge", {"k": 2, "budget": "1%"}, None),
     }
-    monkeypatch.setattr("gsmerge.research.charts.store.__version__", gsmerge.__version__ + ".1")
+    monkeypatch.setattr("gsmerge.research.charts.record.__version__", gsmerge.__version__ + ".1")
     others.add(experiment_key("aa", "gsmerge", {"k": 2, "budget": "1%"}, 3))
     assert len(others | {key}) == 6
 
 
 def test_a_key_stays_the_same_from_version_to_version_of_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.research.charts.store.__version__", "1.0")
+    monkeypatch.setattr("gsmerge.research.charts.record.__version__", "1.0")
     text = b'{"method":"gsmerge","scene":"aa","schema_version":1,"settings":{"k":2},"tool_version":"1.0","views":null}'
     assert experiment_key("aa", "gsmerge", {"k": 2}, None) == hashlib.sha256(text).hexdigest()
 

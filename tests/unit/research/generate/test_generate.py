@@ -13,7 +13,7 @@ import gsmerge
 from gsmerge import PixelScene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import project
-from gsmerge.io import load_scene, read_targets
+from gsmerge.io import load_scene, read_held_out
 from gsmerge.render.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate, make_scene
 from gsmerge.research.generate.styles import STYLES
@@ -64,7 +64,7 @@ def test_targets_look_at_the_same_scene(folder: Path) -> None:
     better = []
     for index in range(len(STYLES)):
         load = load_scene(folder / f"scene_{index:04d}")
-        targets = read_targets(load, folder / f"scene_{index:04d}" / "targets", None)
+        targets = read_held_out(load, folder / f"scene_{index:04d}" / "targets", None)
         images = gsmerge.render(load.scene.gaussians, targets.cameras).images
         own = np.mean([psnr(a, b) for a, b in zip(images, targets.images, strict=True)])
         other = np.mean([psnr(a, b) for a, b in zip(images, targets.images.flip(0), strict=True)])
@@ -132,7 +132,7 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.research.generate.writing.write_ply", full)
+    monkeypatch.setattr("gsmerge.research.generate.run.write_ply", full)
     with pytest.raises(SceneError, match="No space left"):
         generate(tmp_path, 1, TINY)
     assert list(tmp_path.iterdir()) == []

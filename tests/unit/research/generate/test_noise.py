@@ -14,7 +14,14 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import project, quat_to_rotmat
 from gsmerge.kernels.raster.harmonics import view_colors
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, read_ranges
-from gsmerge.research.generate.noise import Seen, edges, facing, pixel_gaussians, predicted_depth, textured
+from gsmerge.research.generate.noise import (
+    TrueView,
+    edge_mask,
+    pixel_gaussians,
+    predict_depth,
+    quats_facing,
+    texture_mask,
+)
 from gsmerge.research.generate.options import ERRORS, Noise, draw_noise
 from gsmerge.research.generate.paths import look_at
 from gsmerge.research.generate.photograph import Lens
@@ -28,16 +35,16 @@ CLEAN = replace(
 )
 
 
-def seen(step: float = 0.0) -> Seen:
+def seen(step: float = 0.0) -> TrueView:
     """A slanted wall with detail; its right half is nearer by ``step``."""
     rng = np.random.default_rng(0)
     x = np.broadcast_to(np.arange(W), (H, W))
     depth = 1 / (0.3 + 0.001 * x) * np.where(x < W // 2, 1, 1 - step)
     normals = np.broadcast_to(-POSE[:3, 2], (H, W, 3)).astype(np.float32)
-    return Seen(rng.uniform(0.2, 0.8, (H, W, 3)).astype(np.float32), depth, normals, POSE)
+    return TrueView(rng.uniform(0.2, 0.8, (H, W, 3)).astype(np.float32), depth, normals, POSE)
 
 
-def made(noise: Noise, given: Seen | None = None, seed: int = 0) -> Gaussians:
+def made(noise: Noise, given: TrueView | None = None, seed: int = 0) -> Gaussians:
     return pixel_gaussians(given or seen(), LENS, noise, np.random.default_rng(seed))
 
 
@@ -64,7 +71,7 @@ def test_thin_axes_are_the_normals() -> None:
     np.testing.assert_allclose(np.abs(turns[:, :, 2].numpy() @ POSE[:3, 2]), 1, atol=1e-5)
     normals = np.random.default_rng(0).normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    axis = quat_to_rotmat(torch.from_numpy(facing(normals)))[:, :, 2].numpy()
+    axis = quat_to_rotmat(torch.from_numpy(quats_facing(normals)))[:, :, 2].numpy()
     np.testing.assert_allclose(np.abs((axis * normals).sum(1)), 1, atol=1e-6)
 
 
@@ -85,20 +92,20 @@ def test_grain_and_drift_have_their_strengths() -> None:
 
 def test_edges_bleed_and_are_not_trusted() -> None:
     given = seen(step=0.4)
-    depth, confidence = predicted_depth(given, replace(CLEAN, bleed=1.0, bleed_width=1.5), np.random.default_rng(0))
+    depth, confidence = predict_depth(given, replace(CLEAN, bleed=1.0, bleed_width=1.5), np.random.default_rng(0))
     off = np.abs(np.log(depth / given.depth))
     assert off[:, W // 2 - 2 : W // 2 + 2].min() > 0.02
     assert off[:, : W // 2 - 8].max() < 1e-3
     assert confidence[:, W // 2].mean() < confidence[:, : W // 2 - 8].mean() - 0.4
-    assert edges(given.depth)[:, W // 2].min() > 0.9
-    assert edges(seen().depth).max() < 0.05  # a slant is no edge
+    assert edge_mask(given.depth)[:, W // 2].min() > 0.9
+    assert edge_mask(seen().depth).max() < 0.05  # a slant is no edge
 
 
 def test_errors_are_larger_without_texture() -> None:
     image = seen().image.copy()
     image[: H // 2] = 0.5
     given = replace(seen(), image=image)
-    assert textured(image)[: H // 2 - 4].max() == 0
+    assert texture_mask(image)[: H // 2 - 4].max() == 0
     found = seen_again(made(replace(CLEAN, grain=0.01, blank=2.0), given))[1]
     off = np.log(found / given.depth)
     assert off[: H // 2 - 4].std() == pytest.approx(3 * off[H // 2 + 4 :].std(), rel=0.2)
@@ -176,5 +183,5 @@ def test_ranges_come_from_files(tmp_path: Path) -> None:
     assert read_ranges(path) == NoiseOptions(grain=(0.001, 0.002), sh_degrees=(0,), constant_opacity=0)
     for text in ('{"grian": [0, 1]}', '{"grain": 3}', '{"grain": ["a", 1]}', '{"grain": [2, 1]}'):
         path.write_text(text)
-        with pytest.raises(SceneError, match=r"docs/generator\.md"):
+        with pytest.raises(SceneError, match=r"docs/internals/generator\.md"):
             read_ranges(path)

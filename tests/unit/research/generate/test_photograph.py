@@ -7,14 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsmerge.research.generate.paths import PATHS, look_at, worth_a_photo
-from gsmerge.research.generate.photograph import Lens, developed, exposure, lit, radiance, rectangles, trace
-from gsmerge.research.generate.shapes import LYING, Look, Shape, ball, box, column, packed, placed, quad, rod, sheet
+from gsmerge.research.generate.paths import PATHS, is_usable, look_at
+from gsmerge.research.generate.photograph import (
+    Lens,
+    develop,
+    find_exposure,
+    light_stage,
+    radiance,
+    screen_boxes,
+    trace,
+)
+from gsmerge.research.generate.shapes import LYING, Material, Shape, ball, box, column, pack, place, quad, rod, sheet
 from gsmerge.research.generate.stage import Light, Palette, Stage
 from gsmerge.research.generate.styles import STYLES
 from gsmerge.research.generate.textures import KINDS
 
-LOOK = Look(0)
+LOOK = Material(0)
 LENS = Lens(40, 30, 40.0)
 WHITE = np.ones((32, 32, 3), np.float32)
 DOWN = Light(np.array([0.0, -1.0, 0.0]), None, np.ones(3), 0.2 * np.ones(3), 0.01)
@@ -25,13 +33,13 @@ def stage(*shapes: Shape) -> Stage:
 
 
 def test_a_wall_has_its_own_depth_everywhere() -> None:
-    hits = trace(packed([quad((0, 0, 2.5), (9, 9), LOOK)]), np.eye(4), LENS, 1)
+    hits = trace(pack([quad((0, 0, 2.5), (9, 9), LOOK)]), np.eye(4), LENS, 1)
     np.testing.assert_allclose(hits.depth, 2.5)
     np.testing.assert_allclose(hits.normals, np.broadcast_to([0, 0, -1], hits.normals.shape), atol=1e-6)
 
 
 def test_a_ball_is_as_near_as_its_front_and_as_wide_as_its_cone() -> None:
-    hits = trace(packed([ball((0, 0, 4), (1, 1, 1), LOOK)]), np.eye(4), Lens(401, 301, 300.0), 1)
+    hits = trace(pack([ball((0, 0, 4), (1, 1, 1), LOOK)]), np.eye(4), Lens(401, 301, 300.0), 1)
     assert hits.depth.min() == pytest.approx(3, abs=1e-4)
     radius = np.sqrt((hits.ids == 0).sum() / np.pi)
     assert radius == pytest.approx(300 / np.sqrt(15), rel=0.01)  # tangent of the cone that touches the ball
@@ -39,7 +47,7 @@ def test_a_ball_is_as_near_as_its_front_and_as_wide_as_its_cone() -> None:
 
 def test_a_column_stands_on_its_foot() -> None:
     shape = column((0.0, 1.0, 3.0), 1.5, 0.2, LOOK, top=0.5)
-    hits = trace(packed([shape]), np.eye(4), Lens(200, 200, 200.0), 1)
+    hits = trace(pack([shape]), np.eye(4), Lens(200, 200, 200.0), 1)
     rows = np.flatnonzero((hits.ids == 0).any(1))
     assert (rows[-1] + 1 - 100) / 200 * hits.depth[rows[-1], 100] == pytest.approx(1.0, abs=0.02)
     widths = (hits.ids == 0).sum(1)
@@ -49,9 +57,9 @@ def test_a_column_stands_on_its_foot() -> None:
 def test_a_rod_joins_its_ends() -> None:
     a, b = np.array([-0.5, -0.3, 2.0]), np.array([0.6, 0.4, 3.0])
     shape = rod(a, b, 0.05, LOOK)
-    np.testing.assert_allclose(shape.centre - shape.turn[:, 1] * shape.size[1], a, atol=1e-12)
-    np.testing.assert_allclose(shape.turn.T @ shape.turn, np.eye(3), atol=1e-12)
-    assert np.linalg.det(shape.turn) == pytest.approx(1)
+    np.testing.assert_allclose(shape.centre - shape.rotation[:, 1] * shape.size[1], a, atol=1e-12)
+    np.testing.assert_allclose(shape.rotation.T @ shape.rotation, np.eye(3), atol=1e-12)
+    assert np.linalg.det(shape.rotation) == pytest.approx(1)
 
 
 def test_no_rectangle_cuts_off_what_is_seen() -> None:
@@ -59,9 +67,9 @@ def test_no_rectangle_cuts_off_what_is_seen() -> None:
     rng = np.random.default_rng(2)
     shapes = [box(p - 0.3, p + 0.3, LOOK) for p in rng.uniform(-2, 2, (20, 3))]
     shapes += [sheet((0, 1, 0), (3, 3), LOOK, rng, 0.3, length=2.0), quad((0, 0, 3), (2, 2), LOOK)]
-    shapes = placed(shapes, (0.1, 0, 0.4), yaw=0.3)
-    given, c2w = packed(shapes), look_at(np.array([0.2, 0.1, -1.0]), np.array([0.3, 0.2, 2.0]), 0.1)
-    rects = rectangles(given, c2w, LENS, 1)
+    shapes = place(shapes, (0.1, 0, 0.4), yaw=0.3)
+    given, c2w = pack(shapes), look_at(np.array([0.2, 0.1, -1.0]), np.array([0.3, 0.2, 2.0]), 0.1)
+    rects = screen_boxes(given, c2w, LENS, 1)
     together = trace(given, c2w, LENS, 1)
     for m in range(len(shapes)):
         y, x = np.nonzero(together.ids == m)
@@ -72,7 +80,7 @@ def test_no_rectangle_cuts_off_what_is_seen() -> None:
 
 def test_a_thing_throws_shade_on_the_ground() -> None:
     ground = replace(quad((0, 0, 0), (4, 4), LOOK, LYING), shell=True)
-    view = lit(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
+    view = light_stage(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
     from_side = look_at(np.array([0.0, -0.45, -3.0]), np.array([0.0, 0.0, 0.0]))
     image, hits = radiance(view, from_side, Lens(60, 60, 60.0), 1)
     y, x = np.mgrid[:60, :60] + 0.5
@@ -87,8 +95,8 @@ def test_a_thing_throws_shade_on_the_ground() -> None:
 
 def test_exposure_meets_the_brightness() -> None:
     pictures = [np.random.default_rng(0).uniform(0, 30, (20, 20, 3)).astype(np.float32)]
-    gain = exposure(pictures, 0.45)
-    assert developed(pictures[0] * gain).mean() == pytest.approx(0.45, abs=1e-3)
+    gain = find_exposure(pictures, 0.45)
+    assert develop(pictures[0] * gain).mean() == pytest.approx(0.45, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -116,14 +124,14 @@ def test_textures_have_no_seam(kind: str) -> None:
 def test_stages_are_seen_from_their_paths(style: str) -> None:
     built = STYLES[style](Palette(np.random.default_rng(3), 64))
     assert len(built.shapes) > 20
-    view, rng = packed(built.shapes), np.random.default_rng(0)
+    view, rng = pack(built.shapes), np.random.default_rng(0)
     worth = []
     for path in PATHS.values():
         for _ in range(4):
             pose = path(built, rng, 6)
             for s in (0.0, 0.5, 1.0):
-                turn = pose(s)[:3, :3]
-                np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-9)
-                assert np.linalg.det(turn) == pytest.approx(1)
-                worth.append(worth_a_photo(trace(view, pose(s), LENS, 1)))
+                rotation = pose(s)[:3, :3]
+                np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-9)
+                assert np.linalg.det(rotation) == pytest.approx(1)
+                worth.append(is_usable(trace(view, pose(s), LENS, 1)))
     assert np.mean(worth) > 0.3

