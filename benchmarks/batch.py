@@ -1,4 +1,4 @@
-"""What a batch costs beside single runs, and what it loses when it is killed again and again.
+"""Cost of a batch compared with single runs, and what it loses when it is killed again and again.
 
     python benchmarks/batch.py                                 # 200 scenes of 50 k Gaussians, 20 kills
     python benchmarks/batch.py --scenes 20 --kills 4 -- --effort fast
@@ -78,7 +78,7 @@ def throughput(scenes: list[Path], out: Path, options: list[str]) -> Cost:
     print(f"single run      {wall:6.2f} s, {cpu:6.2f} s of processors (mean of {len(single)}, imports included)")
     whole = out / "undisturbed"
     shutil.rmtree(whole, ignore_errors=True)
-    cost = timed("batch", scenes[0].parent, "--out", whole, "-q", *options)
+    cost = timed("batch", scenes[0].parent, "--output", whole, "-q", *options)
     count = len(scenes)
     each = Cost(cost.wall * available_threads() / count, cost.cpu / count)
     print(f"batch           {cost.wall:6.1f} s for {count} scenes: {each.wall:.2f} s of a core, {each.cpu:.2f} s used")
@@ -101,7 +101,7 @@ def killed(scenes: list[Path], out: Path, options: list[str], cost: Cost, kills:
     folder, chance, done = out / "killed", random.Random(seed), []
     shutil.rmtree(folder, ignore_errors=True)
     for _ in range(kills):
-        process = subprocess.Popen([*COMMAND, "batch", str(scenes[0].parent), "--out", str(folder), "-q", *options])
+        process = subprocess.Popen([*COMMAND, "batch", str(scenes[0].parent), "--output", str(folder), "-q", *options])
         start = time.time()
         while process.poll() is None and not at_work(folder, start):
             time.sleep(0.01)
@@ -109,13 +109,13 @@ def killed(scenes: list[Path], out: Path, options: list[str], cost: Cost, kills:
         process.kill()
         process.wait()
         done.append(sum(records(folder).values()))
-    timed("batch", scenes[0].parent, "--out", folder, "-q", *options)
-    found, wanted, counts = hashes(folder), hashes(out / "undisturbed"), records(folder)
+    timed("batch", scenes[0].parent, "--output", folder, "-q", *options)
+    results, expected, counts = hashes(folder), hashes(out / "undisturbed"), records(folder)
     twice = [name for (name, _), count in counts.items() if count > 1]
-    lost, other = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
-    differ = sorted(name for name in found.keys() & wanted.keys() if found[name] != wanted[name])
+    lost, other = sorted(expected.keys() - results.keys()), sorted(results.keys() - expected.keys())
+    differ = sorted(name for name in results.keys() & expected.keys() if results[name] != expected[name])
     print(f"killed {kills} times, with {', '.join(map(str, done))} scenes recorded")
-    print(f"                {len(found)} of {len(wanted)} results; lost {lost}, differ {differ}")
+    print(f"                {len(results)} of {len(expected)} results; lost {lost}, differ {differ}")
     print(f"                recorded twice {twice}, left over {other}")
     return not (lost or differ or twice or other)
 
@@ -128,7 +128,7 @@ def memory(out: Path, count: int) -> None:
         (folder / f"{number:06d}.ply").write_bytes(b"ply\n")
     target = out / "broken-out"
     shutil.rmtree(target, ignore_errors=True)
-    command = [*COMMAND, "batch", str(folder), "--out", str(target), "--jobs", "1", "-q"]
+    command = [*COMMAND, "batch", str(folder), "--output", str(target), "--jobs", "1", "-q"]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     seen: list[tuple[int, int]] = []
 
@@ -163,7 +163,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--size", default="128x98", help="of the views: 4 x 128 x 98 are 50 k Gaussians")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "out" / "batch")
+    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "out" / "batch")
     parser.add_argument("--only", choices=["batch", "memory"], default="batch")
     parser.add_argument("options", nargs="*", help="of gsmerge batch, after --")
     args = parser.parse_args()

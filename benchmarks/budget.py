@@ -22,11 +22,11 @@ import gsmerge
 from gsmerge.moments import Members, scene_members
 from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.decode import DecodeOptions, decode, split_counts
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import Frame, canonicalise
-from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree, split_counts
+from gsmerge.stages.region_tree import auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Gaussians, Groups, PixelScene
 

@@ -1,4 +1,4 @@
-"""Exports of several backbones, read without a flag: found pixels, time to read, and quality after compaction.
+"""Exports of several backbones, read without a flag: recovered pixels, time to read, and quality after compaction.
 
 python benchmarks/exporters.py eval                          # reading alone, all views
 python benchmarks/exporters.py fox,fern --views 3 6 0        # 0: all views
@@ -66,10 +66,10 @@ def share_at_home(loaded: SceneLoad, truth: Truth | None) -> float:
     if loaded.recovery is None or truth is None:
         return float("nan")
     layout = loaded.recovery.best.layout
-    size, found = layout.width * layout.height, np.full(len(truth.pixels), -1)
+    size, recovered = layout.width * layout.height, np.full(len(truth.pixels), -1)
     for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
-        found[rows.reshape(-1)] = view * size + pixels
-    return float((found == truth.pixels).mean())
+        recovered[rows.reshape(-1)] = view * size + pixels
+    return float((recovered == truth.pixels).mean())
 
 
 def measure(scene: Path, name: str, max_views: int, cache: Path, quality: bool) -> dict[str, Any]:

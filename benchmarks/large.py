@@ -1,4 +1,4 @@
-"""Seconds and memory of ``gsmerge compact`` on scenes of many views, beside what ``gsmerge inspect`` estimates.
+"""Seconds and memory of ``gsmerge compact`` on scenes of many views, and the estimates of ``gsmerge inspect``.
 
 python benchmarks/large.py                                  # 84 views of a real scene, default settings
 python benchmarks/large.py --views 12 84 --degrees 0 3 4 --settings "--fit none" "--effort draft"
@@ -106,7 +106,7 @@ def row(scene: Path, views: int, degree: int, settings: str, out: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--scene", default="redkitchen", help="one of the scenes beside the repository")
+    parser.add_argument("--scene", default="redkitchen", help="one of the scenes next to the repository")
     parser.add_argument("--views", type=int, nargs="*", default=[84])
     parser.add_argument("--degrees", type=int, nargs="*", default=[0], help="of the harmonics, 0 to 4")
     parser.add_argument("--settings", nargs="*", default=[""], help="options of compact, one string a run")

@@ -19,14 +19,14 @@ SHIFT = 0.002  # of the median depth
 
 
 def many_views(scene: Path, out: Path, num_views: int, seed: int = 0) -> Path:
-    """A scene folder with ``num_views`` context views, for the exporter; made once.
+    """A scene folder with ``num_views`` context views, for the exporter; created once.
 
     Views stand in the order of the scene's own, the repetitions of each one after the other. The first has the pose
     of the original, others one that is jittered by about ``TURN`` and ``SHIFT``, as by pose estimation from a video
     that hardly moves. Photos and depth are the same. Target views are kept.
 
     Args:
-        scene: Folder with ``transforms.json``, as the scenes beside the repository.
+        scene: Folder with ``transforms.json``, as the scenes next to the repository.
         out: Folder to write.
         num_views: Context views, at least as many as the scene has.
         seed: Of the poses.
@@ -86,7 +86,7 @@ def _jittered(pose: np.ndarray, shift: float, rng: np.random.Generator) -> np.nd
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scene", help="name of one of the scenes beside the repository")
+    parser.add_argument("scene", help="name of one of the scenes next to the repository")
     parser.add_argument("out", type=Path)
     parser.add_argument("--views", type=int, default=84)
     parser.add_argument("--seed", type=int, default=0)

@@ -36,7 +36,7 @@ STAGES = ("encode", "match", "refine", "decode")  # that networks take part in
 
 @dataclass(frozen=True)
 class Condition:
-    """A way to run; both with and without networks unless ``learned`` alone is wanted."""
+    """A way to run; both with and without networks unless ``learned`` says otherwise."""
 
     name: str
     settings: dict[str, Any]

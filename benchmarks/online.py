@@ -29,14 +29,14 @@ from gsmerge.io import find_scene_files
 
 
 def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[Path]:
-    """A scene's views in batches, each the export of a scene of its own; made once."""
+    """A scene's views in batches, each exported as its own scene; created once."""
     source = many_views(scene_folders(name)[0], cache / f"{name}-{views}", views)
     document = json.loads((source / "transforms.json").read_text())
     context = [f for f in document["frames"] if f["role"] == "context"]
     ids = np.arange(len(context))
     if order == "cycle":  # every batch goes once through the scene
         ids = np.concatenate([ids[i :: -(-views // size)] for i in range(-(-views // size))])
-    found = []
+    results = []
     for number, first in enumerate(range(0, len(ids), size)):
         folder = cache / f"{name}-{views}-{order}-{size}" / f"{number:03d}"
         ply = folder / "plain" / "scene.ply"
@@ -49,8 +49,8 @@ def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[P
             (folder / "transforms.json").write_text(json.dumps(document | {"frames": frames}))
             ply = Path(exporter().export(folder, folder / "plain", "plain"))
             (folder / "done").touch()
-        found.append(ply)
-    return found
+        results.append(ply)
+    return results
 
 
 def online(args: argparse.Namespace) -> dict:
@@ -71,12 +71,12 @@ def online(args: argparse.Namespace) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         compactor.save(Path(folder) / "state.gsm")
         size = (Path(folder) / "state.gsm").stat().st_size
-    found = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
+    results = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
     for fit, k in (("none", 1), ("none", 2), ("none", 4), ("color", 1), ("full", 1), ("full", 2), ("full", 4)):
         start = time.perf_counter()
         gaussians = compactor.decode(k=k, fit=fit)
-        found[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
-    return found
+        results[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
+    return results
 
 
 def whole(args: argparse.Namespace, fit: str) -> dict:
@@ -94,8 +94,8 @@ def whole(args: argparse.Namespace, fit: str) -> dict:
 
 def _scored(gaussians: gsmerge.Gaussians, targets: Targets, seconds: float, perceptual: bool) -> dict:
     values = score(gaussians, targets, perceptual)
-    found = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
-    return {"count": len(gaussians), **found, "seconds": round(seconds, 1)}
+    results = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
+    return {"count": len(gaussians), **results, "seconds": round(seconds, 1)}
 
 
 def main() -> None:

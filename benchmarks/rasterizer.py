@@ -10,7 +10,7 @@ in a training loop.
 
 Milliseconds are process CPU time on one thread, best of the repeats, kernels warm; ours and the sketch's runs take
 turns. ``dB`` is the PSNR against float64 renders. Scenes, renders and sketch are looked for in ``GSMERGE_SHARED``
-and in ``../shared`` beside the repository; without them there is nothing to measure.
+and in ``../shared`` next to the repository; without them there is nothing to measure.
 """
 
 from __future__ import annotations
@@ -111,10 +111,10 @@ def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int
     for _ in range(repeats + 1):
         clock("sketch backward", lambda: raster.sums(gradient))
         clock("raster backward", lambda: walk_back(plan, image, left, gradient, colors))
-        wanted = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, none, False))
+        expected = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, none, False))
         shade = clock(
             "color gradients",
-            lambda wanted=wanted, shade=shade: color_gradients(plan, wanted.colors, colors, used=shade),
+            lambda expected=expected, shade=shade: color_gradients(plan, expected.colors, colors, used=shade),
         )
     return clock.best, image
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.measure.comparison import break_even
 from gsmerge.report import human_bytes
-from gsmerge.research.charts.figures import make_verdicts
+from gsmerge.research.charts.figures import make_verdict_tables
 from gsmerge.research.charts.record import INPUT, RunRecord
 from gsmerge.research.charts.statistics import mean_interval
 
@@ -53,8 +53,8 @@ def _table(head: Row, rows: Sequence[Row]) -> str:
 
 def _section(title: str, parts: str, words: str, table: str, *figures: str) -> str:
     """A section with the command that makes it, its table and its charts."""
-    shown = [f"![{name}](results/{name}.png)" for name in figures]
-    return "\n\n".join(filter(None, [f"## {title}", f"Made by `{COMMAND} --only {parts}`. {words}", table, *shown]))
+    pictures = [f"![{name}](results/{name}.png)" for name in figures]
+    return "\n\n".join(filter(None, [f"## {title}", f"Made by `{COMMAND} --only {parts}`. {words}", table, *pictures]))
 
 
 def _mean(records: Sequence[RunRecord], name: str, digits: int = 2) -> str:
@@ -66,8 +66,8 @@ def _interval(records: Sequence[RunRecord], name: str) -> str:
     values = [v for r in records if (v := getattr(r, name)) is not None]
     if len(values) < 2:
         return "-"
-    found = mean_interval(values)
-    return f"{found.mean:.2f} ± {found.high - found.mean:.2f}"
+    interval = mean_interval(values)
+    return f"{interval.mean:.2f} ± {interval.high - interval.mean:.2f}"
 
 
 def _share(records: Sequence[RunRecord]) -> str:
@@ -92,12 +92,12 @@ def _words(record: RunRecord) -> str:
 def _grouped(
     records: Sequence[RunRecord], key: Callable[[RunRecord], tuple[object, ...]]
 ) -> dict[tuple[object, ...], list[RunRecord]]:
-    """Records by key, those that lack a scene that others have left out; in the order they came."""
-    found: dict[tuple[object, ...], list[RunRecord]] = {}
+    """Records by key in their order, without keys that lack a scene that others have."""
+    groups: dict[tuple[object, ...], list[RunRecord]] = {}
     for record in records:
-        found.setdefault(key(record), []).append(record)
-    most = max((len({r.scene for r in some}) for some in found.values()), default=0)
-    return {k: some for k, some in found.items() if len({r.scene for r in some}) == most}
+        groups.setdefault(key(record), []).append(record)
+    most = max((len({r.scene for r in some}) for some in groups.values()), default=0)
+    return {k: some for k, some in groups.items() if len({r.scene for r in some}) == most}
 
 
 def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -123,7 +123,7 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
 
 def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     """Whether a baseline's point lies above gsmerge at equal cost."""
-    tables = make_verdicts(list(parts.get("sizes", ())))
+    tables = make_verdict_tables(list(parts.get("sizes", ())))
     head = ("baseline", "its value", "gsmerge", "difference", "verdict")
     out = []
     for table in tables:
@@ -132,7 +132,7 @@ def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
             d = table.decimals
             ours = "-" if verdict.ours is None else f"{verdict.ours:.{d}f}"
             ahead = "-" if verdict.ahead is None else f"{verdict.ahead.mean:+.{d}f}"
-            rows.append((f"{verdict.rival}, {label}", f"{verdict.quality:.{d}f}", ours, ahead, verdict.words))
+            rows.append((f"{verdict.baseline}, {label}", f"{verdict.quality:.{d}f}", ours, ahead, verdict.words))
         above = [row[0] for row in rows if row[3] != "-" and float(row[3]) < 0]
         cheaper = sum(row[2] == "-" for row in rows)
         summary = f"Of {len(rows) - cheaper} points none lies above gsmerge on the mean."
@@ -150,9 +150,7 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     for style, name in (("views", "plain"), ("da3", "da3"), ("depthsplat", "depthsplat"), ("anysplat", "anysplat")):
         records = parts.get(style, ())
         if style == "views":
-            records = [
-                r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"} and r.settings.get("k") != "auto"
-            ]
+            records = [r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"}]
             records = [
                 *records,
                 *(r for r in parts.get("sizes", ()) if r.method == "paper" and r.settings.get("budget") == "4.4%"),
@@ -238,11 +236,11 @@ ABLATION = {
     (("fit", "color"),): "without the full fit: colours alone, merge chosen by the photos",
     (("checkpoint", "none"), ("fit", "none")): "without any fit: merge chosen by the photos",
     (("checkpoint", "shipped"), ("fit", "none")): "without any fit: the trained encoder, merger, refiner and heads",
-    (("density", 0.02),): "larger superpixels",
-    (("density", 0.087),): "smaller superpixels",
+    (("superpixels", "2%"),): "larger superpixels",
+    (("superpixels", "8.7%"),): "smaller superpixels",
     (("segmentation", "bass-st"),): "the paper's superpixels (BASS with Shi-Tomasi)",
     (("segmentation", "slic"),): "SLIC superpixels",
-    (("k", "auto"),): "as many Gaussians as the scene needs (`--k auto`)",
+    (("budget", "auto"),): "as many Gaussians as the scene needs (`--budget auto`)",
 }
 
 
@@ -316,9 +314,9 @@ def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
     gains = sorted(_gains(parts), key=lambda row: float(row[-1]))
     lost = [row for row in gains if float(row[-1]) < 0]
     head = ("scene", "part", "views", "settings", "input (dB)", "gsmerge")
-    shown = lost or gains[:5]
+    listed = lost or gains[:5]
     words = "are below their input" if lost else "gain least (none is below its input)"
-    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{_table(head, shown)}"
+    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{_table(head, listed)}"
     return "\n\n".join(filter(None, [text, _too_many(parts.get("sizes", ())), _without(parts.get("ablation", ()))]))
 
 
@@ -348,11 +346,13 @@ def _too_many(records: Sequence[RunRecord]) -> str:
     budgets = sorted({str(r.settings["budget"]) for r in runs}, key=lambda text: float(text.rstrip("%")))
     if len(budgets) < 2:
         return ""
-    found = {(r.scene, str(r.settings["budget"])): r for r in runs}
+    by_scene = {(r.scene, str(r.settings["budget"])): r for r in runs}
     rows = []
     for scene in sorted({r.scene for r in runs}):
         values = [
-            (found[scene, b].psnr_target_visible, found[scene, b].psnr_context) for b in budgets if (scene, b) in found
+            (by_scene[scene, b].psnr_target_visible, by_scene[scene, b].psnr_context)
+            for b in budgets
+            if (scene, b) in by_scene
         ]
         rows.append((scene, *(f"{target:.2f} / {context:.2f}" for target, context in values)))
     words = (

@@ -1,4 +1,4 @@
-"""Measures what docs/results.md says, on the real scenes kept beside the repository, and writes it.
+"""Measures the figures of docs/results.md on the real scenes next to the repository, and writes it.
 
 python benchmarks/results.py                       # everything, resumable: what is done is not repeated
 python benchmarks/results.py --only sizes views    # some of the parts
@@ -59,7 +59,7 @@ PARTS = (
             ("--budgets", "4.4%", "--fit", "color", *NO_PROXIES),
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", *PLAIN, *NO_PROXIES),
-            ("--densities", "0.005,0.01,0.02,0.044,0.2", "--efforts", "draft", *NO_PROXIES),
+            ("--superpixels", "0.5%,1%,2%,4.4%,20%", "--efforts", "draft", *NO_PROXIES),
             ("--densities", "0.044,0.2", "--fit", "none", "--efforts", "draft", "--segmentations", "grid", *NO_PROXIES),
             ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", *NO_PROXIES),
             ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", *NO_PROXIES),
@@ -75,9 +75,10 @@ PARTS = (
             ("--fit", "color", *NO_PROXIES),
             ("--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
             ("--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
-            ("--densities", "0.02,0.087", *NO_PROXIES),
+            ("--superpixels", "2%,8.7%", *NO_PROXIES),
             ("--segmentations", "bass-st,slic", *NO_PROXIES),
-            ("--k", "2,4,auto", *NO_PROXIES),
+            ("--k", "2,4", *NO_PROXIES),
+            ("--budgets", "auto", *NO_PROXIES),
         ),
     ),
     *(
@@ -104,7 +105,7 @@ def run(part: Part, split: str, cache: Path, out: Path) -> None:
     scenes = [str(path) for path in exports(part.style, split, cache)]
     targets = f"{shared_folder()}/scenes/{split}/{{stem}}/transforms.json"
     for call in part.calls:
-        words = ["chart", *scenes, "--targets", targets, "--out", str(out / part.name), *call, *LPIPS]
+        words = ["chart", *scenes, "--targets", targets, "--output", str(out / part.name), *call, *LPIPS]
         start = time.perf_counter()
         code = gsmerge(words)
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {part.name} {shlex.join(call)}", flush=True)
@@ -129,7 +130,7 @@ def main() -> None:
         folder = args.runs / part.name
         if not folder.is_dir():
             continue
-        gsmerge(["chart", "--draw-only", "--out", str(folder)])
+        gsmerge(["chart", "--draw-only", "--output", str(folder)])
         records[part.name] = list(read_runs(folder)[0].values())
         for figure in part.figures:
             for suffix in ("png", "svg"):

@@ -3,7 +3,7 @@
     python benchmarks/segmentation.py [--density 5000] [--repeats 3]
 
 ``ms`` is process CPU time for 476 x 476 pixels, best of the repeats, kernels warm. ``/bass-st`` is that time over
-the one of ``bass-st``. With the folder of reference material beside the repository (``GSMERGE_SHARED`` or
+the one of ``bass-st``. With the folder of reference material next to the repository (``GSMERGE_SHARED`` or
 ``../shared``), ``/sketch`` is the time over that of the sketch of the same method kept there.
 """
 

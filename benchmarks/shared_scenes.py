@@ -1,4 +1,4 @@
-"""Real scenes kept beside the repository (``GSMERGE_SHARED`` or ``../shared``): exports, target views, visibility."""
+"""Real scenes next to the repository (``GSMERGE_SHARED`` or ``../shared``): exports, target views, visibility."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def scene_folders(split: str) -> list[Path]:
     """``train`` or ``eval``: the scenes of that split; otherwise a comma-separated list of names."""
     root = shared_folder()
     if root is None:
-        raise SystemExit("needs the scenes beside the repository: set GSMERGE_SHARED")
+        raise SystemExit("needs the scenes next to the repository: set GSMERGE_SHARED")
     known = {p.name: p for p in sorted(root.glob("scenes/*/*")) if p.is_dir()}
     if split in ("train", "eval"):
         return [p for p in known.values() if p.parent.name == split]
@@ -50,9 +50,9 @@ def exporter() -> ModuleType:
 def export(scene: Path, cache: Path, style: str = "plain") -> Path:
     """The ``.ply`` of a scene, written once into ``cache``."""
     out = cache / f"{scene.name}-{style}"
-    found = sorted(out.rglob("*.ply")) if (out / "done").exists() else []
-    if found:
-        return found[0]
+    files = sorted(out.rglob("*.ply")) if (out / "done").exists() else []
+    if files:
+        return files[0]
     path = Path(exporter().export(scene, out, style))
     (out / "done").touch()
     return path

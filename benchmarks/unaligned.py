@@ -32,19 +32,19 @@ def loosened(scene: gsmerge.PixelScene) -> gsmerge.UnalignedScene:
 
 
 def time_pass(folder: Path, cache: Path, threads: int) -> None:
-    """The contribution pass, with its kernels compiled, beside rendering the same views."""
+    """The contribution pass, with its kernels compiled, compared with rendering the same views."""
     scene = gsmerge.read_scene(export(folder, cache))
     assert scene.images is not None
     groups, loose = segment(scene.images, SegmentOptions()), loosened(scene)
-    found = []
+    times = []
     with use_threads(threads):
         for work in (lambda: find_owners(loose, groups), lambda: gsmerge.render(scene.gaussians, scene.cameras)):
             work()
             wall, start = time.perf_counter(), time.process_time()
             work()
-            found.append((time.process_time() - start, time.perf_counter() - wall))
+            times.append((time.process_time() - start, time.perf_counter() - wall))
     size = f"{len(scene.gaussians)} Gaussians x {len(scene)} views of {scene.cameras.width} x {scene.cameras.height}"
-    (own, wall), (drawn, _) = found
+    (own, wall), (drawn, _) = times
     print(
         f"{folder.name}: {size}: {own:.2f} s of processor time, {wall:.2f} s; {own / drawn:.2f} x rendering", flush=True
     )
@@ -58,18 +58,18 @@ def compare(folder: Path, cache: Path, settings: dict[str, object]) -> dict[str,
         "loose": loosened(plain),
         "anysplat": read_scene(export(folder, cache, "anysplat"), order="none"),
     }
-    targets, found = read_held_out(folder), {}
+    targets, results = read_held_out(folder), {}
     for name, scene in ways.items():
         result = gsmerge.compact(scene, **settings)
-        found[name], similarity = score(result.gaussians, targets)
+        results[name], similarity = score(result.gaussians, targets)
         share = 100 * len(result.gaussians) / len(scene.gaussians)
         print(
             f"{folder.name:10s} {name:8s} {len(scene.gaussians):8d} -> {len(result.gaussians):6d} ({share:.2f} %)"
-            f"  {found[name]:.2f} dB {similarity:.3f}  {found[name] - found['plain']:+.2f} dB"
+            f"  {results[name]:.2f} dB {similarity:.3f}  {results[name] - results['plain']:+.2f} dB"
             f"  pass {result.report.seconds['members']:.1f} s",
             flush=True,
         )
-    return found
+    return results
 
 
 def main() -> None:

@@ -1,85 +1,169 @@
-"""How many Gaussians a budget, a file size or a device allows."""
+"""How many Gaussians: what a budget, a file size, a device or a quality means."""
 
 from __future__ import annotations
 
 import math
 import re
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.ply_writer import count_for_bytes
 
-PRESETS = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
-SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}  # most Gaussians that they draw fluidly
+SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
+AUTO = "auto"
 
 
 @dataclass(frozen=True)
-class TargetOptions:
+class BudgetOptions:
     """What decides the number of Gaussians, next to the superpixels of each view and K.
 
     Args:
-        budget: Gaussians in the result: a number, or a share of the input as "2%". Met, and never exceeded.
-        max_bytes: Largest size of the result as a ``.ply``: bytes, or as "5MB".
-        preset: The most that a ``quest3``, a ``mobile`` or a ``desktop`` draws fluidly; scenes that need fewer
-            get fewer.
-        max_drop: The fewest Gaussians that lose at most this (dB) against the best that the scene's own curve
-            reaches.
-        target_psnr: The fewest Gaussians with which the input photos are rendered at this PSNR (dB).
+        budget: Gaussians in the result: a number, a share of the input as "2%", or the size of the ``.ply`` as "5MB",
+            met and never exceeded; ``"quest3"``, ``"mobile"`` or ``"desktop"``: at most as many as the device draws
+            fluidly; ``"auto"``: as many as the scene needs.
+        quality: The fewest Gaussians that render the input photos at a PSNR, as "30dB", or that lose at most so much
+            against the best that the scene's own curve reaches, as "-0.2dB".
         levels: Levels of detail, each with a quarter of the Gaussians of the one before and fitted by itself.
 
     Raises:
-        ValueError: If a setting is out of range, or both quality targets are given.
+        ValueError: If a setting is out of range.
     """
 
     budget: int | str | None = None
-    max_bytes: int | str | None = None
-    preset: str | None = None
-    max_drop: float | None = None
-    target_psnr: float | None = None
+    quality: str | None = None
     levels: int = 1
 
     def __post_init__(self) -> None:
-        if self.budget is not None:
+        if self.in_bytes:
+            parse_bytes(str(self.budget))
+        elif self.budget not in (None, AUTO, *DEVICES):
             parse_budget(self.budget, sys.maxsize)
-        if self.max_bytes is not None:
-            parse_bytes(self.max_bytes)
-        if self.preset is not None and self.preset not in PRESETS:
-            raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {self.preset!r}")
-        if self.max_drop is not None and not 0 <= self.max_drop < math.inf:
-            raise ValueError(f"max drop: expected at least 0 dB, got {self.max_drop}")
-        if self.target_psnr is not None and not 0 < self.target_psnr < math.inf:
-            raise ValueError(f"target psnr: expected more than 0 dB, got {self.target_psnr}")
-        if self.max_drop is not None and self.target_psnr is not None:
-            raise ValueError("expected one of max drop and target psnr, got both")
+        if self.quality is not None:
+            parse_quality(self.quality)
         if not 1 <= self.levels <= 8:
             raise ValueError(f"levels: expected 1 to 8, got {self.levels}")
 
     @property
-    def searches(self) -> bool:
-        """Whether a quality decides the count."""
-        return self.max_drop is not None or self.target_psnr is not None
+    def auto(self) -> bool:
+        """Whether the scene decides the count."""
+        return self.budget == AUTO
+
+    @property
+    def in_bytes(self) -> bool:
+        """Whether the budget is a file size."""
+        return re.fullmatch(r"[^a-z]*[kmg]?i?b", str(self.budget).strip().lower()) is not None
+
+    @property
+    def target_psnr(self) -> float | None:
+        """PSNR (dB) that the input photos have to reach; None without such a quality."""
+        quality = None if self.quality is None else parse_quality(self.quality)
+        return None if quality is None or self.max_drop is not None else quality
+
+    @property
+    def max_drop(self) -> float | None:
+        """dB that may be lost against the best; None without such a quality."""
+        loss = self.quality is not None and self.quality.strip().startswith("-")
+        return -parse_quality(str(self.quality)) if loss else None
 
 
-def exact_count(options: TargetOptions, num_input: int, sh_degree: int) -> int | None:
-    """The number of Gaussians that a budget or a file size asks for, the smaller of the two; None without either."""
-    wanted = []
-    if options.budget is not None:
-        wanted.append(parse_budget(options.budget, num_input))
-    if options.max_bytes is not None:
-        wanted.append(count_for_bytes(parse_bytes(options.max_bytes), sh_degree))
-    return min(*wanted, num_input) if wanted else None
+def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
+    """The number of Gaussians that a budget or a file size asks for; None without either."""
+    if options.budget in (None, AUTO, *DEVICES):
+        return None
+    if options.in_bytes:
+        return min(count_for_bytes(parse_bytes(str(options.budget)), sh_degree), num_input)
+    return parse_budget(str(options.budget), num_input)
 
 
-def most_allowed(options: TargetOptions, num_input: int, sh_degree: int) -> int:
-    """The most Gaussians that budget, size and preset leave, at most as many as the input has."""
-    limits = [num_input, exact_count(options, num_input, sh_degree), PRESETS.get(options.preset or "")]
-    return min(limit for limit in limits if limit is not None)
+def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
+    """The most Gaussians that budget, size or device leave, at most as many as the input has."""
+    limit = DEVICES.get(str(options.budget), exact_count(options, num_input, sh_degree))
+    return num_input if limit is None else min(limit, num_input)
 
 
-def parse_budget(budget: str | int, num_input: int) -> int:
-    """The number of Gaussians that ``--budget`` asks for: a number, or a share of the input as "2%" (rounded down).
+def parse_quality(text: str) -> float:
+    """The dB of ``--quality``: a PSNR as "30dB", or below zero a loss as "-0.2dB".
+
+    Raises:
+        ValueError: If it is neither.
+
+    Example:
+        >>> parse_quality("30dB"), parse_quality("-0.2dB")
+        (30.0, -0.2)
+    """
+    match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
+    value = float(match[2]) if match else math.inf
+    if match is None or not math.isfinite(value) or (value == 0 and not match[1]):
+        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}')
+    return -value if match[1] else value
+
+
+def parse_share(text: str) -> float:
+    """The part of a whole that "4.4%" means: 0.044.
+
+    Raises:
+        ValueError: If it is no share above 0 and up to 100 %.
+    """
+    match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
+    share = Fraction(match[1]) / 100 if match else Fraction(0)
+    if not 0 < share <= 1:
+        raise ValueError(f'expected a share as "4.4%", above 0 and up to 100%, got {text!r}')
+    return float(share)
+
+
+def share_text(share: float) -> str:
+    """A share as :func:`parse_share` reads it, exactly: 0.044 -> "4.4%"."""
+    if isinstance(share, bool) or not isinstance(share, int | float):
+        raise ValueError(f"expected a share as a number, got {share!r}")
+    return f"{(Decimal(repr(share)) * 100).normalize():f}%"
+
+
+def new_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as files of version 0.1.0 name them, by their names of today.
+
+    Example:
+        >>> new_settings({"k": "auto", "density": 0.02, "superpixels": None})
+        {'superpixels': '2%', 'budget': 'auto'}
+    """
+    old = ("density", "superpixels", "max_bytes", "preset", "max_drop", "target_psnr", "k", "budget")
+    new, given = dict(settings), {name: settings[name] for name in old if settings.get(name) is not None}
+    for name in old[2:6]:
+        new.pop(name, None)
+    if "density" in new or new.get("superpixels", "") is None:
+        density = new.pop("density", None)
+        new["superpixels"] = given.get("superpixels") or share_text(0.044 if density is None else density)
+    if given.get("k") == AUTO:
+        given["auto"] = new.pop("k")
+    for name in ("auto", "preset", "max_bytes"):
+        if name in given and "budget" not in given:
+            size = given[name]
+            new["budget"] = f"{size}B" if isinstance(size, int) else size
+            given["budget"] = size
+    if "target_psnr" in given or "max_drop" in given:
+        new["quality"] = f"{given['target_psnr']:g}dB" if "target_psnr" in given else f"-{given['max_drop']:g}dB"
+    return new
+
+
+def old_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The reverse of :func:`new_settings` for superpixels and counts: keys of records are digests of the old names."""
+    old = dict(settings)
+    if isinstance(old.get("superpixels"), str):
+        old["density"] = parse_share(old.pop("superpixels"))
+    if old.get("budget") == AUTO:
+        old["k"] = old.pop("budget")
+    elif isinstance(old.get("budget"), str) and BudgetOptions(old["budget"]).in_bytes:
+        old["max_bytes"] = old.pop("budget")
+    return old
+
+
+def parse_budget(budget: str | int | None, num_input: int) -> int:
+    """The number of Gaussians that a budget means: a number, or a share of the input as "2%" (rounded down).
 
     Never above ``num_input``.
 
@@ -92,9 +176,12 @@ def parse_budget(budget: str | int, num_input: int) -> int:
         (40000, 25000)
     """
     text = str(budget).strip()
-    found = re.fullmatch(r"(\d[\d_]*|\d*\.?\d+\s*%)", text, re.ASCII)
-    if not found:
-        raise ValueError(f'budget: expected a number of Gaussians as "40000" or a share as "2%", got {text!r}')
+    match = re.fullmatch(r"(\d[\d_]*|\d*\.?\d+\s*%)", text, re.ASCII)
+    if not match:
+        raise ValueError(
+            f'budget: expected a number of Gaussians as "40000", a share as "2%", a size as "5MB", auto or'
+            f" {', '.join(DEVICES)}, got {text!r}"
+        )
     if text.endswith("%"):
         share = Fraction(text[:-1].strip())
         if share > 100:
@@ -118,8 +205,8 @@ def parse_bytes(size: str | int) -> int:
         1500000
     """
     text = str(size).strip()
-    found = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]*)", text, re.ASCII)
-    unit = SIZES.get((found[2] or "B").upper()) if found else None
-    if found is None or unit is None:
-        raise ValueError(f'max bytes: expected a size as "5MB" or "800KiB", got {text!r}')
-    return int(Fraction(found[1]) * unit)
+    match = re.fullmatch(r"(\d*\.?\d+)\s*([A-Za-z]*)", text, re.ASCII)
+    unit = SIZES.get((match[2] or "B").upper()) if match else None
+    if match is None or unit is None:
+        raise ValueError(f'budget: expected a size as "5MB" or "800KiB", got {text!r}')
+    return int(Fraction(match[1]) * unit)

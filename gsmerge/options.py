@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gsmerge.budget import TargetOptions
+from gsmerge.budget import BudgetOptions, new_settings
 from gsmerge.stages.assign import ContributionOptions
 from gsmerge.stages.backing import BackingOptions
 from gsmerge.stages.choose_merge import RobustOptions, photos_choose
@@ -41,7 +41,7 @@ class CompactOptions:
         match: Merging across views.
         decode: Gaussians per group.
         fit: Fit to the photos.
-        target: What decides the number of Gaussians.
+        budget: What decides the number of Gaussians.
         method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
@@ -65,7 +65,7 @@ class CompactOptions:
     match: MatchOptions = field(default_factory=MatchOptions)
     decode: DecodeOptions = field(default_factory=DecodeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
-    target: TargetOptions = field(default_factory=TargetOptions)
+    budget: BudgetOptions = field(default_factory=BudgetOptions)
     method: str = "gsmerge"
     checkpoint: str = "auto"
     require_checkpoint: bool = False
@@ -79,10 +79,10 @@ class CompactOptions:
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
             return
-        asked = {"k auto": self.decode.k == "auto", "levels": self.target.levels > 1}
-        asked |= {"target psnr": self.target.target_psnr is not None, "max drop": self.target.max_drop is not None}
+        asked = {"budget auto": self.budget.auto, "levels": self.budget.levels > 1}
+        asked |= {f"quality {self.budget.quality}": self.budget.quality is not None}
         for name in (name for name, wanted in asked.items() if wanted):
-            raise ValueError(f"method {self.method}: expected a budget, a preset or a density, got {name}")
+            raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
 
     def networks(self, *, photos: bool, aligned: bool = True) -> str:
         """The checkpoint to load: as asked, or the shipped one where it improves results (docs/internals/networks.md).
@@ -111,22 +111,22 @@ class CompactOptions:
         }
 
     def with_auto_steps(self) -> CompactOptions:
-        """With ``k="auto"`` twice the steps, unless given: fewer Gaussians cost less each, and need them for detail."""
-        if self.decode.k != "auto" or self.fit.fit_steps is not None:
+        """With ``budget="auto"`` twice the steps, unless given: fewer Gaussians cost less, and need them for detail."""
+        if not self.budget.auto or self.fit.fit_steps is not None:
             return self
         return replace(self, fit=replace(self.fit, fit_steps=AUTO_STEPS * self.fit.steps))
 
     @property
     def needs_tree(self) -> bool:
         """Whether the number of Gaussians is searched for, or further levels of detail are cut."""
-        return self.target.searches or self.decode.k == "auto" or self.target.levels > 1
+        return self.budget.quality is not None or self.budget.auto or self.budget.levels > 1
 
     @property
     def whole_only(self) -> list[str]:
         """What is asked for that only a whole scene, compacted at once, can have: rivals, searches, levels."""
-        target = self.target
-        asked = {f"method {self.method}": self.method != "gsmerge", "levels": target.levels > 1}
-        asked |= {"max drop": target.max_drop is not None, "target psnr": target.target_psnr is not None}
+        budget = self.budget
+        asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
+        asked |= {f"quality {budget.quality}": budget.quality is not None}
         return [name for name, wanted in asked.items() if wanted]
 
     def to_dict(self) -> dict[str, Any]:
@@ -138,7 +138,7 @@ class CompactOptions:
         return flat
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
-        """The options with some settings changed, by flat name (``k=2, density=0.01``).
+        """The options with some settings changed, by flat name (``k=2, superpixels="1%"``).
 
         A name that several stages share, such as ``effort``, is changed in all of them.
 
@@ -189,9 +189,9 @@ def to_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def from_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of :func:`to_schema`."""
+    """The inverse of :func:`to_schema`; also of files from before ``superpixels``, ``budget`` and ``quality``."""
     names, rate_names = ({old: new for new, old in both.items()} for both in (SCHEMA_NAMES, RATE_SCHEMA_NAMES))
-    return _rename(settings, names, rate_names)
+    return _rename(new_settings(settings), names, rate_names)
 
 
 def _rename(settings: Mapping[str, Any], names: Mapping[str, str], rates: Mapping[str, str]) -> dict[str, Any]:

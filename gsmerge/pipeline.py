@@ -50,7 +50,7 @@ def compact(
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the longer ones with ("fit: ...", step, steps).
-        **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, density=0.01)``.
+        **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Returns:
         The Gaussians and a report; further levels of detail if they were asked for.
@@ -71,11 +71,11 @@ def compact(
                 gaussians = Gaussians.concat([gaussians, prepared.hidden])
             return score(prepared.frame.leave(gaussians), prepared, log)
 
-        if options.target.target_psnr is not None:
+        if options.budget.target_psnr is not None:
             result = search_quality(prepared, build_scored, log)
         else:
             result = build_scored(choose_count(prepared, build, log), log)
-        counts = level_counts(len(result.gaussians), options.target.levels, prepared.limits.min_count)
+        counts = level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count)
         coarser = tuple(build_scored(count, RunLog(progress)) for count in counts)
         result = score_input(replace(result, coarser=coarser), prepared, RunLog(progress))
     if progress:

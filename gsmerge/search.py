@@ -66,8 +66,9 @@ def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | No
         build: What makes Gaussians of it, see :func:`gsmerge.pipeline.build`.
         log: Takes the curve.
     """
-    limits, options, drop = prepared.limits, prepared.options, prepared.options.target.max_drop
-    if drop is None and options.decode.k != "auto":
+    limits, options = prepared.limits, prepared.options
+    drop = options.budget.max_drop
+    if drop is None and not options.budget.auto:
         return limits.count
     if prepared.given.images is None:
         return knee_count(prepared)
@@ -84,11 +85,11 @@ def search_quality(
     """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do.
 
     Args:
-        prepared: The scene, with ``target_psnr`` among its options.
+        prepared: The scene, with a PSNR as ``quality`` among its options.
         build_scored: Number of Gaussians and a log -> scored result.
         log: Of what came before; its seconds and notes enter the report.
     """
-    target, limits = prepared.options.target.target_psnr, prepared.limits
+    target, limits = prepared.options.budget.target_psnr, prepared.limits
     assert target is not None
     results: dict[int, CompactResult] = {}
 
@@ -106,7 +107,7 @@ def search_quality(
     unmet = None
     if not search.met:
         unmet = (
-            f"target psnr: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
+            f"quality: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
             f" with {len(result.gaussians)} Gaussians"
         )
     choices = result.report.choices | {"search": asdict(search)}

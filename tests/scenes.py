@@ -176,9 +176,16 @@ def make_scene(
         pixel_gaussians(TrueView(image, hits.depth, hits.normals, c2w), lens, errors, rng)
         for image, (c2w, hits, _) in zip(images, found, strict=True)
     ]
+    gaussians = Gaussians.concat(parts)
+    means = gaussians.means.double()
+    if not noise:  # exactly on the surfaces, so that what is equal is so in float64
+        means = torch.from_numpy(
+            np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in found])
+        )
+    gaussians = nudged(replace(gaussians, means=means))
     valid = torch.ones((len(cameras), cameras.height, cameras.width), dtype=torch.bool)
     pictures = torch.from_numpy(np.stack(images)) if photos else None
-    return PixelScene(nudged(Gaussians.concat(parts)), cameras, pictures, valid, names(len(cameras)))
+    return PixelScene(gaussians, cameras, pictures, valid, names(len(cameras)))
 
 
 def names(count: int) -> tuple[str, ...]:
@@ -260,7 +267,7 @@ def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
 def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
     """A scene whose photos show exactly these Gaussians."""
     scene = make_scene(room(), arc(views, 48, 36), degree=degree)
-    gaussians = plain(scene, density=0.08)
+    gaussians = plain(scene, superpixels="8%")
     gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
     images = images_of(gaussians, scene.cameras)[0].clip(0, 1)
     return replace(scene, images=torch.from_numpy(images).float()), gaussians
@@ -288,7 +295,7 @@ def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:
 def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
     """``compact`` with the invariants checked; a tenth of the pixels unless told."""
     if "superpixels" not in settings:
-        settings = {"density": 0.1, **settings}
+        settings = {"superpixels": "10%", **settings}
     result = compact(scene, **settings)
     assert_invariants(result.gaussians, scene)
     assert_consistent(result.report, scene, result.gaussians)

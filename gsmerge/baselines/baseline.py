@@ -20,7 +20,7 @@ from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
 Need = Literal["photos", "pixels", "node"]
 Run = Callable[[PreparedScene, int, RunLog], Gaussians]
 
-COUNTS = ("budget", "max_bytes", "preset", "superpixels", "density", "k")  # settings that decide how many
+COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
 
 
 @dataclass(frozen=True)

@@ -67,17 +67,17 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
             continue
         inputs.add(real)
         job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
-        for name in (job.output, *further_outputs(job.output, options.settings.target.levels)):
+        for name in (job.output, *further_outputs(job.output, options.settings.budget.levels)):
             if name in owners:
                 raise UsageError(
                     f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
-                    f" {scene}; tell them apart with --output, such as '{{parent}}-{{stem}}.ply'"
+                    f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
         jobs.append(job)
     for name in owners:
         if os.path.realpath(out / name) in inputs:
-            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --out")
+            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")
     return jobs
 
 
@@ -102,7 +102,7 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     try:
         return os.path.normpath(options.output.format(**values))
     except ValueError as error:  # a format that fits numbers only
-        raise UsageError(f"--output: {options.output!r} does not fit {values}: {error}") from error
+        raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error
 
 
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:

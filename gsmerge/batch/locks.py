@@ -96,7 +96,9 @@ def _open(path: Path) -> int:
         except OSError as error:
             if isinstance(error, FileNotFoundError) and path.parent.parent.is_dir():
                 continue  # another run ended and removed the folder of locks
-            raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --out") from error
+            raise SceneError(
+                path, f"cannot be written ({error.strerror})", "name another folder with --output"
+            ) from error
 
 
 def _lock(descriptor: int, path: Path, *, shared: bool) -> bool:
@@ -113,7 +115,7 @@ def _lock(descriptor: int, path: Path, *, shared: bool) -> bool:
     except OSError as error:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
             raise BusyError from None
-        raise SceneError(path, f"cannot be locked ({error.strerror})", "name another folder with --out") from error
+        raise SceneError(path, f"cannot be locked ({error.strerror})", "name another folder with --output") from error
     return True
 
 
@@ -155,14 +157,14 @@ def run_lock(folder: Path, name: str) -> Iterator[None]:
     deadline = time.monotonic() + LOCK_TIMEOUT
     while (joined := _join_run(path, name)) is None:
         if time.monotonic() > deadline:
-            raise UsageError(f"{folder}: another batch is at work there; name another --out")
+            raise UsageError(f"{folder}: another batch is at work there; name another --output")
         time.sleep(0.05)
     descriptor, holder = joined
     try:
         if holder["what"] != name:
             raise UsageError(
                 f"{folder}: a batch with other settings is at work there (process {holder['pid']} on"
-                f" {holder['host']}); wait for it, or name another --out"
+                f" {holder['host']}); wait for it, or name another --output"
             )
         yield
     finally:

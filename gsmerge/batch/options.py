@@ -58,8 +58,9 @@ class BatchOptions:
 
     def __post_init__(self) -> None:
         check_template(self.output)
-        if self.settings.target.max_bytes is not None and output_format(self.output) != ".ply":
-            raise ValueError(f"max bytes: expected an output as .ply, got {self.output}; give a budget")
+        budget = self.settings.budget
+        if budget.in_bytes and output_format(self.output) != ".ply":
+            raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"jobs: expected at least 1, got {self.jobs}")
         if self.max_memory is not None and self.max_memory < 1:

@@ -119,4 +119,6 @@ def check_folder(folder: Path) -> None:
         with (folder / RECORDS).open("ab"):
             pass
     except OSError as error:
-        raise SceneError(folder, f"cannot be written ({error.strerror})", "name another folder with --out") from error
+        raise SceneError(
+            folder, f"cannot be written ({error.strerror})", "name another folder with --output"
+        ) from error

@@ -131,7 +131,7 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
 
 def _output_names(job: Job, options: BatchOptions) -> list[str]:
     """Names of the result and of its further levels."""
-    return [job.output, *further_outputs(job.output, options.settings.target.levels)]
+    return [job.output, *further_outputs(job.output, options.settings.budget.levels)]
 
 
 def _as_written(folder: Path, known: DoneResult) -> list[dict[str, Any]]:

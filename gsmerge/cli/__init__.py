@@ -13,10 +13,10 @@ def main(args: Sequence[str] | None = None) -> int:
         args: Arguments without the program's name; those of the process when None.
 
     Returns:
-        0 done, 1 something unforeseen, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
+        0 done, 1 unexpected error, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
         130 interrupted.
     """
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what it has to say about a damaged image is said by us
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # we report damaged images ourselves
     from gsmerge.cli.app import run
 
     return run(args)

@@ -1,55 +1,58 @@
-"""The typer application, and the one place that turns exceptions into a line and an exit code."""
+"""The Typer application, and the one place that turns exceptions into a line and an exit code."""
 
 from __future__ import annotations
 
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 
 from gsmerge import __version__
-from gsmerge.cli.batch import batch
-from gsmerge.cli.chart import chart
-from gsmerge.cli.compact import compact
 from gsmerge.cli.console import one_line, plain_warnings
-from gsmerge.cli.decode import decode
-from gsmerge.cli.encode import encode
-from gsmerge.cli.evaluate import evaluate
-from gsmerge.cli.extend import extend
-from gsmerge.cli.generate import generate
-from gsmerge.cli.inspect import inspect
-from gsmerge.cli.options import debug_wanted, set_debug
-from gsmerge.cli.preview import preview
-from gsmerge.cli.render import render
-from gsmerge.cli.report import report
-from gsmerge.cli.segment import segment
-from gsmerge.cli.stress import stress
-from gsmerge.cli.train import train
+from gsmerge.cli.options import renamed
 from gsmerge.errors import DAMAGED_OPENCV, GsmergeError, is_opencv_damaged
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
 
-app = typer.Typer(
-    name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
-)
-COMMANDS = (
-    compact, batch, encode, decode, extend, evaluate, inspect, segment, render, preview, report, stress, chart,
-    generate, train,
-)  # fmt: skip
-for command in COMMANDS:
-    app.command()(command)
+# Panel of the help -> commands, each the function of its name in the module of its name
+COMMANDS = {
+    "Compact": ("compact",),
+    "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
+    "Look and measure": ("inspect", "segment", "render", "preview", "evaluate", "report"),
+    "Research": ("stress", "chart", "generate", "train"),
+}
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def make_app(only: str | None = None) -> typer.Typer:
+    """The application with all commands, or with one alone, which imports no other."""
+    made = typer.Typer(
+        name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
+    )
+    made.callback(invoke_without_command=True)(root)
+    for panel, names in COMMANDS.items():
+        for name in names:
+            if only in (None, name):
+                function = getattr(import_module(f"gsmerge.cli.{name}"), name)
+                made.command(rich_help_panel=panel)(function)
+    return made
+
+
+def __getattr__(name: str) -> Any:
+    if name == "app":
+        return make_app()
+    raise AttributeError(name)
+
+
+def _print_version(value: bool) -> None:
+    if value:
         print(f"{PROGRAM} {__version__}")
         raise typer.Exit
 
 
-@app.callback(invoke_without_command=True)
 def root(
     context: typer.Context,
     _: Annotated[
@@ -61,41 +64,44 @@ def root(
         print(context.get_help())
 
 
-def _fail(message: str, code: int) -> int:
-    if debug_wanted():
-        traceback.print_exc()
-    print(one_line(f"{PROGRAM}: error: {message}"), file=sys.stderr)
-    return code
-
-
 def _usage_message(error: Any) -> str:
-    context = error.ctx
-    place = context.command_path if context is not None else PROGRAM
-    told = error.format_message().replace("Value error, ", "", 1)  # of the checks that typer borrows
-    return f"{told.rstrip('.')}; see '{place} --help'"
+    """One line about wrong usage, where possible with the new name of an option that was renamed."""
+    place = PROGRAM if error.ctx is None else error.ctx.command_path
+    message = renamed(getattr(error, "option_name", ""), place.rpartition(" ")[2])
+    message = message or error.format_message().replace("Value error, ", "", 1)  # a prefix of checks inside Typer
+    return f"{message.rstrip('.')}; see '{place} --help'"
 
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
-    set_debug(False)
+    words = list(sys.argv[1:] if args is None else args)
+
+    def fail(message: str, code: int) -> int:
+        if "--debug" in words:
+            traceback.print_exc()
+        print(one_line(f"{PROGRAM}: error: {message}"), file=sys.stderr)
+        return code
+
+    known = any(words[:1] == [name] for names in COMMANDS.values() for name in names)
     try:
         with plain_warnings():
-            code = app(args=args, prog_name=PROGRAM, standalone_mode=False) or 0
-        return _fail("interrupted", code) if code == INTERRUPTED else code  # typer turns Ctrl-C into this code
+            app = make_app(words[0] if known else None)
+            code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
+        return fail("interrupted", code) if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except GsmergeError as error:
-        return _fail(str(error), error.exit_code)
+        return fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted", INTERRUPTED)
+        return fail("interrupted", INTERRUPTED)
     except MemoryError:
-        return _fail("out of memory; use a smaller scene or fewer --threads", 1)
+        return fail("out of memory; use a smaller scene or fewer --threads", 1)
     except Exception as error:
         if isinstance(error, _UsageErrors):
-            return _fail(_usage_message(error), 2)
+            return fail(_usage_message(error), 2)
         if is_opencv_damaged(error):
-            return _fail(DAMAGED_OPENCV, 1)
-        told = f"{type(error).__name__}: {error}".splitlines()[0]
-        return _fail(f"unexpected error: {told}; run again with --debug", 1)
+            return fail(DAMAGED_OPENCV, 1)
+        first = f"{type(error).__name__}: {error}".splitlines()[0]
+        return fail(f"unexpected error: {first}; run again with --debug", 1)
 
 
-# typer keeps its usage errors to itself; BadParameter, which it exports, derives from their common base
+# Typer does not export its usage errors; BadParameter, which it exports, derives from their common base
 _UsageErrors = typer.BadParameter.__mro__[2]

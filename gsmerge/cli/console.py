@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -28,21 +28,32 @@ def say(message: str, *, quiet: bool = False) -> None:
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
-    """Print what the reader or the work had to say, a line each, unless ``quiet``."""
+    """Print a line on stderr for each note about the input or the run, unless ``quiet``."""
     for note in notes:
         say(f"note: {note}", quiet=quiet)
 
 
-def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Stand-in for :func:`warnings.showwarning` that prints the message alone."""
-    say(f"gsmerge: warning: {message}")
+def print_document(
+    document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False
+) -> None:
+    """Print the result of a command on stdout: the document as JSON, or lines for people unless ``quiet``."""
+    from gsmerge.report import to_json
+
+    if as_json:
+        sys.stdout.write(to_json(document))
+    elif not quiet:
+        print("\n".join(map(one_line, [lines] if isinstance(lines, str) else lines)))
 
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
     """Warnings as one line each, without the place in the code that raised them."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        say(f"gsmerge: warning: {message}")
+
     with warnings.catch_warnings():
-        warnings.showwarning = show_warning
+        warnings.showwarning = show
         yield
 
 
@@ -81,6 +92,16 @@ def announce_compilation(*, quiet: bool, share: bool = False) -> Iterator[Callab
                 process.wait()
 
 
+def _terminal(*, quiet: bool) -> Any:
+    """Rich's console on stderr; None when quiet or where stderr is no terminal."""
+    if quiet:
+        return None
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    return console if console.is_terminal else None
+
+
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
     """A progress bar per stage on stderr; yields the callable that moves it.
@@ -89,24 +110,17 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
         ``(stage, done, total) -> None``, or None when quiet or when stderr is no terminal (``FORCE_COLOR`` set
         in the environment counts as one).
     """
-    if quiet:
+    console = _terminal(quiet=quiet)
+    if console is None:
         yield None
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich import progress as rich
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
     columns = (
-        TextColumn("{task.description:>12}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[detail]}"),
-    )
-    with Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
+        rich.TextColumn("{task.description:>12}"), rich.BarColumn(), rich.MofNCompleteColumn(),
+        rich.TimeElapsedColumn(), rich.TextColumn("{task.fields[detail]}"),
+    )  # fmt: skip
+    with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
 
         def move(stage: str, done: int, total: int) -> None:
@@ -119,33 +133,25 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
 
 
 @contextmanager
-def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+def total_progress(total: int, *, quiet: bool) -> Iterator[Progress]:
     """One bar for many runs on stderr: done of total, time left; a line per run where there is no terminal.
 
     Yields:
-        ``(what, done, total) -> None``.
+        ``(text, done, total) -> None``.
     """
-    if quiet:
-        yield lambda what, done, total: None
+    console = _terminal(quiet=quiet)
+    if console is None:
+        yield lambda text, done, total: say(f"{done}/{total} {text}", quiet=quiet)
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress as rich
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda what, done, total: say(f"{done}/{total} {what}")
-        return
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.description}"), console=console, transient=True) as bars:
+    columns = (
+        rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
+        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+    )  # fmt: skip
+    with rich.Progress(*columns, console=console, transient=True) as bars:
         task = bars.add_task("", total=total)
-        yield lambda what, done, total: bars.update(task, completed=done, total=total, description=one_line(what))
+        yield lambda text, done, total: bars.update(task, completed=done, total=total, description=one_line(text))
 
 
 def duration(seconds: float) -> str:

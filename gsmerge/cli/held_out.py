@@ -1,4 +1,4 @@
-"""Held-out views and networks as commands that measure want them."""
+"""Held-out views and LPIPS networks, for the commands that measure."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsmerge.cli.options import Lpips
-from gsmerge.cli.settings import told_as_usage
+from gsmerge.cli.options import usage_errors
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -15,27 +14,27 @@ if TYPE_CHECKING:
     from gsmerge.measure.evaluate import Views
     from gsmerge.types import PixelScene, UnalignedScene
 
-_NETS = {Lpips.both: ("vgg", "alex"), Lpips.vgg: ("vgg",), Lpips.alex: ("alex",), Lpips.none: ()}
 
-
-def networks(asked: Lpips | None) -> tuple[tuple[str, ...], list[str]]:
-    """The networks to measure with, and a note where the weights are not installed and nobody asked for them.
+def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
+    """The networks of ``--lpips``; without that option those that are installed, with a note where none is.
 
     Raises:
-        UsageError: If somebody did.
+        UsageError: If a network that was asked for is not installed.
     """
+    from gsmerge.measure.evaluate import NETS
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
-    if asked is not None:
-        if not all(map(lpips_available, _NETS[asked])):
-            raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
-        return _NETS[asked], []
-    nets = tuple(net for net in _NETS[Lpips.both] if lpips_available(net))
-    return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
+    if choice is None:
+        nets = tuple(net for net in NETS if lpips_available(net))
+        return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
+    nets = {"both": NETS, "none": ()}.get(choice, (choice,))
+    if not all(map(lpips_available, nets)):
+        raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
+    return nets, []
 
 
 def require_views(load: SceneLoad) -> None:
-    """Refuse a scene that there are no cameras of.
+    """Refuse a scene without cameras.
 
     Raises:
         SceneError: If it has no views.
@@ -48,7 +47,7 @@ def require_views(load: SceneLoad) -> None:
 def held_out_views(
     load: SceneLoad, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[PixelScene | UnalignedScene, Views | None, tuple[str, ...]]:
-    """The scene with the context views that were asked for, the held-out ones, and notes about those."""
+    """The scene with the context views of ``--views``, the held-out views, and notes about those."""
     from gsmerge.io import read_held_out
     from gsmerge.measure.evaluate import Views
     from gsmerge.views import even_views, midpoint_views, subset
@@ -56,13 +55,13 @@ def held_out_views(
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of those photos too; name them with --targets")
     read = None if targets is None else read_held_out(load, targets, target_images)
-    found = None if read is None else Views(read.cameras, read.images, read.names)
+    held_out = None if read is None else Views(read.cameras, read.images, read.names)
     notes = () if read is None else read.notes
     if views is None:
-        return load.scene, found, notes
-    with told_as_usage():
+        return load.scene, held_out, notes
+    with usage_errors():
         ids = even_views(len(load.scene), views)
-    if read is not None and found is not None:
+    if read is not None:
         if read.context_places is None:
             raise UsageError(
                 "--views: expected --targets that also name the input views, in the order of the trajectory"
@@ -70,8 +69,8 @@ def held_out_views(
         chosen = midpoint_views([read.context_places[i] for i in ids], read.places)
         if not chosen:
             raise UsageError(f"--views {views}: expected held-out views between the input views, found none")
-        found = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
-    return subset(load.scene, ids), found, notes
+        held_out = Views(read.cameras[chosen], read.images[chosen], tuple(read.names[i] for i in chosen))
+    return subset(load.scene, ids), held_out, notes
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:

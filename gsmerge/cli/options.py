@@ -1,376 +1,330 @@
-"""The options that commands share, each declared once. Names are the fields' names of the Python API.
+"""The options of the command line, each declared once, and how a command gets them.
 
-An option that was not given is None and leaves the library's own default alone; ``show_default`` repeats that
-default for the reader, and a test holds the two together.
+A command is a function of one :class:`Args`; :func:`command` lists its parameters for Typer: names of options
+declared here, and its own. An option that is a setting of the library carries the setting's name and no default: None
+leaves the library's own. What help says about that default and the possible values is compared with the library by
+``tests/contract/test_options.py``: the library's classes load torch, which ``--help`` must not.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from copy import copy
 from enum import Enum
+from functools import wraps
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Annotated
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-INPUT, SEGMENTATION, COUNT, MERGING, MEASURING, OUTPUT = (
-    "Input",
-    "Superpixels",
-    "How many Gaussians",
-    "Merging and colours",
-    "Measuring",
-    "Output and behaviour",
-)
+from gsmerge.errors import UsageError
+
+if TYPE_CHECKING:
+    from gsmerge.io import ReadHints, SceneFiles, SceneLoad
+    from gsmerge.options import CompactOptions
+
+INPUT, COUNT, MERGING, FITTING, MEASURING, OUTPUT, GENERAL = (
+    "Input", "How many Gaussians", "Merging", "Fitting", "Measuring", "Output", "General"
+)  # fmt: skip
+REQUIRED = Parameter.empty
+
+# Old option -> what to use instead; "command option" where an option was renamed in one command alone
+RENAMED = {
+    "--out": "-o/--output",
+    "batch --output": "--name; -o/--output is the folder",
+    "--density": "--superpixels, such as --superpixels 4.4%",
+    "--densities": "--superpixels, such as --superpixels 2%,4.4%",
+    "--max-bytes": "--budget, such as --budget 5MB",
+    "--preset": "--budget, such as --budget quest3",
+    "--k auto": "--budget auto",
+    "--target-psnr": "--quality, such as --quality 30dB",
+    "--max-drop": "--quality, such as --quality -0.2dB",
+}
 
 
-class Segmentation(str, Enum):
-    """Ways to cut superpixels."""
-
-    rdseg = "rdseg"
-    bass = "bass"
-    bass_st = "bass-st"
-    slic = "slic"
-    grid = "grid"
+def renamed(option: str, command: str = "") -> str | None:
+    """One line that says the new name of an option; None for a name that never was one."""
+    new = RENAMED.get(f"{command} {option}") or RENAMED.get(option)
+    return new and f"{option} is now {new}"
 
 
-class Method(str, Enum):
-    """Our own method and its rivals."""
+class Args(SimpleNamespace):
+    """The arguments and options of a command by name; values of choices are plain strings."""
 
-    gsmerge = "gsmerge"
-    unmerged = "unmerged"
-    unmerged_color = "unmerged-color"
-    unmerged_fit = "unmerged-fit"
-    paper = "paper"
-    voxel = "voxel"
-    opacity = "opacity"
-    contribution = "contribution"
-    random = "random"
-    blocks = "blocks"
-    greedy = "greedy"
-    splat_transform = "splat-transform"
+    @property
+    def silent(self) -> bool:
+        """Whether nothing but data may be printed."""
+        return bool(self.quiet or self.json)
 
+    def given(self, names: Iterable[str]) -> dict[str, Any]:
+        """Those of the named options that were given."""
+        values = vars(self)
+        return {name: values[name] for name in names if values.get(name) is not None}
 
-class Effort(str, Enum):
-    """How much work to put in."""
+    def settings(self, **changes: Any) -> CompactOptions:
+        """The library's options with those that were given, and ``changes``.
 
-    draft = "draft"
-    fast = "fast"
-    default = "default"
-    best = "best"
+        Raises:
+            UsageError: If a value is out of range.
+        """
+        from gsmerge.options import CompactOptions
 
+        options = CompactOptions()
+        with usage_errors():
+            return options.with_settings(self.given(options.to_dict()) | changes)
 
-class Preset(str, Enum):
-    """Devices and the most Gaussians that they draw fluidly."""
+    def hints(self) -> ReadHints:
+        """How to read the scene.
 
-    quest3 = "quest3"
-    mobile = "mobile"
-    desktop = "desktop"
+        Raises:
+            UsageError: If a value is none of the possible ones.
+        """
+        from gsmerge.io import ReadHints
+        from gsmerge.io.exporters import find_exporter
 
+        with usage_errors():
+            find_exporter(self.exporter)
+            return ReadHints(**self.given(("exporter", "quats", "order", "scene_scale", "max_side")))
 
-class Match(str, Enum):
-    """How Feature Gaussians of different views are told to show the same surface."""
+    def files(self, scene: Path) -> SceneFiles:
+        """The scene's .ply, its cameras and its photos: those named, or those beside it."""
+        from gsmerge.io import find_scene_files
 
-    overlap = "overlap"
-    aabb = "aabb"
-    none = "none"
+        return find_scene_files(scene, cameras=self.cameras, images=vars(self).get("images"))
 
+    def load(self, files: SceneFiles) -> SceneLoad:
+        """The scene of these files."""
+        from gsmerge.io import load_files
 
-class Unseen(str, Enum):
-    """Choices of ``--unseen``."""
-
-    drop = "drop"
-    keep = "keep"
-
-
-class Fit(str, Enum):
-    """What is fitted to the input images."""
-
-    full = "full"
-    color = "color"
-    none = "none"
+        return load_files(files, opacity=self.opacity, hints=self.hints())
 
 
-class Device(str, Enum):
-    """Where the full fit runs."""
-
-    cpu = "cpu"
-    cuda = "cuda"
-    auto = "auto"
-
-
-class Opacity(str, Enum):
-    """How the file stores opacity."""
-
-    auto = "auto"
-    logit = "logit"
-    raw = "raw"
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """A block in which a value that the library refuses is wrong usage of the command."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
-class Quats(str, Enum):
-    """How the file stores rotations."""
-
-    auto = "auto"
-    wxyz = "wxyz"
-    xyzw = "xyzw"
-    xyzw_root = "xyzw-root"
-    camera = "camera"
+def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUIRED) -> Parameter:
+    """A positional argument of a command."""
+    info = typer.Argument(metavar=metavar, help=_escape(help))
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
 
 
-class Order(str, Enum):
-    """Order of the file's rows."""
+def option(
+    name: str, kind: Any, help: str, *flags: str, default: Any = None, shown: str | None = None, rare: bool = False,
+    **more: Any,
+) -> Parameter:  # fmt: skip
+    """An option.
 
-    auto = "auto"
-    view_major = "view-major"
-    view_fastest = "view-fastest"
-    layer_major = "layer-major"
-    column_major = "column-major"
-    unordered = "unordered"
-    none = "none"
-
-
-class Lpips(str, Enum):
-    """Networks of ``--lpips``."""
-
-    both = "both"
-    vgg = "vgg"
-    alex = "alex"
-    none = "none"
-
-
-def debug_wanted() -> bool:
-    """Whether the command line asked for tracebacks."""
-    return _state["debug"]
-
-
-def set_debug(value: bool) -> bool:
-    """Remember ``--debug`` for the error handler, which runs when no command is active any more."""
-    _state["debug"] = value
-    return value
+    Args:
+        name: In :class:`Args`, and on the command line with dashes.
+        kind: Its type: bool is a switch, a tuple lists the possible values.
+        help: For the reader.
+        flags: On the command line, where they are not made of the name.
+        default: Value where it is not given.
+        shown: How help words the default, where that is left to the library.
+        rare: Shown by ``--help-all`` alone.
+        more: Passed on to Typer.
+    """
+    flags = flags or (f"--{name.replace('_', '-')}",)
+    if isinstance(kind, tuple):
+        choice: Any = Enum  # which mypy knows with literal names alone
+        kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
+        default = kind(default) if isinstance(default, str) else default
+    kind = kind | None if default is None else kind
+    info = typer.Option(*flags, help=_escape(help), show_default=shown or default is not False, hidden=rare, **more)
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
 
 
-_state = {"debug": False}
+def switch(name: str, help: str, *short: str, rare: bool = False, **more: Any) -> Parameter:
+    """An option without a value, off where it is not given."""
+    return option(name, bool, help, f"--{name.replace('_', '-')}", *short, default=False, rare=rare, **more)
 
 
-SceneArgument = Annotated[
-    Path, typer.Argument(metavar="SCENE", help="A .ply with one Gaussian per pixel and view, or the folder it is in.")
-]
-CamerasOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Cameras: transforms.json, a COLMAP folder, cameras.json or results.npz. Found beside the .ply if not"
-        " given.",
-        rich_help_panel=INPUT,
-    ),
-]
-ImagesOption = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the input images. Found beside the .ply if not given.", rich_help_panel=INPUT),
-]
-OpacityOption = Annotated[
-    Opacity,
-    typer.Option(
-        help="How the file stores opacity: as logits, or raw in [0, 1]; auto looks at the values.",
-        rich_help_panel=INPUT,
-    ),
-]
-DialectOption = Annotated[
-    str,
-    typer.Option(
-        help="Which exporter wrote the file, such as da3 or depthsplat; auto recognises it.", rich_help_panel=INPUT
-    ),
-]
-QuatsOption = Annotated[
-    Quats,
-    typer.Option(
-        help="How the file stores rotations: w first, w last, or relative to each view's camera.",
-        rich_help_panel=INPUT,
-    ),
-]
-OrderOption = Annotated[
-    Order,
-    typer.Option(help="Order of the rows; none: they belong to no pixels.", rich_help_panel=INPUT),
-]
-SceneScaleOption = Annotated[
-    float | None,
-    typer.Option(
-        help="Size of the Gaussians' world in units of the cameras'.", show_default="found", rich_help_panel=INPUT
-    ),
-]
-TargetsOption = Annotated[
-    Path | None,
-    typer.Option(
-        help="Cameras of held-out photos: any camera file; views that the scene was made of are left out.",
-        rich_help_panel=INPUT,
-    ),
-]
-TargetImagesOption = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the held-out photos. Found by their cameras if not given.", rich_help_panel=INPUT),
-]
-LpipsOption = Annotated[
-    Lpips | None,
-    typer.Option(
-        help="Networks of the perceptual distance; none is much faster.",
-        show_default="both, where installed",
-        rich_help_panel=MEASURING,
-    ),
-]
-MaxSideOption = Annotated[
-    int | None,
-    typer.Option(
-        min=16,
-        help="Longest side of the views of Gaussians that belong to no pixels; larger photos are resized.",
-        show_default="1200",
-        rich_help_panel=INPUT,
-    ),
-]
-SuperpixelsOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="Superpixels per view. Wins over --density.", rich_help_panel=SEGMENTATION),
-]
-DensityOption = Annotated[
-    float | None,
-    typer.Option(min=0.0, max=1.0, help="Superpixels per pixel.", show_default="0.044", rich_help_panel=SEGMENTATION),
-]
-SegmentationOption = Annotated[
-    Segmentation | None,
-    typer.Option(help="How superpixels are cut.", show_default="rdseg", rich_help_panel=SEGMENTATION),
-]
-EffortOption = Annotated[
-    Effort | None,
-    typer.Option(
-        help="How much work to put into superpixels and fit.", show_default="default", rich_help_panel=SEGMENTATION
-    ),
-]
+def panel(title: str, *parameters: Parameter) -> tuple[Parameter, ...]:
+    """Options of one group in help."""
+    for parameter in parameters:
+        get_args(parameter.annotation)[1].rich_help_panel = title
+    return parameters
 
 
-def parse_k(text: str) -> int | str:
-    """``--k``: a number from 1 to 8, or auto."""
+def changed(name: str, default: Any = None, **changes: Any) -> Parameter:
+    """A declared option as one command has it: another default, ``help``, ``show_default``, ``hidden``, ..."""
+    kind, info = get_args(OPTIONS[name].annotation)
+    info = copy(info)
+    for attribute, value in changes.items():
+        setattr(info, attribute, value)
+    return OPTIONS[name].replace(default=default, annotation=Annotated[kind, info])
+
+
+def _escape(help: str) -> str:
+    """Text in which rich does not take ``[cuda]`` for markup."""
+    return re.sub(r"\[(?=[a-z])", r"\\[", help)
+
+
+def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
+    """Give a command its parameters, in the order of help.
+
+    Args:
+        parameters: Names of declared options with spaces between, and parameters of the command alone.
+    """
+    listed: dict[str, Parameter] = {}
+    for given in (*parameters, "json quiet debug help_all"):
+        for name in given.split() if isinstance(given, str) else [given.name]:
+            listed.setdefault(name, OPTIONS[name] if isinstance(given, str) else given)
+
+    def decorate(function: Callable[[Args], None]) -> Callable[..., None]:
+        @wraps(function)
+        def run(**values: Any) -> None:
+            plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
+            function(Args(**plain))
+
+        run.__signature__ = Signature(list(listed.values()))  # type: ignore[attr-defined]
+        run.__annotations__ = {}
+        return run
+
+    return decorate
+
+
+def _show_all(context: typer.Context, value: bool) -> None:
+    """``--help-all``."""
+    if value:
+        for parameter in context.command.params:
+            parameter.hidden = False  # type: ignore[attr-defined]
+        print(context.get_help())
+        raise typer.Exit
+
+
+def parse_k(text: str) -> int:
+    """``--k``: a number from 1 to 8."""
     if text == "auto":
-        return text
+        raise UsageError(str(renamed("--k auto")))
     if not text.isdigit() or not 1 <= int(text) <= 8:
-        raise typer.BadParameter(f'expected 1 to 8 or "auto", got {text!r}')
+        raise typer.BadParameter(f"expected 1 to 8, got {text!r}")
     return int(text)
 
 
-KOption = Annotated[
-    str | None,
-    typer.Option(
-        "--k",
-        parser=parse_k,
-        metavar="[1-8|auto]",
-        help="Gaussians per superpixel: finer with more. auto: as many as the scene needs.",
-        show_default="1",
-        rich_help_panel=COUNT,
+def parse_superpixels(text: str) -> int | str:
+    """``--superpixels``: a number, or a share."""
+    return int(text) if text.isdigit() else text
+
+
+SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
+
+# Names of options that commands share
+HINTS = "opacity exporter quats order scene_scale max_side"
+READING = f"cameras images {HINTS}"
+TARGETS = "targets target_images"
+COUNTS = "k superpixels budget quality levels"
+MERGE = "segmentation robust match geometry unseen"
+FIT = "fit effort device fit_steps time_budget"
+NETWORKS = "checkpoint require_checkpoint"
+RUN = "seed threads"
+
+_TABLE = (
+    panel(
+        INPUT,
+        option("cameras", Path, "Camera file or COLMAP folder: transforms.json, cameras.json, results.npz, ... "
+               "Default: beside the .ply."),
+        option("images", Path, "Folder of the input photos. Default: beside the .ply."),
+        option("opacity", ("auto", "logit", "raw"), "How the file stores opacity: as logits, or raw in [0, 1]; auto "
+               "decides by the values.", default="auto", rare=True),
+        option("exporter", str, "The program that wrote the file, such as da3 or depthsplat; auto recognises it.",
+               default="auto", rare=True),
+        option("quats", ("auto", "wxyz", "xyzw", "xyzw-root", "camera"), "How the file stores rotations: w first, w "
+               "last, or relative to each view's camera.", default="auto", rare=True),
+        option("order", ("auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"),
+               "Order of the rows; none: the Gaussians belong to no pixels.", default="auto", rare=True),
+        option("scene_scale", float, "Size of the Gaussians' world in units of the cameras'.", shown="estimated",
+               rare=True),
+        option("max_side", int, "Longest side of a view, pixels, where the Gaussians belong to no pixels; larger "
+               "photos are resized.", shown="1200", rare=True, min=16),
+        option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "
+               "left out."),
+        option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
     ),
-]
-BudgetOption = Annotated[
-    str | None,
-    typer.Option(help='Gaussians in the result, such as 40000 or "2%"; met exactly.', rich_help_panel=COUNT),
-]
-MaxBytesOption = Annotated[
-    str | None, typer.Option(help="Largest size of the result as a .ply, such as 5MB.", rich_help_panel=COUNT)
-]
-PresetOption = Annotated[
-    Preset | None,
-    typer.Option(help="At most as many Gaussians as this device draws fluidly.", rich_help_panel=COUNT),
-]
-MaxDropOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0, help="Fewest Gaussians within so many dB of the best that the scene reaches.", rich_help_panel=COUNT
+    panel(
+        COUNT,
+        option("k", str, "Gaussians per superpixel: finer with more.", shown="1", parser=parse_k, metavar="1-8"),
+        option("superpixels", str, "Superpixels per view: a number such as 3000, or a share of its pixels.",
+               shown="4.4%", parser=parse_superpixels, metavar="NUMBER|SHARE"),
+        option("budget", str, "Gaussians in the result: a number, a share such as 2% of the input, or a size such as "
+               "5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the scene "
+               "needs.", metavar="40000|2%|5MB|DEVICE|auto"),
+        option("quality", str, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that lose at "
+               "most so much against the best, such as -0.2dB.", metavar="30dB|-0.2dB"),
+        option("levels", int, "Levels of detail, each in a file of its own, with a quarter of the Gaussians of the "
+               "one before.", shown="1", rare=True, min=1, max=8),
+        option("max_k", int, "Most Gaussians per superpixel that can be decoded later: more take more space.",
+               shown="4, or 8 with a --budget", min=1, max=8),
     ),
-]
-TargetPsnrOption = Annotated[
-    float | None,
-    typer.Option(min=0.0, help="Fewest Gaussians that render the input images at so many dB.", rich_help_panel=COUNT),
-]
-LevelsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=8,
-        help="Levels of detail, each in a file of its own, with a quarter of the Gaussians of the one before.",
-        show_default="1",
-        rich_help_panel=COUNT,
+    panel(
+        MERGING,
+        option("segmentation", ("rdseg", "bass", "bass-st", "slic", "grid"), "Superpixel method.", shown="rdseg",
+               rare=True),
+        option("robust", bool, "Choose among merges by comparing them with the photos.", "--robust/--no-robust",
+               shown="unless --fit full or a draft", rare=True),
+        option("match", ("overlap", "aabb", "none"), "How Gaussians of different views are matched and merged.",
+               shown="overlap, none for a draft", rare=True),
+        option("geometry", ("analytic", "decoded"), "What is matched where networks are loaded: moments, or the "
+               "output of the K = 1 head.", shown="analytic", rare=True),
+        option("unseen", ("drop", "keep"), "Gaussians that no view sees, where they are not one per pixel: drop (the "
+               "default), or keep, merged.", rare=True),
+        option("method", (
+            "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "paper", "voxel", "opacity", "contribution",
+            "random", "blocks", "greedy", "splat-transform",
+        ), "gsmerge, or a baseline to compare it with.", shown="gsmerge", rare=True),
+        option("checkpoint", str, "Trained networks that correct the analytic stages: a file, shipped, none, or auto: "
+               "the shipped ones where they improve the result.", shown="auto", rare=True, metavar="FILE|NAME"),
+        option("require_checkpoint", bool, "A checkpoint that cannot be used is an error instead of a note.",
+               "--require-checkpoint", rare=True),
     ),
-]
-FitStepsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1, help="Steps of the full fit: more takes longer.", show_default="by effort", rich_help_panel=MERGING
+    panel(
+        FITTING,
+        option("fit", ("full", "color", "none"), "What is fitted to the photos.", shown="full"),
+        option("effort", ("draft", "fast", "default", "best"), "How much work goes into superpixels and fit.",
+               shown="default"),
+        option("device", ("cpu", "cuda", "auto"), "Where the full fit runs; cuda needs gsmerge[cuda]. auto: a GPU "
+               "where there is one.", shown="cpu"),
+        option("fit_steps", int, "Steps of the full fit.", shown="by effort", rare=True, min=1),
+        option("time_budget", float, "Seconds that the full fit may take.", rare=True, min=0.0),
     ),
-]
-TimeBudgetOption = Annotated[
-    float | None, typer.Option(min=0.0, help="Seconds that the full fit may take.", rich_help_panel=MERGING)
-]
-DeviceOption = Annotated[
-    Device | None,
-    typer.Option(
-        help="Where the full fit runs; cuda needs gsmerge[cuda]. auto: a GPU where there is one.",
-        show_default="cpu",
-        rich_help_panel=MERGING,
+    panel(
+        MEASURING,
+        option("lpips", ("both", "vgg", "alex", "none"), "Networks of the perceptual distance; none is much faster.",
+               shown="both, where installed"),
+        option("lpips_views", int, "Measure LPIPS on at most so many views of each split.", shown="all", min=1),
     ),
-]
-RobustOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--robust/--no-robust",
-        help="Choose among merges by what the photos say.",
-        show_default="unless --fit full or a draft",
-        rich_help_panel=MERGING,
+    panel(
+        OUTPUT,
+        option("output", Path, "", "--output", "-o"),
+        switch("overwrite", "Replace the output if it exists."),
+        option("report", Path, "Write the JSON report to this file."),
+        switch("dry_run", "Print what would be done; write nothing."),
+        switch("json", "Print JSON on stdout."),
     ),
-]
-MatchOption = Annotated[
-    Match | None,
-    typer.Option(help="Merging across views.", show_default="overlap, none for a draft", rich_help_panel=MERGING),
-]
-FitOption = Annotated[
-    Fit | None, typer.Option(help="What to fit to the photos.", show_default="full", rich_help_panel=MERGING)
-]
-MethodOption = Annotated[
-    Method | None,
-    typer.Option(
-        help="What makes the result: gsmerge, or another method to compare it with.",
-        show_default="gsmerge",
-        rich_help_panel=MERGING,
+    panel(
+        GENERAL,
+        option("seed", int, "Seed of all random numbers.", shown="0", rare=True, min=0),
+        option("threads", int, "Threads; the result does not depend on their number.", shown="all processors",
+               rare=True, min=1),
+        switch("quiet", "Print errors only.", "-q", rare=True),
+        switch("debug", "Print tracebacks of errors.", rare=True),
     ),
-]
-UnseenOption = Annotated[
-    Unseen | None,
-    typer.Option(
-        help="Gaussians that no view sees, where they are not one per pixel: drop (the default), or keep, merged.",
-        rich_help_panel=MERGING,
-    ),
-]
-OutputOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--output",
-        "-o",
-        help="The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.",
-        show_default="SCENE.compact.ply",
-        rich_help_panel=OUTPUT,
-    ),
-]
-SeedOption = Annotated[
-    int | None, typer.Option(min=0, help="Seed of everything random.", show_default="0", rich_help_panel=OUTPUT)
-]
-ReportOption = Annotated[Path | None, typer.Option(help="Write the JSON report to this file.", rich_help_panel=OUTPUT)]
-DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Print what would be done; write nothing.", rich_help_panel=OUTPUT)
-]
-ThreadsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1, help="Threads. The result is the same for any.", show_default="all processors", rich_help_panel=OUTPUT
-    ),
-]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the output if it exists.", rich_help_panel=OUTPUT)
-]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Errors only.", rich_help_panel=OUTPUT)]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.", rich_help_panel=OUTPUT)]
-DebugOption = Annotated[
-    bool,
-    typer.Option("--debug", help="Tracebacks for errors.", callback=set_debug, is_eager=True, rich_help_panel=OUTPUT),
-]
+    panel("Options", switch("help_all", "Show all options and exit.", is_eager=True, callback=_show_all,
+                            expose_value=False)),
+)  # fmt: skip
+OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}
+
+
+def output(help: str, shown: str | None = None, default: Any = None) -> Parameter:
+    """``-o/--output``: the file or folder that a command writes its result to; ``default`` may be REQUIRED."""
+    return changed("output", default, help=help, show_default=shown or default is not REQUIRED)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
+    from gsmerge.budget import BudgetOptions
     from gsmerge.io import SceneFiles
 
 
@@ -19,8 +20,8 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def check_format(output: Path, max_bytes: str | None = None) -> None:
-    """Refuse an output whose name asks for no format, or a file size for one whose size is not known beforehand.
+def check_format(output: Path, budget: BudgetOptions | None = None) -> None:
+    """Refuse an output whose name says no known format, or a budget in bytes for a format of unknown size.
 
     Raises:
         UsageError: In either case.
@@ -28,8 +29,8 @@ def check_format(output: Path, max_bytes: str | None = None) -> None:
     from gsmerge.io import output_format
 
     ending = output_format(output)
-    if max_bytes is not None and ending != ".ply":
-        raise UsageError(f"--max-bytes: expected an output as .ply, got {ending}; give a --budget")
+    if budget is not None and budget.in_bytes and ending != ".ply":
+        raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
 def check_picture(output: Path) -> None:
@@ -42,23 +43,37 @@ def check_picture(output: Path) -> None:
         raise UsageError(f"{output}: expected a name that ends in .png")
 
 
-def check_output(output: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
-    """Refuse an output file that is one of the inputs, that exists, or whose folder does not.
+def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
+    """Refuse an output file that is one of the inputs, that exists, whose folder does not, or that is named twice.
 
     Args:
-        output: The file to write.
+        outputs: The files to write; None: not asked for.
         inputs: Files that are read, and folders of photos: no photo is replaced.
-        overwrite: Whether the file may exist.
+        overwrite: Whether the files may exist.
 
     Raises:
-        UsageError: If the output is an input, or exists and ``overwrite`` is False.
-        SceneError: If the output cannot be written.
+        UsageError: If an output is an input or another output, or exists and ``overwrite`` is False.
+        SceneError: If an output cannot be written.
     """
+    from gsmerge.io.cameras.read import find_cameras
+
+    given = [path for path in inputs if path is not None]
+    inside = [cameras for path in given if path.is_dir() and (cameras := find_cameras(path)) is not None]
+    known, seen = {os.path.realpath(path) for path in (*given, *inside)}, set[str]()
+    for output in outputs:
+        if output is None:
+            continue
+        _check_output(output, known, overwrite=overwrite)
+        if os.path.realpath(output) in seen:
+            raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
+        seen.add(os.path.realpath(output))
+
+
+def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
-    refused = (str(target), str(target.parent if _is_photo(target) else target))
-    if any(os.path.realpath(path) in refused for path in inputs):
+    if not inputs.isdisjoint((str(target), str(target.parent if _is_photo(target) else target))):
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
@@ -73,63 +88,52 @@ def _is_photo(path: Path) -> bool:
 
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
-    """What is read: Gaussians, cameras, photos."""
+    """Gaussians, cameras and photos that are read."""
     return tuple(path for path in (files.ply, files.cameras, files.images) if path is not None)
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
-    """:func:`check_output` for several files, of which no two may be the same; None: not asked for.
+def checkpoint_files(checkpoint: str | None) -> tuple[Path, ...]:
+    """The file that ``--checkpoint`` names; none where it is one of the package's own names."""
+    from gsmerge.options import CHECKPOINTS
 
-    Raises:
-        UsageError: If two are the same, or as :func:`check_output`.
-        SceneError: As :func:`check_output`.
-    """
-    from gsmerge.io.cameras.read import find_cameras
+    return () if checkpoint is None or checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
-    given = [path for path in inputs if path is not None]
-    inside = [found for path in given if path.is_dir() and (found := find_cameras(path)) is not None]
-    known, seen = (*given, *inside), set[str]()
-    for output in outputs:
-        if output is None:
-            continue
-        check_output(output, known, overwrite=overwrite)
-        if os.path.realpath(output) in seen:
-            raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
-        seen.add(os.path.realpath(output))
+
+def write_text(path: Path, text: str, *, overwrite: bool) -> None:
+    """Write a text file, atomically."""
+    from gsmerge.io import atomic_output
+
+    with atomic_output(path, overwrite=overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Refuse an output folder that holds files, unless ``overwrite``, or the photos, or that cannot be written.
 
-    It is made with the first file that goes into it, so that a run that fails before leaves none.
-
-    Args:
-        folder: The folder to write to.
-        inputs: Files and folders that are read.
-        overwrite: Whether there may be files in it.
+    The folder is made with the first file in it, so that a run that fails before leaves none.
 
     Raises:
         UsageError: If the folder is one of the inputs, or holds files and ``overwrite`` is False.
         SceneError: If it cannot be made or written, or is a file.
     """
     try:
-        there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-        if not there.is_dir():
-            problem = f"expected a folder to write pictures to, found the file {there}"
+        nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+        if not nearest.is_dir():
+            problem = f"expected a folder to write pictures to, found the file {nearest}"
             raise SceneError(folder, problem, "name another with --output")
-        occupied = there == folder and next(folder.iterdir(), None) is not None
+        occupied = nearest == folder and next(folder.iterdir(), None) is not None
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})", "name another with --output") from error
     if any(os.path.realpath(folder) == os.path.realpath(path) for path in inputs):
         raise UsageError(f"{folder}: expected an output other than the input; name another folder with --output")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise SceneError(folder, f"cannot be written: no permission for {there}", "name another with --output")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise SceneError(folder, f"cannot be written: no permission for {nearest}", "name another with --output")
     if occupied and not overwrite:
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")
 
 
 def source_of(ply: Path) -> Path | None:
-    """The scene that ``compact`` made a file of, if it is still beside it: ``scene.ply`` of ``scene.compact.ply``."""
+    """The scene that a file was compacted from, if it is beside it: ``scene.ply`` for ``scene.compact.ply``."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?\.ply", ply.name)
     source = None if match is None else ply.with_name(f"{match[1]}.ply")
     return source if source is not None and source.is_file() else None

@@ -1,14 +1,14 @@
-"""Writing pictures, as all outputs are written, and saying which."""
+"""Names of pictures, writing them, and saying which were written."""
 
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.cli.console import say
+from gsmerge.cli.console import print_document, say
+from gsmerge.cli.options import Args
 from gsmerge.errors import SceneError
 
 if TYPE_CHECKING:
@@ -65,33 +65,20 @@ def write_picture(path: Path, picture: Picture, *, overwrite: bool) -> None:
         temporary.write_bytes(data)
 
 
-def tell_pictures(
-    output: Path,
-    pictures: Sequence[Path],
-    facts: Mapping[str, Any],
-    line: str,
-    *,
-    dry_run: bool,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def report_pictures(args: Args, pictures: Sequence[Path], facts: Mapping[str, Any], line: str) -> None:
     """Say which pictures were written, or would be: as JSON on stdout, or as a line on stderr.
 
     Args:
-        output: What the user asked to be written.
+        args: Of the command; ``output`` is the picture or their folder.
         pictures: The pictures.
-        facts: What else the JSON document says.
-        line: What they are, in a few words.
-        dry_run: Nothing was written.
-        as_json: JSON instead of the line.
-        quiet: No line.
+        facts: Further entries of the JSON document.
+        line: What the pictures are, in a few words.
     """
-    from gsmerge.report import document_head, to_json
+    from gsmerge.report import document_head
 
-    if as_json:
-        head = {**document_head(), "dry_run": dry_run, "output": str(output)}
-        sys.stdout.write(to_json({**head, "pictures": [str(path) for path in pictures], **facts}))
-    elif dry_run:
-        print(f"would write {output}: {line}")
+    if args.json or args.dry_run:
+        head = {**document_head(), "dry_run": args.dry_run, "output": str(args.output)}
+        document = {**head, "pictures": [str(path) for path in pictures], **facts}
+        print_document(document, f"would write {args.output}: {line}", as_json=args.json)
     else:
-        say(f"{output}: {line}", quiet=quiet)
+        say(f"{args.output}: {line}", quiet=args.quiet)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from gsmerge.cli import options as opt
-from gsmerge.cli.console import announce_compilation, one_line, say, say_notes
-from gsmerge.cli.held_out import file_names, held_out_views, networks
-from gsmerge.cli.paths import check_outputs, input_files
-from gsmerge.cli.settings import reading_of
+from gsmerge.cli.console import announce_compilation, print_document, say_notes
+from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks
+from gsmerge.cli.paths import check_outputs, input_files, write_text
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -32,108 +30,83 @@ def parse_sizes(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in parts)
 
 
-def report(
-    before: Annotated[Path, typer.Argument(metavar="BEFORE", help="The scene: a .ply or its folder.")],
-    after: Annotated[list[Path], typer.Argument(metavar="AFTER...", help="Compact .ply files of that scene.")],
-    output: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--output", "-o", help="Write it here: .md, .html or .json; may be repeated.", rich_help_panel=opt.OUTPUT
-        ),
-    ] = None,
-    cameras: opt.CamerasOption = None,
-    images: opt.ImagesOption = None,
-    opacity: opt.OpacityOption = opt.Opacity.auto,
-    exporter: opt.DialectOption = "auto",
-    quats: opt.QuatsOption = opt.Quats.auto,
-    order: opt.OrderOption = opt.Order.auto,
-    scene_scale: opt.SceneScaleOption = None,
-    max_side: opt.MaxSideOption = None,
-    targets: opt.TargetsOption = None,
-    target_images: opt.TargetImagesOption = None,
-    sizes: Annotated[
-        str | None,
-        typer.Option(
-            parser=parse_sizes,
-            metavar="PIXELS,...",
-            help="Longer sides of the pictures whose render time is measured.",
-            show_default="the views' own, and twice that",
-            rich_help_panel=opt.MEASURING,
-        ),
-    ] = None,
-    merge_seconds: Annotated[
-        list[float] | None,
-        typer.Option(
-            min=0.0, help="What making each AFTER took; may be repeated, in their order.", rich_help_panel=opt.MEASURING
-        ),
-    ] = None,
-    compact_report: Annotated[
-        list[Path] | None,
-        typer.Option(help="The --report of the compact run of each AFTER, instead.", rich_help_panel=opt.MEASURING),
-    ] = None,
-    lpips: opt.LpipsOption = None,
-    threads: opt.ThreadsOption = None,
-    overwrite: opt.OverwriteOption = False,
-    json: opt.JsonOption = False,
-    quiet: opt.QuietOption = False,
-    debug: opt.DebugOption = False,
-) -> None:
+@opt.command(
+    opt.argument("before", Path, "BEFORE", "The scene: a .ply or its folder."),
+    opt.argument("after", list[Path], "AFTER...", "Compact .ply files of that scene."),
+    f"{opt.READING} {opt.TARGETS}",
+    *opt.panel(
+        opt.MEASURING,
+        opt.option("sizes", str, "Longer sides of the pictures whose render time is measured.", parser=parse_sizes,
+                   metavar="PIXELS,...", shown="the views' own, and twice that"),
+        opt.option("merge_seconds", list[float], "Seconds that making each AFTER took; may be repeated, in their "
+                   "order.", min=0.0),
+        opt.option("compact_report", list[Path], "The --report of the compact run of each AFTER, instead."),
+    ),
+    "lpips",
+    *opt.panel(
+        opt.OUTPUT,
+        opt.option("output", list[Path], "The file to write: .md, .html or .json; may be repeated.", "--output", "-o"),
+    ),
+    "overwrite threads",
+)  # fmt: skip
+def report(args: opt.Args) -> None:
     """Compare a scene with its compact versions: bytes, render time, overdraw, quality, break-even frames."""
-    hints = reading_of(exporter, quats.value, order.value, scene_scale, max_side)
-    from gsmerge.io import find_scene_files, load_files, read_ply
+    from gsmerge.io import read_ply
     from gsmerge.measure.comparison import compare
-    from gsmerge.measure.comparison_page import comparison_document
+    from gsmerge.measure.comparison_page import comparison_document, comparison_markdown
     from gsmerge.measure.evaluate import INPUT, EvaluateOptions
     from gsmerge.runtime.run_log import RunLog
     from gsmerge.stages.place_cameras import add_views
     from gsmerge.types import UnalignedScene
 
-    files = find_scene_files(before, cameras=cameras, images=images)
-    for path in output or []:
+    files, after, outputs = args.files(args.before), args.after, args.output or []
+    for path in outputs:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
-    inputs = (*input_files(files), *after, *(compact_report or []), targets, target_images)
-    check_outputs(output or [], inputs, overwrite=overwrite)
-    seconds = _merge_seconds(after, merge_seconds, compact_report)
-    nets, missing = networks(lpips)
-    load = load_files(files, opacity=opacity.value, hints=hints)
-    scene, held_out, adapted = held_out_views(load, targets, target_images, None)
+    inputs = (*input_files(files), *after, *(args.compact_report or []), args.targets, args.target_images)
+    check_outputs(outputs, inputs, overwrite=args.overwrite)
+    seconds = _merge_seconds(after, args.merge_seconds, args.compact_report)
+    nets, missing = lpips_networks(args.lpips)
+    load = args.load(files)
+    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
     log = RunLog()
     if isinstance(scene, UnalignedScene):
         scene = add_views(scene, log)
     plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
     notes = [*load.notes, *adapted, *log.notes, *missing]
-    say_notes(notes, quiet=quiet or json)
+    say_notes(notes, quiet=args.silent)
     storage = {INPUT: _storage(load.ply), **{name: _storage(ply.info) for name, ply in plys.items()}}
     gaussians = {name: ply.gaussians for name, ply in plys.items()}
-    with announce_compilation(quiet=quiet or json):
-        found = compare(
-            scene, gaussians, storage, held_out, EvaluateOptions(nets, threads=threads),
-            long_sides=sizes, merge_seconds=dict(zip(plys, seconds, strict=False)),  # type: ignore[arg-type]
+    with announce_compilation(quiet=args.silent):
+        comparison = compare(
+            scene, gaussians, storage, held_out, EvaluateOptions(nets, threads=args.threads),
+            long_sides=args.sizes, merge_seconds=dict(zip(plys, seconds, strict=False)),
         )  # fmt: skip
-    document = comparison_document(found, notes)
-    for path in output or []:
-        _write(path, document, scene, gaussians, overwrite=overwrite)
-    _tell(document, found.quality.notes, written=bool(output), as_json=json, quiet=quiet)
+    document = comparison_document(comparison, notes)
+    for path in outputs:
+        _write(path, document, scene, gaussians, overwrite=args.overwrite)
+    lines = comparison_markdown(document).rstrip().split("\n")
+    print_document(document, lines, as_json=args.json, quiet=args.quiet or bool(outputs))
+    say_notes(comparison.quality.notes, quiet=args.silent or not outputs)
 
 
 def _merge_seconds(
-    after: Sequence[Path], told: Sequence[float] | None, reports: Sequence[Path] | None
+    after: Sequence[Path], seconds: Sequence[float] | None, reports: Sequence[Path] | None
 ) -> Sequence[float]:
-    """What making each result took; empty where nobody said."""
-    if told and reports:
+    """Seconds that making each result took; empty where not given."""
+    if seconds and reports:
         raise UsageError("--merge-seconds and --compact-report: expected one of them")
-    given = told or reports or []
+    given = seconds or reports or []
     if given and len(given) != len(after):
         raise UsageError(f"expected the merge time of each of {len(after)} AFTER, got {len(given)}")
-    return [_seconds_of(path) for path in reports] if reports else list(told or [])
+    return [_seconds_of(path) for path in reports] if reports else list(seconds or [])
 
 
 def _seconds_of(path: Path) -> float:
     from gsmerge.io import read_json
 
-    found = read_json(path)
-    seconds = found.get("total_seconds") if isinstance(found, dict) else None
+    document = read_json(path)
+    seconds = document.get("total_seconds") if isinstance(document, dict) else None
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < 1e9:
         raise SceneError(path, "expected the report of a compact run (total_seconds), found none")
     return float(seconds)
@@ -154,7 +127,6 @@ def _write(
     overwrite: bool,
 ) -> None:
     from gsmerge.cli.pictures import png_bytes
-    from gsmerge.io import atomic_output
     from gsmerge.measure.comparison_page import comparison_html, comparison_markdown
     from gsmerge.measure.evaluate import near_plane
     from gsmerge.measure.preview import contact_sheet
@@ -166,18 +138,4 @@ def _write(
         text = comparison_html(document, png_bytes(sheet))
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)
-    with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="replace")
-
-
-def _tell(document: Mapping[str, Any], notes: Sequence[str], *, written: bool, as_json: bool, quiet: bool) -> None:
-    from gsmerge.measure.comparison_page import comparison_markdown
-    from gsmerge.report import to_json
-
-    if as_json:
-        sys.stdout.write(to_json(document))
-    elif not quiet and not written:
-        print("\n".join(map(one_line, comparison_markdown(document).rstrip().split("\n"))))
-    if not (quiet or as_json):
-        for note in notes if written else ():
-            say(f"note: {note}")
+    write_text(path, text, overwrite=overwrite)

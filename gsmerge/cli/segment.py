@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import check_folder, input_files
-from gsmerge.cli.pictures import picture_stems, tell_pictures, write_picture
-from gsmerge.cli.settings import reading_of, told_as_usage
+from gsmerge.cli.pictures import picture_stems, report_pictures, write_picture
 
 if TYPE_CHECKING:
     from gsmerge.stages.segment import SegmentOptions
@@ -21,54 +18,36 @@ if TYPE_CHECKING:
 KINDS = ("borders", "means", "saliency")
 
 
-def segment(
-    scene: opt.SceneArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for the pictures.", rich_help_panel=opt.OUTPUT)
-    ],
-    superpixels: opt.SuperpixelsOption = None,
-    density: opt.DensityOption = None,
-    segmentation: opt.SegmentationOption = None,
-    effort: opt.EffortOption = None,
-    cameras: opt.CamerasOption = None,
-    images: opt.ImagesOption = None,
-    opacity: opt.OpacityOption = opt.Opacity.auto,
-    exporter: opt.DialectOption = "auto",
-    quats: opt.QuatsOption = opt.Quats.auto,
-    order: opt.OrderOption = opt.Order.auto,
-    scene_scale: opt.SceneScaleOption = None,
-    threads: opt.ThreadsOption = None,
-    overwrite: opt.OverwriteOption = False,
-    json: opt.JsonOption = False,
-    dry_run: opt.DryRunOption = False,
-    quiet: opt.QuietOption = False,
-    debug: opt.DebugOption = False,
-) -> None:
+@opt.command(
+    opt.SCENE,
+    "cameras images opacity exporter quats order scene_scale superpixels",
+    opt.changed("segmentation", hidden=False),
+    "effort",
+    opt.output("Folder for the pictures.", default=opt.REQUIRED),
+    "overwrite dry_run threads",
+)
+def segment(args: opt.Args) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
-    hints = reading_of(exporter, quats.value, order.value, scene_scale)
-    from gsmerge.io import find_scene_files, load_files
     from gsmerge.runtime.threads import use_threads
     from gsmerge.stages.segment import SegmentOptions, count_for
 
-    chosen: dict[str, Any] = {"superpixels": superpixels, "density": density}
-    chosen |= {"segmentation": segmentation and segmentation.value, "effort": effort and effort.value}
-    with told_as_usage():
-        options = SegmentOptions(**{name: value for name, value in chosen.items() if value is not None})
-    files = find_scene_files(scene, cameras=cameras, images=images)
-    check_folder(output, input_files(files), overwrite=overwrite)
-    loaded = load_files(files, opacity=opacity.value, hints=hints)
-    pixel_scene = loaded.pixel_scene()
-    per_view = count_for(options, pixel_scene.cameras.height, pixel_scene.cameras.width)
-    say_notes(loaded.notes, quiet=quiet or json)
-    stems = picture_stems(pixel_scene.names)
-    pictures = [output / f"{stem}.{kind}.png" for stem in stems for kind in KINDS]
+    with opt.usage_errors():
+        options = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))
+    files = args.files(args.scene)
+    check_folder(args.output, input_files(files), overwrite=args.overwrite)
+    load = args.load(files)
+    scene = load.pixel_scene()
+    per_view = count_for(options, scene.cameras.height, scene.cameras.width)
+    say_notes(load.notes, quiet=args.silent)
+    stems = picture_stems(scene.names)
+    pictures = [args.output / f"{stem}.{kind}.png" for stem in stems for kind in KINDS]
     counts: Sequence[int] = [per_view] * len(stems)
-    if not dry_run:
-        with use_threads(threads), announce_compilation(quiet=quiet or json):
-            counts = _write_overlays(pixel_scene, options, pictures, overwrite=overwrite)
-    facts = {"superpixels": counts, "options": vars(options), "notes": loaded.notes}
+    if not args.dry_run:
+        with use_threads(args.threads), announce_compilation(quiet=args.silent):
+            counts = _write_overlays(scene, options, pictures, overwrite=args.overwrite)
+    facts = {"superpixels": counts, "options": vars(options), "notes": load.notes}
     line = f"{len(pictures)} pictures, {min(counts)} to {max(counts)} superpixels per view"
-    tell_pictures(output, pictures, facts, line, dry_run=dry_run, as_json=json, quiet=quiet)
+    report_pictures(args, pictures, facts, line)
 
 
 def _write_overlays(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from gsmerge.budget import parse_budget
+from gsmerge.budget import AUTO, BudgetOptions, exact_count
 from gsmerge.encoded.divide import pick_children
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
@@ -35,40 +35,43 @@ class DecodePlan:
     notes: tuple[str, ...] = ()
 
 
-def plan_decode(encoded: Encoded, *, k: int | str | None = None, budget: int | str | None = None) -> DecodePlan:
+def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | None = None) -> DecodePlan:
     """How many Gaussians each group becomes, see :func:`decode_scene`.
 
     Raises:
         UsageError: As :func:`decode_scene`.
     """
     s = encoded.settings
-    if budget is not None:
-        if k is not None:
-            raise UsageError("expected one of k and budget, got both")
-        return _distribute(encoded, _group_budget(encoded, budget))
-    if s.target_count is not None and (k is None or k == s.k == "auto"):
+    if budget is not None and k is not None:
+        raise UsageError("expected one of k and budget, got both")
+    auto = AUTO in (budget, s.k) and k is None and budget in (None, AUTO)
+    if s.target_count is not None and k is None and (budget is None or (auto and s.k == AUTO)):
         return _distribute(encoded, s.target_count)
-    k = s.k if k is None else k
-    if k == "auto":
+    if auto:
         plan = _distribute(encoded, max(len(encoded), s.knee_count))
         if s.knee_count >= len(encoded):
             return plan
-        note = f"k auto would take {s.knee_count} Gaussians, fewer than there are groups; encoded with k auto it can"
+        note = f"budget auto would take {s.knee_count} Gaussians, fewer than there are groups; encode with budget auto"
         return replace(plan, notes=(note,))
-    if not isinstance(k, int) or not 1 <= k <= s.max_k:
+    if budget is not None:
+        return _distribute(encoded, _group_budget(encoded, budget))
+    number = s.k if k is None else k
+    if not isinstance(number, int) or not 1 <= number <= s.max_k:
         more = "" if s.max_k == MAX_CHILDREN else ", as encoded (more with a larger max k)"
-        raise UsageError(f'k: expected 1 to {s.max_k} or "auto"{more}, got {k!r}')
+        raise UsageError(f"k: expected 1 to {s.max_k}{more}, got {number!r}")
     if s.num_slots is not None:
-        return replace(_distribute(encoded, s.num_slots * k), min_contribution=s.min_contribution)
-    return DecodePlan(np.full(len(encoded), k), s.min_contribution)
+        return replace(_distribute(encoded, s.num_slots * number), min_contribution=s.min_contribution)
+    return DecodePlan(np.full(len(encoded), number), s.min_contribution)
 
 
 def _group_budget(encoded: Encoded, budget: int | str) -> int:
     """Gaussians that a budget leaves for the groups."""
     try:
-        count = parse_budget(budget, encoded.settings.num_input)
+        count = exact_count(BudgetOptions(budget), encoded.settings.num_input, encoded.sh_degree)
     except ValueError as error:
         raise UsageError(str(error)) from error
+    if count is None:
+        raise UsageError(f"budget: expected a number, a share or a size, got {budget}; encode with that budget")
     min_count = len(encoded) + encoded.num_kept
     if count < min_count:
         raise UsageError(
@@ -91,7 +94,7 @@ def _distribute(encoded: Encoded, total: int) -> DecodePlan:
 def decode_scene(
     encoded: Encoded,
     *,
-    k: int | str | None = None,
+    k: int | None = None,
     budget: int | str | None = None,
     threads: int | None = None,
 ) -> Gaussians:
@@ -99,9 +102,9 @@ def decode_scene(
 
     Args:
         encoded: From :func:`encode_scene` or :func:`load_encoded`.
-        k: Gaussians of each group, 1 to what was encoded, or ``"auto"``: as many in all as ``compact`` would take
-            without photos, where they help most. None: as it was encoded.
-        budget: Gaussians in all instead: a number from one for each group on, or a share of the input as "2%".
+        k: Gaussians of each group, 1 to what was encoded. None: as it was encoded.
+        budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size as
+            "5MB", or ``"auto"``: as many as ``compact`` would take without photos, where they help most.
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:

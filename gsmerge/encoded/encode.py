@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from gsmerge import __version__
+from gsmerge.budget import AUTO
 from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
@@ -37,14 +38,14 @@ def encode_scene(
     """All of :func:`gsmerge.compact` up to decoding, stored: superpixels, merging, matching, networks; never a fit.
 
     ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", **settings)``, bit for bit; so is
-    any other ``k`` at decoding, unless a budget, a preset, ``k="auto"`` or the size of the input limits the number of
+    any other ``k`` at decoding, unless a budget or the size of the input limits the number of
     superpixels of either, or Gaussians that no view sees are kept: these are merged for one K.
 
     Args:
         scene: As of :func:`gsmerge.compact`.
         options: Settings of all stages; those of the fit do not matter. None: the defaults.
         max_k: Most Gaussians of a group that can be decoded, 1 to 8: more take more space. None: 4, or 8 where ``k``
-            is larger or a number of Gaussians is asked for (budgets, presets, ``k="auto"``, unaligned scenes).
+            is larger or a number of Gaussians is asked for (budgets, unaligned scenes).
         progress: As of :func:`gsmerge.compact`.
         **settings: Single settings by name, on top of ``options``.
 
@@ -54,8 +55,8 @@ def encode_scene(
     options = _without_fit((options or CompactOptions()).with_settings(settings), settings)
     if max_k is not None and not 1 <= max_k <= MAX_CHILDREN:
         raise UsageError(f"max k: expected 1 to {MAX_CHILDREN}, got {max_k}")
-    if max_k is not None and max_k < options.decode.count:
-        raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {max_k}")
+    if max_k is not None and max_k < options.decode.k:
+        raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
         prepared = prepare(scene, options, log)
@@ -84,16 +85,16 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
     features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
     options, scene = prepared.options, prepared.scene
     count = merged_count(merged, options.decode, grows=options.fit.grows)
-    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.count <= DEFAULT_MAX_K else MAX_CHILDREN)
+    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.k <= DEFAULT_MAX_K else MAX_CHILDREN)
     prunes = scene.images is not None and options.fit.effort != "draft"
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
-        k=options.decode.k,
+        k=AUTO if options.budget.auto else options.decode.k,
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
         min_contribution=options.fit.min_contribution if prunes else 0.0,
         target_count=count if exact else None,
-        num_slots=None if exact or count is None else count // options.decode.count,
+        num_slots=None if exact or count is None else count // options.decode.k,
         knee_count=knee_count(prepared),
     )
     heads = None

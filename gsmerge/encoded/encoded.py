@@ -57,7 +57,7 @@ class StoredSettings:
 
     Args:
         num_input: Gaussians of the scene.
-        k: Gaussians of each group by default, or ``"auto"``: ``target_count`` of them, found for the scene.
+        k: Gaussians of each group by default, or ``"auto"`` where the budget was: ``target_count`` in all.
         max_k: Most children of a group that are stored.
         min_opacity: Gaussians below this opacity are left out.
         min_contribution: Gaussians that add less than this to every pixel of every view that they lie in are left out,
@@ -65,7 +65,7 @@ class StoredSettings:
         target_count: Gaussians that a budget asked for, without those that no view sees; None without one.
         num_slots: Of an unaligned scene, its groups and the empty superpixels whose Gaussians other groups get;
             None: K Gaussians for each group.
-        knee_count: Gaussians at the knee of the scene's own curve of distortion: ``--k auto`` without photos.
+        knee_count: Gaussians at the knee of the scene's own curve of distortion: ``--budget auto`` without photos.
     """
 
     num_input: int

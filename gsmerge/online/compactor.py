@@ -21,7 +21,7 @@ class Compactor:
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
-            :class:`gsmerge.online.options.OnlineOptions`: ``Compactor(density=0.03, max_k=2)``.
+            :class:`gsmerge.online.options.OnlineOptions`: ``Compactor(superpixels="3%", max_k=2)``.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
@@ -73,7 +73,7 @@ class Compactor:
     def decode(
         self,
         *,
-        k: int | str | None = None,
+        k: int | None = None,
         budget: int | str | None = None,
         progress: Progress | None = None,
         **fit: Any,

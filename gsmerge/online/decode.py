@@ -56,7 +56,7 @@ def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
 def decode_stored(
     stored: Encoded | OnlineState,
     *,
-    k: int | str | None = None,
+    k: int | None = None,
     budget: int | str | None = None,
     options: FitOptions | None = None,
     seed: int = 0,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
+from gsmerge.budget import AUTO
 from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians
@@ -176,8 +177,8 @@ def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, option
         raise UsageError(
             "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
         )
-    if options.decode.count > max_k:
-        raise UsageError(f"max k: expected at least {options.decode.count}, which is k, got {max_k}")
+    if options.decode.k > max_k:
+        raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
         expected = state.sh_degree
@@ -257,7 +258,7 @@ def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> Onlin
     options, cameras = prepared.options, prepared.scene.cameras
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
-        k=options.decode.k,
+        k=AUTO if options.budget.auto else options.decode.k,
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
         min_contribution=options.fit.min_contribution if prepared.given.images is not None else 0.0,
@@ -279,11 +280,12 @@ def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> Onlin
 def _grown_state(state: OnlineState, groups: GroupSet, prepared: PreparedScene, new_cameras: Cameras) -> OnlineState:
     """The state with other groups, and with the views and the unseen Gaussians of a further batch."""
     kept = [gaussians for gaussians in (state.kept, prepared.hidden) if gaussians is not None]
-    num_input = state.settings.num_input + prepared.given.num_gaussians
+    num_input, options = state.settings.num_input + prepared.given.num_gaussians, prepared.options
+    k = AUTO if options.budget.auto else options.decode.k
     return replace(
         state,
         groups=groups,
         kept=Gaussians.concat(kept) if kept else None,
         cameras=concat_cameras(state.cameras, new_cameras),
-        settings=replace(state.settings, num_input=num_input, k=prepared.options.decode.k),
+        settings=replace(state.settings, num_input=num_input, k=k),
     )

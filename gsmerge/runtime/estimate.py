@@ -17,7 +17,7 @@ IMPORT_SECONDS = 1.5
 COST_READ = 0.7
 COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
 COST_MERGE = 0.5
-COST_NETWORKS = 2.8  # at the default density
+COST_NETWORKS = 2.8  # at the default superpixels
 COST_SCORE = 0.07  # for each scored view: rendering from input and output
 COST_ROBUST = 1.6
 COST_COLOR_FIT = 0.9
@@ -160,7 +160,7 @@ def plan_document(
         photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
         fit_steps: Steps of the full fit.
-        default_count: Gaussians that density and K ask for.
+        default_count: Gaussians that superpixels and K ask for.
         budget: Gaussians that a budget, a file size or a preset asks for; None without any.
         notes: Of the reader.
         count: Gaussians of the file; None: one for each pixel of the grid.
@@ -179,7 +179,7 @@ def plan_document(
         "input": {**files, "num_gaussians": count or pixels, "num_views": views, "height": height, "width": width},
         "output": {"path": os.fspath(output_path), "num_gaussians_at_most": min(count or pixels, max_count)},
         "method": method,
-        "superpixels_per_view": per_view if budget is None and options["k"] != "auto" else None,
+        "superpixels_per_view": per_view if budget is None and options["budget"] != "auto" else None,
         "robust": is_robust(options, photos=photos),
         "fit": fit_of(options, photos=photos),
         "estimate": estimate_run(

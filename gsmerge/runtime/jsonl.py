@@ -104,7 +104,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
                 raise
             os.fsync(file.fileno())
     except OSError as error:
-        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --out") from error
+        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
 
 
 def _write(file: FileIO, line: bytes) -> None:

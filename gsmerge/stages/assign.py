@@ -99,13 +99,12 @@ def split_unseen(
     log.notes.append(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
     if num_unseen in (0, len(seen)):
         return scene, options, None
-    count = exact_count(options.target, len(seen), scene.gaussians.sh_degree)
-    rate = options.segment.density * options.decode.count if count is None else count / len(seen)
+    count = exact_count(options.budget, len(seen), scene.gaussians.sh_degree)
+    rate = options.segment.share * options.decode.k if count is None else count / len(seen)
     unseen = scene.gaussians[~seen & (scene.gaussians.opacities >= options.decode.min_opacity)]
     num_kept = min(len(unseen), int(rate * num_unseen))
     if count is not None:
-        target = replace(options.target, budget=max(1, count - num_kept), max_bytes=None)
-        options = replace(options, target=target)
+        options = replace(options, budget=replace(options.budget, budget=max(1, count - num_kept)))
     kept = merge_neighbors(unseen, scene, num_kept, options) if num_kept else None
     return replace(scene, gaussians=scene.gaussians[seen]), options, kept
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -25,26 +24,21 @@ class DecodeOptions:
     """How many Gaussians a Feature Gaussian becomes.
 
     Args:
-        k: Children of each group, 1 to 8; ``"auto"``: one, of groups that follow what the scene needs.
+        k: Children of each group, 1 to 8.
         min_opacity: Gaussians below this opacity are left out (paper section 4.3).
 
     Raises:
         ValueError: If K is not within 1 to 8 or the opacity not within 0 to 1.
     """
 
-    k: int | Literal["auto"] = 1
+    k: int = 1
     min_opacity: float = 1 / 255
 
     def __post_init__(self) -> None:
-        if self.k != "auto" and not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
-            raise ValueError(f'k: expected 1 to {MAX_CHILDREN} or "auto", got {self.k!r}')
+        if not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
+            raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, got {self.k!r}")
         if not 0 <= self.min_opacity <= 1:
             raise ValueError(f"min_opacity: expected 0 to 1, got {self.min_opacity}")
-
-    @property
-    def count(self) -> int:
-        """Children of each group as a number."""
-        return 1 if self.k == "auto" else self.k
 
 
 def decode(
@@ -75,7 +69,7 @@ def decode(
         ValueError: If ``counts`` has the wrong shape or a count below 1.
     """
     if counts is None:
-        counts = np.full(len(features), options.count)
+        counts = np.full(len(features), options.k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
@@ -102,7 +96,7 @@ def decode_merged(merged: MergedViews, options: DecodeOptions, rule: Rule, *, gr
 
 def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions, rule: Rule) -> Gaussians:
     """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
-    if count is None and options.count == 1 and merged.k1_gaussians is not None:
+    if count is None and options.k == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
     features, members = merged.features, merged.members
     children = None if count is None else split_counts(features, members, max(0, count - len(features)))
@@ -126,7 +120,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     seen = members.pixels[members.pixels >= 0]
     labels = groups.labels.reshape(-1).numpy()[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].numel()]
     num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
-    return min(segmentation.count, options.count * (len(merged.features) + len(groups) - num_filled))
+    return min(segmentation.count, options.k * (len(merged.features) + len(groups) - num_filled))
 
 
 def divide(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from gsmerge.budget import exact_count, most_allowed
+from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.stages.assign import seen_depths
 from gsmerge.stages.choose_merge import MIN_VIEWS, photos_choose
@@ -72,10 +72,10 @@ def count_limits(scene: PixelScene | UnalignedScene, options: CompactOptions) ->
 def default_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
     """Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
     if len(scene) == 0:
-        return max(1, int(options.segment.density * scene.num_gaussians)) * options.decode.count
+        return max(1, int(options.segment.share * scene.num_gaussians)) * options.decode.k
     per_view = superpixels_per_view(scene, options)
     total = per_view * scene.num_gaussians // scene.pixels_per_view
-    return max(len(scene), total if isinstance(scene, PixelScene) else per_view * len(scene)) * options.decode.count
+    return max(len(scene), total if isinstance(scene, PixelScene) else per_view * len(scene)) * options.decode.k
 
 
 def budget_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int | None:
@@ -95,19 +95,19 @@ def limited_count(default: int, max_count: int, exact: int | None) -> int | None
 def _counts(scene: PixelScene | UnalignedScene, options: CompactOptions) -> tuple[int, int, int | None]:
     """Default count, most that is allowed, and the count that a budget or a size asks for."""
     num_input, degree = scene.num_gaussians, scene.gaussians.sh_degree
-    max_count = most_allowed(options.target, num_input, degree)
+    max_count = max_allowed(options.budget, num_input, degree)
     if max_count < min(len(scene), num_input):
         raise UsageError(f"budget: expected at least {len(scene)}, one for each view, got {max_count}")
-    return default_count(scene, options), max_count, exact_count(options.target, num_input, degree)
+    return default_count(scene, options), max_count, exact_count(options.budget, num_input, degree)
 
 
 def superpixels_per_view(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
     """Superpixels of each view. Where there are fewer Gaussians than pixels, a share is taken of the Gaussians."""
     cameras = scene.cameras
     per_view = count_for(options.segment, cameras.height, cameras.width)
-    if isinstance(scene, PixelScene) or options.segment.superpixels is not None:
+    if isinstance(scene, PixelScene) or options.segment.per_view is not None:
         return per_view
-    return max(1, min(per_view, int(options.segment.density * len(scene.gaussians) / len(cameras))))
+    return max(1, min(per_view, int(options.segment.share * len(scene.gaussians) / len(cameras))))
 
 
 def segment_scene(prepared: PreparedScene, count: int | None) -> Segmentation:

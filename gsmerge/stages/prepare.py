@@ -187,7 +187,7 @@ def prepare(
     """
     if settings.method != "gsmerge":  # baselines set nothing aside and learn nothing
         settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
-    if scene.images is None and settings.target.searches:
+    if scene.images is None and settings.budget.quality is not None:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     with log.stage("prepare"):
         own, options = drop_repeats(scene, settings, log)
@@ -223,9 +223,8 @@ def drop_repeats(
     if len(views) == len(scene):
         return scene, options
     few = subset(scene, views)
-    count = exact_count(options.target, scene.num_gaussians, scene.gaussians.sh_degree)
+    count = exact_count(options.budget, scene.num_gaussians, scene.gaussians.sh_degree)
     if count is not None:
-        target = replace(options.target, budget=min(count, few.num_gaussians), max_bytes=None)
-        options = replace(options, target=target)
+        options = replace(options, budget=replace(options.budget, budget=min(count, few.num_gaussians)))
     log.notes.append(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
     return few, options

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.budget import parse_share
 from gsmerge.errors import UsageError
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels
@@ -33,14 +34,15 @@ BLOCK = 32  # side of the squares that the cutting starts from, pixels
 PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
 
+SHARE = "4.4%"  # superpixels per pixel by default
+
 
 @dataclass(frozen=True)
 class SegmentOptions:
     """How to cut views into superpixels.
 
     Args:
-        superpixels: Superpixels of each view; None to take ``density`` of its pixels.
-        density: Superpixels per pixel, in (0, 1].
+        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%".
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
@@ -50,18 +52,31 @@ class SegmentOptions:
         ValueError: If an option is out of range.
     """
 
-    superpixels: int | None = None
-    density: float = 0.044
+    superpixels: int | str = SHARE
     segmentation: str = "rdseg"
     effort: str = "default"
     compactness: float = 1e-5
 
     def __post_init__(self) -> None:
-        if self.superpixels is not None and self.superpixels < 1:
+        if self.per_view is not None and self.per_view < 1:
             raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
-        if not 0 < self.density <= 1:
-            raise ValueError(f"density: expected a number in (0, 1], got {self.density}")
+        if self.per_view is None:
+            try:
+                parse_share(str(self.superpixels))
+            except ValueError as error:
+                raise ValueError(f"superpixels: expected a number, or {str(error).partition(' ')[2]}") from None
         _check(self.segmentation, self.effort, self.compactness)
+
+    @property
+    def per_view(self) -> int | None:
+        """Superpixels of each view; None where a share of its pixels is asked for."""
+        text = str(self.superpixels)
+        return int(text) if text.removeprefix("-").isdecimal() else None
+
+    @property
+    def share(self) -> float:
+        """Superpixels per pixel; the default where a number of them is asked for."""
+        return parse_share(SHARE if self.per_view is not None else str(self.superpixels))
 
 
 def _check(segmentation: str, effort: str, compactness: float) -> None:
@@ -79,12 +94,12 @@ def count_for(options: SegmentOptions, height: int, width: int) -> int:
     Raises:
         UsageError: If there are more than pixels.
     """
-    if options.superpixels is not None:
-        if options.superpixels > height * width:
+    if options.per_view is not None:
+        if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"
-            raise UsageError(f"superpixels: expected at most {limit}, got {options.superpixels}")
-        return options.superpixels
-    return max(1, int(options.density * height * width))
+            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
+        return options.per_view
+    return max(1, int(options.share * height * width))
 
 
 def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -> Groups:

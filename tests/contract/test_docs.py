@@ -34,13 +34,22 @@ GENERATED = {
 }
 WRITTEN = [page for page in PAGES if page not in GENERATED]
 # options of tools that pages name beside our own
-OTHER_OPTIONS = {"--version", "--help", "--install-completion", "--only", "--no-deps", "--force-reinstall", "--check"}
+OTHER_OPTIONS = {
+    "--version",
+    "--help",
+    "--help-all",
+    "--install-completion",
+    "--only",
+    "--no-deps",
+    "--force-reinstall",
+    "--check",
+}
 
 
 def options(command: Any) -> set[str]:
     """Long names of a command's options."""
     names = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
-    return {name for name in names if name.startswith("--")} - {"--help"}
+    return {name for name in names if name.startswith("--")} - {"--help", "--help-all"}
 
 
 def read(page: str) -> str:
@@ -174,7 +183,7 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
 def test_defaults_in_help_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     in_help = dict(cli_defaults())
-    known = {"k", "density", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
+    known = {"k", "superpixels", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
     known |= {"levels", "device", "checkpoint", "geometry"}
     assert set(in_help) == known
     assert library["robust"] is None

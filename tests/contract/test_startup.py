@@ -10,6 +10,10 @@ from pathlib import Path
 import pytest
 
 HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage", "matplotlib")
+COMMANDS = (
+    "compact", "batch", "encode", "decode", "extend", "evaluate", "inspect", "segment", "render", "preview", "report",
+    "stress", "chart", "generate", "train",
+)  # fmt: skip
 
 
 def run_python(code: str) -> str:
@@ -24,19 +28,17 @@ def loaded_after(code: str) -> set[str]:
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        ["--help"],
-        ["--version"],
-        [],
-        *(
-            [name, "--help"]
-            for name in ("compact", "batch", "inspect", "segment", "render", "preview", "chart", "generate", "train")
-        ),
-    ],
+    [["--help"], ["--version"], [], ["compact", "--help-all"], *([name, "--help"] for name in COMMANDS)],
     ids=" ".join,
 )
 def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     assert loaded_after(f"from gsmerge.cli import main\nassert main({arguments!r}) == 0") == set()
+
+
+def test_a_command_loads_no_other() -> None:
+    code = "from gsmerge.cli import main\nassert main(['compact', '--help']) == 0\nimport sys\n"
+    modules = run_python(f"{code}print(*(m for m in sys.modules if m.startswith('gsmerge.cli.')))").splitlines()[-1]
+    assert set(modules.split()) == {f"gsmerge.cli.{name}" for name in ("app", "compact", "console", "options", "paths")}
 
 
 def test_import_loads_nothing_heavy() -> None:

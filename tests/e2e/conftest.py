@@ -51,7 +51,7 @@ def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def undisturbed(rooms: Path) -> dict[str, str]:
     """What a batch that nothing happens to makes of them."""
     out = rooms.parent / "undisturbed"
-    assert finish(rooms, "--out", out, *FAST, "--jobs", 2, "-q") == 0
+    assert finish(rooms, "--output", out, *FAST, "--jobs", 2, "-q") == 0
     assert sorted(results(out)) == NAMES
     return results(out)
 

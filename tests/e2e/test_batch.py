@@ -29,7 +29,7 @@ def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
-    return run("batch", rooms, "--out", out, *FAST, *options)
+    return run("batch", rooms, "--output", out, *FAST, *options)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def first(rooms: Path) -> tuple[int, Path]:
     from gsmerge.cli import main
 
     out = rooms.parent / "out"
-    return main(["batch", str(rooms), "--out", str(out), *FAST, "-q", "--jobs", "2"]), out
+    return main(["batch", str(rooms), "--output", str(out), *FAST, "-q", "--jobs", "2"]), out
 
 
 @pytest.fixture(autouse=True)
@@ -122,15 +122,15 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
     for name, path in cameras.items():
         shutil.copytree(rooms / name, tmp_path / "in" / name)
         (tmp_path / "in" / name / "transforms.json").rename(path)
-    told = ("--cameras", f"{tmp_path}/{{stem}}.json", "--output", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
+    told = ("--cameras", f"{tmp_path}/{{stem}}.json", "--name", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
     outcome = batch(run, tmp_path / "in", tmp_path / "out", *told)
     assert outcome.code == 0, outcome.err
     assert sorted(results(tmp_path / "out")) == ["in/0-room0.k1.ply", "in/1-room1.k1.ply"]
 
 
 def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
-    told = ("--effort", "draft", "--target-psnr", 90, "--density", 0.01, "--jobs", 1)
-    outcome = run("batch", rooms / "room0", "--out", tmp_path, *told)
+    told = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
+    outcome = run("batch", rooms / "room0", "--output", tmp_path, *told)
     assert outcome.code == 4
     assert "1 of 1 results miss the target" in outcome.err
     assert (tmp_path / "room0.ply").exists()
@@ -139,17 +139,17 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
 @pytest.mark.parametrize(
     ("told", "code", "said"),
     [
-        (("--fit", "color", "--max-drop", 1, "--target-psnr", 30), 2, "expected one of max drop and target psnr"),
-        (("--method", "voxel", "--k", "auto"), 2, "method voxel"),
+        (("--fit", "color", "--quality", "30"), 2, 'quality: expected a PSNR as "30dB"'),
+        (("--method", "voxel", "--budget", "auto"), 2, "method voxel"),
         (("--require-checkpoint", "--checkpoint", "none"), 2, "require_checkpoint"),
         (("--jobs", "many"), 2, "auto"),
         (("--jobs", 0), 2, "auto"),
         (("--max-memory", "lots"), 2, "--max-memory: expected a size such as 8GB"),
         (("--retries", -1), 2, "retries"),
-        (("--output", "{name}.ply"), 2, "{stem}"),
-        (("--output", "{stem}.txt"), 2, "ends in .compressed.ply, .ply, .spz, .splat"),
-        (("--output", "{stem}.spz", "--max-bytes", "1MB"), 2, "max bytes: expected an output as .ply"),
-        (("--output", "same.ply"), 2, "a file of its own for each scene"),
+        (("--name", "{name}.ply"), 2, "{stem}"),
+        (("--name", "{stem}.txt"), 2, "ends in .compressed.ply, .ply, .spz, .splat"),
+        (("--name", "{stem}.spz", "--budget", "1MB"), 2, "budget 1MB: expected an output as .ply"),
+        (("--name", "same.ply"), 2, "a file of its own for each scene"),
         (("--address", "auto"), 2, "address: expected engine ray"),
         (("--exporter", "nobody"), 2, "nobody"),
     ],
@@ -157,7 +157,7 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
 def test_wrong_usage_is_told_at_once(
     told: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
 ) -> None:
-    outcome = run("batch", rooms, "--out", tmp_path / "out", *told)
+    outcome = run("batch", rooms, "--output", tmp_path / "out", *told)
     assert outcome.code == code
     assert said in outcome.err
     assert outcome.err.count("\n") == 1
@@ -165,11 +165,11 @@ def test_wrong_usage_is_told_at_once(
 
 
 def test_places_that_make_no_sense_are_told_at_once(rooms: Path, tmp_path: Path, run: Run) -> None:
-    assert run("batch", tmp_path / "gone", "--out", tmp_path / "out").code == 3
-    assert run("batch", rooms, "--out", rooms).code == 2
+    assert run("batch", tmp_path / "gone", "--output", tmp_path / "out").code == 3
+    assert run("batch", rooms, "--output", rooms).code == 2
     (tmp_path / "file").touch()
-    assert run("batch", rooms, "--out", tmp_path / "file").code == 2
-    outcome = run("batch", rooms, "--out", tmp_path / "file" / "out")
+    assert run("batch", rooms, "--output", tmp_path / "file").code == 2
+    outcome = run("batch", rooms, "--output", tmp_path / "file" / "out")
     assert outcome.code == 3
     assert "cannot be written" in outcome.err
     assert outcome.err.count("gsmerge: error") == 1
@@ -178,7 +178,7 @@ def test_places_that_make_no_sense_are_told_at_once(rooms: Path, tmp_path: Path,
 def test_every_option_of_compact_is_there() -> None:
     commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     options = {name: {o: p for p in commands[name].params for o in p.opts} for name in ("compact", "batch")}
-    assert options["compact"].keys() - options["batch"].keys() == {"scene", "-o", "--report"}
-    own = {"--cameras", "--images", "--output", "--threads", "--overwrite", "--json"}  # which mean many things here
+    assert options["compact"].keys() - options["batch"].keys() == {"scene", "--report"}
+    own = {"--cameras", "--images", "-o", "--output", "--threads", "--overwrite", "--json"}  # of many scenes in batch
     for name in options["compact"].keys() & options["batch"].keys() - own:
         assert options["compact"][name].help == options["batch"][name].help

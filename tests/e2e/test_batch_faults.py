@@ -56,7 +56,7 @@ def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[s
     """
     out, chance = tmp_path / "out", random.Random(0)
     for _ in range(4):
-        process = start(rooms, "--out", out, *FAST, "--jobs", 2)
+        process = start(rooms, "--output", out, *FAST, "--jobs", 2)
         workers = until(lambda: holders(out), process) or []
         time.sleep(chance.uniform(0, 0.5))
         process.kill()
@@ -64,7 +64,7 @@ def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[s
         assert not outlive(workers)
         if sorted(statuses(out)) == NAMES:
             break
-    process = start(rooms, "--out", out, *FAST, "--jobs", 2, "--json")
+    process = start(rooms, "--output", out, *FAST, "--jobs", 2, "--json")
     told, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
     assert sorted(json.loads(line)["output"] for line in told.splitlines()) == NAMES
@@ -74,7 +74,7 @@ def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[s
 
 @pytest.mark.slow
 def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
-    runs = [start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "--json") for _ in range(2)]
+    runs = [start(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "--json") for _ in range(2)]
     told = [[json.loads(line) for line in process.communicate()[0].splitlines()] for process in runs]
     assert [process.returncode for process in runs] == [0, 0]
     assert results(tmp_path) == undisturbed
@@ -86,10 +86,10 @@ def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[
 
 @pytest.mark.slow
 def test_a_run_with_other_settings_is_refused_meanwhile(rooms: Path, tmp_path: Path) -> None:
-    first = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")
+    first = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q")
     until(lambda: holders(tmp_path), first)
     os.kill(first.pid, signal.SIGSTOP)  # or it may be done before the other has begun
-    second = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q", "--k", 2)
+    second = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q", "--k", 2)
     errors = second.communicate()[1]
     os.kill(first.pid, signal.SIGCONT)
     assert second.returncode == 2
@@ -103,7 +103,7 @@ def test_a_run_with_other_settings_is_refused_meanwhile(rooms: Path, tmp_path: P
 def test_a_killed_process_costs_its_scene_alone(
     retries: int, code: int, rooms: Path, tmp_path: Path, undisturbed: dict[str, str]
 ) -> None:
-    process = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "--retries", retries, "-q")
+    process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "--retries", retries, "-q")
     workers = until(lambda: holders(tmp_path), process)
     os.kill(workers[0], signal.SIGKILL)
     errors = process.communicate()[1]
@@ -112,7 +112,7 @@ def test_a_killed_process_costs_its_scene_alone(
     assert [record["error"].startswith("its process was killed (SIGKILL") for record in failed] == [True] * (code // 5)
     if code:
         assert "1 of 4 scenes failed" in errors
-        assert finish(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q") == 0
+        assert finish(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q") == 0
     assert results(tmp_path) == undisturbed
 
 
@@ -121,17 +121,17 @@ def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) ->
     quick, slow = rooms / "room0", tmp_path / "slow"
     shutil.copytree(rooms / "room1", slow)
     told = ("--timeout", 3, "--retries", 0, "--jobs", 1, "-q", "--fit-steps", 1_000_000, "--effort", "draft")
-    process = start(slow, "--out", tmp_path / "out", *told)
+    process = start(slow, "--output", tmp_path / "out", *told)
     errors = process.communicate()[1]
     assert process.returncode == 5
     assert "took longer than 3 s (--timeout)" in errors
     assert results(tmp_path / "out") == {}
-    assert finish(quick, "--out", tmp_path / "out", *FAST, "--timeout", PATIENCE, "-q") == 0
+    assert finish(quick, "--output", tmp_path / "out", *FAST, "--timeout", PATIENCE, "-q") == 0
 
 
 @pytest.mark.slow
 def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
-    process = start(rooms, "--out", tmp_path, *FAST, "--jobs", 1)
+    process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1)
     until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path), process)
     process.send_signal(signal.SIGINT)
     told, errors = process.communicate()
@@ -142,7 +142,7 @@ def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed:
     assert told.splitlines()[-1].startswith("4 scenes: ")
     assert " left; " in told.splitlines()[-1]
     assert {name for name in results(tmp_path) if not name.startswith(".batch/")} <= set(NAMES)  # nothing half-done
-    assert finish(rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q") == 0
+    assert finish(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q") == 0
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
 
@@ -159,7 +159,7 @@ def limited(limit: int, *arguments: object) -> tuple[int, str]:
 @pytest.mark.slow
 def test_a_full_disk_is_told_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Results do not fit and records do; then records do not either."""
-    told = (rooms, "--out", tmp_path, *FAST, "--jobs", 1, "-q")
+    told = (rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q")
     code, errors = limited(30_000, *told)
     assert code == 5
     assert "4 of 4 scenes failed; the first: " in errors

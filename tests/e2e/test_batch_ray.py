@@ -19,7 +19,7 @@ PATIENCE = 180  # seconds, on a machine that is busy with other things
 
 @needs_ray
 def test_a_killed_process_is_survived(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
-    process = start(rooms, "--out", tmp_path, *FAST, "--engine", "ray", "-q")
+    process = start(rooms, "--output", tmp_path, *FAST, "--engine", "ray", "-q")
     deadline = time.monotonic() + PATIENCE
     while not (found := holders(tmp_path)):
         assert process.poll() is None
@@ -50,7 +50,7 @@ def strike():
     cluster.remove_node(other, allow_graceful=False)
 
 threading.Thread(target=strike, daemon=True).start()
-code = main(["batch", rooms, "--out", out, "--engine", "ray", "--address", cluster.address, *told])
+code = main(["batch", rooms, "--output", out, "--engine", "ray", "--address", cluster.address, *told])
 print("nodes:", len(cluster.list_all_nodes()))
 cluster.shutdown()
 sys.exit(code)
@@ -73,7 +73,7 @@ def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undist
 
 @needs_ray
 def test_no_cluster_at_the_address_is_told(rooms: Path, tmp_path: Path) -> None:
-    process = start(rooms, "--out", tmp_path / "out", *FAST, "--engine", "ray", "--address", "127.0.0.1:1", "-q")
+    process = start(rooms, "--output", tmp_path / "out", *FAST, "--engine", "ray", "--address", "127.0.0.1:1", "-q")
     errors = process.communicate()[1]
     assert process.returncode == 3
     assert "127.0.0.1:1: no Ray cluster answers there" in errors
@@ -82,7 +82,7 @@ def test_no_cluster_at_the_address_is_told(rooms: Path, tmp_path: Path) -> None:
 def test_without_ray_one_line_says_what_to_install(rooms: Path, tmp_path: Path) -> None:
     code = "import sys; sys.modules['ray'] = None\n"
     code += "from gsmerge.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "batch", str(rooms), "--out", str(tmp_path / "out"), "--engine", "ray"]
+    command = [sys.executable, "-c", code, "batch", str(rooms), "--output", str(tmp_path / "out"), "--engine", "ray"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr == "gsmerge: error: engine ray: Ray is not installed; pip install 'gsmerge[ray]'\n"

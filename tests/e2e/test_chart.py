@@ -26,7 +26,9 @@ def results(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("grid")
     scene = make_scene(folder / "room", num_views=3, width=64, height=48)
-    assert main(["chart", str(scene), "--out", str(folder / "out"), *TARGETS, *FAST, "--proxy-views", "1", "-q"]) == 0
+    assert (
+        main(["chart", str(scene), "--output", str(folder / "out"), *TARGETS, *FAST, "--proxy-views", "1", "-q"]) == 0
+    )
     return folder
 
 
@@ -51,7 +53,7 @@ def merges(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
 
 def again(run: Run, folder: Path, *options: object) -> Outcome:
-    return run("chart", folder / "room", "--out", folder / "out", *TARGETS, *FAST, *options)
+    return run("chart", folder / "room", "--output", folder / "out", *TARGETS, *FAST, *options)
 
 
 def test_what_a_grid_leaves_behind(results: Path) -> None:
@@ -134,11 +136,11 @@ def test_what_is_told_of_the_file_counts_for_all_scenes(copied: Path, run: Run) 
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
     told = ("--order", "none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
-    outcome = run("chart", copied / "room", "--out", copied / "loose", *told)
+    outcome = run("chart", copied / "room", "--output", copied / "loose", *told)
     assert outcome.code == 5, "nothing to measure from"
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
     shutil.copytree(copied / "room" / "targets" / "images", copied / "room" / "images")
-    assert run("chart", copied / "room", "--out", copied / "loose", *told).code == 0
+    assert run("chart", copied / "room", "--output", copied / "loose", *told).code == 0
     records = [record for record in read_runs(copied / "loose")[0].values() if record.error is None]
     assert {record.views for record in records} == {2}
     assert "--order none" in records[0].command
@@ -153,7 +155,7 @@ def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch:
         return compact(scene, **settings)
 
     monkeypatch.setattr(running, "compact", broken)
-    options = ("--budgets", "3%,1%", "--out", copied / "new")
+    options = ("--budgets", "3%,1%", "--output", copied / "new")
     outcome = again(run, copied, *options)
     assert outcome.code == 5
     last = outcome.err.splitlines()[-1]
@@ -170,7 +172,7 @@ def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch:
 def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run: Run) -> None:
     bad = Path(shutil.copytree(copied / "room", copied / "bad"))
     (bad / "scene.ply").write_text("ply\nThese are notes.\n")
-    outcome = run("chart", bad, copied / "room", "--out", copied / "out", *TARGETS, *FAST, "--quiet")
+    outcome = run("chart", bad, copied / "room", "--output", copied / "out", *TARGETS, *FAST, "--quiet")
     assert outcome.code == 5
     assert outcome.err.startswith("gsmerge: error: 3 of 3 runs failed; the first: bad: ")
     assert outcome.err.count("\n") == 1
@@ -194,14 +196,14 @@ def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> 
     assert f"would write {copied / 'out'}: 1 of 3 runs to do" in outcome.out
     assert "estimate    about" in outcome.out
     assert listing(copied) == before
-    assert run("chart", copied / "room", "--out", copied / "none", "--dry-run").code == 0
+    assert run("chart", copied / "room", "--output", copied / "none", "--dry-run").code == 0
     assert not (copied / "none").exists()
 
 
 def test_drawing_alone(copied: Path, run: Run) -> None:
     shutil.rmtree(copied / "out" / "charts")
     shutil.rmtree(copied / "room")
-    outcome = run("chart", "--draw-only", "--out", copied / "out", "--json")
+    outcome = run("chart", "--draw-only", "--output", copied / "out", "--json")
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
     assert document["schema_version"] == 1
@@ -216,7 +218,7 @@ def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run
     outcome = run(
         "chart",
         copied / "room",
-        "--out",
+        "--output",
         copied / "out",
         *TARGETS,
         "--grid",
@@ -228,7 +230,7 @@ def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run
         "--json",
     )
     assert outcome.code == 0
-    assert {settings.get("density") for settings in merges} == {0.02}
+    assert {settings.get("superpixels") for settings in merges} == {"2%"}
     assert json.loads(outcome.out)["num_done"] == 1
 
 
@@ -246,8 +248,8 @@ def test_a_grid_from_a_file(copied: Path, merges: list[dict[str, Any]], run: Run
         (("room", "--targets", "{scene}/none.json"), 3, "expected cameras of held-out views"),
         (("room", "--targets", "{room}/none.json"), 2, "expected {scene}, {parent} or {stem}"),
         (("room", "--lpips", "some"), 2, "--lpips"),
-        (("room", "--out", "room/scene.ply"), 2, "expected a folder, found the file"),
-        (("room", "--out", "room"), 2, "expected a folder of its own"),
+        (("room", "--output", "room/scene.ply"), 2, "expected a folder, found the file"),
+        (("room", "--output", "room"), 2, "expected a folder of its own"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
@@ -256,7 +258,7 @@ def test_wrong_usage(
 ) -> None:
     monkeypatch.chdir(results)
     before = listing(results)
-    outcome = run("chart", "--out", "new", *options)
+    outcome = run("chart", "--output", "new", *options)
     assert outcome.code == code
     assert message in outcome.err
     assert outcome.err.count("\n") == 1

@@ -130,7 +130,7 @@ def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
 @pytest.mark.parametrize(
     ("option", "told"),
     [
-        (("--max-bytes", "5"), "max bytes: expected at least 502 for one Gaussian, got 5"),
+        (("--budget", "5B"), "budget: expected at least 502 bytes for one Gaussian, got 5"),
         (("--budget", "0.001%"), "budget: expected at least one Gaussian, got '0.001%'"),
         (("--effort", "slow"), "'--effort': 'slow' is not one of 'draft', 'fast', 'default', 'best'"),
     ],

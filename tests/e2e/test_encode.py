@@ -34,7 +34,7 @@ def test_decoded_is_compacted_byte_for_byte(k: int, encoded: Path, made_scene: P
     assert one.read_bytes() == other.read_bytes()
 
 
-@pytest.mark.parametrize("wish", [("--budget", "3%"), ("--budget", "700", "--k", "2"), ("--k", "auto")], ids=str)
+@pytest.mark.parametrize("wish", [("--budget", "3%"), ("--budget", "700", "--k", "2"), ("--budget", "auto")], ids=str)
 def test_what_encoding_was_asked_for_is_what_decoding_gives(
     wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -106,7 +106,7 @@ def test_a_dry_run_of_decode_writes_nothing(encoded: Path, tmp_path: Path, run: 
 
 
 def test_quiet_decoding_says_nothing(encoded: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("decode", encoded, "--k", "auto", "-o", tmp_path / "a.ply", "--quiet")
+    outcome = run("decode", encoded, "--budget", "auto", "-o", tmp_path / "a.ply", "--quiet")
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
@@ -176,7 +176,7 @@ def test_levels_in_other_formats(made_scene: Path, tmp_path: Path, run: Run) -> 
     ("arguments", "words"),
     [
         (("-o", "a.ksplat"), "expected a name that ends in"),
-        (("-o", "a.spz", "--max-bytes", "5MB"), "--max-bytes: expected an output as .ply, got .spz"),
+        (("-o", "a.spz", "--budget", "5MB"), "--budget 5MB: expected an output as .ply, got .spz"),
     ],
 )
 def test_formats_that_cannot_be_written(

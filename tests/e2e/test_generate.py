@@ -20,7 +20,7 @@ SMALL = ("--scenes", 2, "--views", "3", "--size", "48x36")
 def generated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes. Read only."""
     folder = tmp_path_factory.mktemp("generate") / "made"
-    assert main(["generate", str(folder), *map(str, SMALL), "--quiet"]) == 0
+    assert main(["generate", "-o", str(folder), *map(str, SMALL), "--quiet"]) == 0
     return folder
 
 
@@ -31,7 +31,7 @@ def made(generated: Path, tmp_path: Path) -> Path:
 
 
 def test_scenes_are_made_and_counted(generated: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("generate", tmp_path / "made", *SMALL)
+    outcome = run("generate", "-o", tmp_path / "made", *SMALL)
     assert outcome.code == 0
     assert outcome.err in ("", COMPILING)
     assert outcome.out == f"{tmp_path / 'made'}: 2 scenes\n"
@@ -41,7 +41,7 @@ def test_scenes_are_made_and_counted(generated: Path, tmp_path: Path, run: Run) 
 def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
     found = json.loads(run("inspect", made / "scene_0001", "--json").out)
     assert (found["dialect"], found["num_views"], found["num_missing"], found["notes"]) == ("gsmerge", 3, 0, [])
-    compacted = run("compact", made / "scene_0001", "--density", 0.05, "--fit", "none")
+    compacted = run("compact", made / "scene_0001", "--superpixels", "5%", "--fit", "none")
     assert compacted.code == 0, compacted.err
     targets = made / "scene_0001" / "targets"
     scored = run("evaluate", made / "scene_0001", "--targets", targets, "--lpips", "none", "--json")
@@ -50,22 +50,22 @@ def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
 
 def test_a_second_call_keeps_and_adds(made: Path, run: Run) -> None:
     before = listing(made)
-    assert run("generate", made, *SMALL).out.endswith("0 scenes, 2 were there already\n")
+    assert run("generate", "-o", made, *SMALL).out.endswith("0 scenes, 2 were there already\n")
     assert listing(made) == before
-    more = json.loads(run("generate", made, *SMALL, "--scenes", 3, "--json").out)
+    more = json.loads(run("generate", "-o", made, *SMALL, "--scenes", 3, "--json").out)
     assert [scene["kept"] for scene in more["scenes"]] == [True, True, False]
     assert more["options"]["views"] == [3, 3]
 
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, run: Run) -> None:
-    outcome = run("generate", tmp_path / "made", *SMALL, "--dry-run")
+    outcome = run("generate", "-o", tmp_path / "made", *SMALL, "--dry-run")
     assert outcome.out.endswith("would write 2 scenes\n")
-    assert json.loads(run("generate", tmp_path / "made", *SMALL, "--dry-run", "--json").out)["dry_run"] is True
+    assert json.loads(run("generate", "-o", tmp_path / "made", *SMALL, "--dry-run", "--json").out)["dry_run"] is True
     assert list(tmp_path.iterdir()) == []
 
 
 def test_quiet_says_nothing(tmp_path: Path, run: Run) -> None:
-    outcome = run("generate", tmp_path / "made", *SMALL, "--quiet")
+    outcome = run("generate", "-o", tmp_path / "made", *SMALL, "--quiet")
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
@@ -84,7 +84,7 @@ def test_quiet_says_nothing(tmp_path: Path, run: Run) -> None:
 )
 def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], code: int, told: str, made: Path, run: Run) -> None:
     before = listing(made)
-    outcome = run("generate", made, *SMALL, *arguments)
+    outcome = run("generate", "-o", made, *SMALL, *arguments)
     assert outcome.code == code
     assert told in outcome.err
     assert outcome.err.count("\n") == 1
@@ -93,7 +93,7 @@ def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], code: int, told: 
 
 def test_a_file_is_no_folder(tmp_path: Path, run: Run) -> None:
     (tmp_path / "made").write_text("notes")
-    outcome = run("generate", tmp_path / "made", *SMALL)
+    outcome = run("generate", "-o", tmp_path / "made", *SMALL)
     assert outcome.code == 3
     assert "found a file" in outcome.err
 
@@ -101,7 +101,7 @@ def test_a_file_is_no_folder(tmp_path: Path, run: Run) -> None:
 def test_ranges_and_noise_are_taken(tmp_path: Path, run: Run) -> None:
     ranges = tmp_path / "ranges.json"
     ranges.write_text('{"scale": [0.7, 0.7], "sh_degrees": [1]}')
-    outcome = run("generate", tmp_path / "made", *SMALL, "--scenes", 1, "--ranges", ranges, "--noise", 0)
+    outcome = run("generate", "-o", tmp_path / "made", *SMALL, "--scenes", 1, "--ranges", ranges, "--noise", 0)
     assert outcome.code == 0, outcome.err
     record = json.loads((tmp_path / "made" / "scene_0000" / "generated.json").read_text())
     drawn = record["noise"]

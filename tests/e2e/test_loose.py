@@ -54,7 +54,7 @@ def test_only_a_ply(made: Path, tmp_path: Path, target_psnr: Measure) -> None:
     scene = read_scene(alone, order="none")
     assert len(scene.cameras) == 0
     assert scene.images is None
-    result = gsmerge.compact(scene, density=0.1)
+    result = gsmerge.compact(scene, superpixels="10%")
     assert len(result.report.notes) >= 2
     gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
     before, after = (target_psnr(made / "targets", ply) for ply in (alone / "scene.ply", tmp_path / "small.ply"))

@@ -107,10 +107,10 @@ def test_a_failing_program_is_told(
     ("arguments", "fragments"),
     [
         (["--method", "magic"], ["--method", "voxel"]),
-        (["--method", "voxel", "--k", "auto"], ["method voxel", "k auto"]),
+        (["--method", "voxel", "--budget", "auto"], ["method voxel", "budget auto"]),
         (["--method", "voxel", "--levels", 2], ["method voxel", "levels"]),
-        (["--method", "voxel", "--target-psnr", 20], ["method voxel", "target psnr"]),
-        (["--method", "voxel", "--max-drop", 1], ["method voxel", "max drop"]),
+        (["--method", "voxel", "--quality", "20dB"], ["method voxel", "quality 20dB"]),
+        (["--method", "voxel", "--quality", "-1dB"], ["method voxel", "quality -1dB"]),
         (["--method", "blocks", "--order", "none"], ["method blocks", "one Gaussian per pixel"]),
     ],
     ids=str,

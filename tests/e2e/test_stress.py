@@ -35,7 +35,7 @@ def test_an_unknown_case(scene_copy: Path, run: Run) -> None:
 
 
 def test_a_case_that_fails_is_a_target_not_met(scene_copy: Path, run: Run) -> None:
-    outcome = run("stress", scene_copy, "--fit", "none", "--density", "0.01", "--cases", "order,views-1,unchanged")
+    outcome = run("stress", scene_copy, "--fit", "none", "--superpixels", "1%", "--cases", "order,views-1,unchanged")
     failed = [line for line in outcome.out.splitlines() if line.startswith("FAILED")]
     assert failed, "so few Gaussians without a fit must be worse than the input somewhere"
     assert outcome.code == 4

@@ -51,11 +51,11 @@ def test_the_finest_level_is_the_result_without_levels(scene: PixelScene) -> Non
     assert alone.coarser == ()
 
 
-def test_target_psnr_is_met_with_few(scene: PixelScene) -> None:
+def test_a_psnr_is_met_with_few(scene: PixelScene) -> None:
     usual = compact(scene, fit_steps=20)
     assert usual.report.psnr_after is not None
     wanted = usual.report.psnr_after - 1
-    found = compact(scene, fit_steps=20, target_psnr=wanted)
+    found = compact(scene, fit_steps=20, quality=f"{wanted}dB")
     assert found.report.unmet is None
     assert found.report.psnr_after is not None
     assert found.report.psnr_after >= wanted
@@ -65,16 +65,16 @@ def test_target_psnr_is_met_with_few(scene: PixelScene) -> None:
 
 def test_a_target_out_of_reach_ends_with_4(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "best.ply"
-    told = run("compact", made_scene, "-o", out, "--target-psnr", 90, "--fit-steps", 8, "--max-bytes", "20KB")
+    told = run("compact", made_scene, "-o", out, "--quality", "90dB", "--fit-steps", 8, "--budget", "20KB")
     assert told.code == 4
-    assert "target psnr: 90 dB was asked for, the input views reach" in told.err
+    assert "quality: 90 dB was asked for, the input views reach" in told.err
     assert len(read_ply(out).gaussians) > 0
     assert out.stat().st_size <= 20_000
     assert str(out) in told.out
 
 
-def test_max_drop_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
-    few, many = (compact(scene, fit_steps=12, max_drop=drop) for drop in (3.0, 0.0))
+def test_a_loss_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
+    few, many = (compact(scene, fit_steps=12, quality=f"-{drop}dB") for drop in (3.0, 0.0))
     assert len(few.gaussians) < len(many.gaussians)
     curve = many.report.choices["curve"]
     assert [point["count"] for point in curve] == sorted(point["count"] for point in curve)
@@ -82,7 +82,7 @@ def test_max_drop_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
 
 
 def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    told = run("compact", made_scene, "-o", tmp_path / "a.ply", "--k", "auto", "--fit-steps", 12)
+    told = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit-steps", 12)
     assert told.code == 0, told.err
     lines = told.out.splitlines()
     assert "PSNR" in lines[2]
@@ -90,13 +90,13 @@ def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> N
 
 
 def test_a_device_is_a_limit(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert scenes.identical(compact(scene, fit="none", preset="quest3").gaussians, compact(scene, fit="none").gaussians)
-    monkeypatch.setitem(__import__("gsmerge.budget").budget.PRESETS, "quest3", 200)
-    assert len(compact(scene, fit_steps=12, preset="quest3").gaussians) == 200
+    assert scenes.identical(compact(scene, fit="none", budget="quest3").gaussians, compact(scene, fit="none").gaussians)
+    monkeypatch.setitem(__import__("gsmerge.budget").budget.DEVICES, "quest3", 200)
+    assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 200
 
 
-@pytest.mark.parametrize("settings", [{"max_drop": 0.2}, {"target_psnr": 30.0}])
-def test_quality_needs_photos(scene: PixelScene, settings: dict[str, float]) -> None:
+@pytest.mark.parametrize("settings", [{"quality": "-0.2dB"}, {"quality": "30dB"}])
+def test_quality_needs_photos(scene: PixelScene, settings: dict[str, str]) -> None:
     with pytest.raises(UsageError, match="needs photos"):
         compact(replace(scene, images=None), **settings)
 
@@ -106,5 +106,5 @@ def test_a_search_keeps_what_reading_had_to_say(scene: PixelScene) -> None:
     means = whole.gaussians.means.clone()
     means[0] = float("nan")
     spoilt = replace(whole, gaussians=replace(whole.gaussians, means=means))
-    found = compact(spoilt, fit_steps=8, target_psnr=10.0)
+    found = compact(spoilt, fit_steps=8, quality="10dB")
     assert any("not finite" in note for note in found.report.notes)

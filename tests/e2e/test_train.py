@@ -30,7 +30,7 @@ CONFIG = {
 def test_train_then_compact(scene_copy: Path, run: Run) -> None:
     config, out = scene_copy / "train.json", scene_copy / "run"
     config.write_text(json.dumps(CONFIG))
-    call = ("train", "--data", scene_copy, "--out", out, "--config", config, "--preset", "paper")
+    call = ("train", "--data", scene_copy, "--output", out, "--config", config, "--preset", "paper")
     outcome = run(*call)
     assert outcome.code == 0, outcome.err
     assert "best.safetensors: 4 steps" in outcome.out
@@ -76,12 +76,12 @@ def test_settings_and_scenes_are_told_in_one_line(scene_copy: Path, run: Run, tm
     config, out = tmp_path / "train.toml", tmp_path / "run"
     for text, told in (("steps = 0\n", "steps"), ("stride = 3\n", "stride"), ("steps = = 3", "TOML")):
         config.write_text(text)
-        outcome = run("train", "--data", scene_copy, "--out", out, "--config", config)
+        outcome = run("train", "--data", scene_copy, "--output", out, "--config", config)
         assert outcome.code == 3
         assert told in outcome.err
         assert outcome.err.count("\n") == 1
-    assert run("train", "--data", tmp_path / "nowhere", "--out", out).code == 3
-    assert run("train", "--out", out).code == 2
+    assert run("train", "--data", tmp_path / "nowhere", "--output", out).code == 3
+    assert run("train", "--output", out).code == 2
 
 
 def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: Run) -> None:
@@ -97,12 +97,12 @@ def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: R
     assert find_training_scenes([folder / "c"], out, held) == held  # it was named
     config = tmp_path / "train.json"
     config.write_text(json.dumps(CONFIG | {"steps": 1, "save_every": 1}))
-    call = ("train", "--data", folder, "--out", out, "--config", config)
+    call = ("train", "--data", folder, "--output", out, "--config", config)
     done = run(*call, "--validation", folder / "c", "--json")
     assert done.code == 0, done.err
     training = load_checkpoint(out / "last.safetensors").training
     assert (len(training["data"]), len(training["validation"])) == (2, 1)
-    outcome = run("train", "--data", folder / "deeper", "--validation", folder / "deeper/b", "--out", out)
+    outcome = run("train", "--data", folder / "deeper", "--validation", folder / "deeper/b", "--output", out)
     assert outcome.code == 2
     assert "besides those of --validation" in outcome.err
 

@@ -74,7 +74,7 @@ def test_two_runs_at_once_do_not_disturb_each_other() -> None:
 def test_large_groups_of_tasks_change_no_bit() -> None:
     """More superpixels than one task takes."""
     scene: PixelScene = scenes.make_scene(scenes.wall(), scenes.arc(2, 128, 96))
-    options = {"density": 0.45, "k": 2, "fit": "none"}
+    options = {"superpixels": "45%", "k": 2, "fit": "none"}
     found = [scenes.compacted(scene, threads=threads, **options).gaussians for threads in (1, 3)]
     assert len(found[0]) > 8192
     assert identical(*found)

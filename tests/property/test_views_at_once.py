@@ -48,5 +48,5 @@ def test_of_many_gaussians_one_view_at_a_time(scene: PixelScene, monkeypatch: py
     found = []
     for many in (0, 10**9):
         monkeypatch.setattr("gsmerge.stages.assign.ONE_AT_A_TIME", many)
-        found.append(compact(loose.loosened(scene), fit="none", density=0.1, unseen="keep").gaussians)
+        found.append(compact(loose.loosened(scene), fit="none", superpixels="10%", unseen="keep").gaussians)
     assert scenes.identical(found[0], found[1])

@@ -40,7 +40,7 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
 
 def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(3))
-    chosen = {"robust": False, "fit": "none", "density": 0.1}
+    chosen = {"robust": False, "fit": "none", "superpixels": "10%"}
     path = written(tmp_path / "a.safetensors", Networks())
     loose = shuffled(scene)
     plain = gsmerge.compact(loose, **chosen, checkpoint="none")
@@ -52,11 +52,11 @@ def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     assert identical(one.gaussians, gsmerge.compact(loose, **chosen, checkpoint=str(path), threads=3).gaussians)
 
 
-@pytest.mark.parametrize("settings", [{}, {"target_psnr": 15.0}, {"levels": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"quality": "15dB"}, {"levels": 2}], ids=str)
 def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", noisy())
-    found = gsmerge.compact(scene, fit="none", density=0.1, checkpoint=str(path), **settings)
+    found = gsmerge.compact(scene, fit="none", superpixels="10%", checkpoint=str(path), **settings)
     for result in (found, *found.coarser):
         assert result.report.choices["networks"]["checkpoint"] == str(path)
     rival = gsmerge.compact(scene, method="random", checkpoint=str(path))

@@ -43,14 +43,14 @@ def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
     "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none", "checkpoint": "none"}], ids=str
 )
 def test_more_children_show_more(scene: PixelScene, settings: dict) -> None:
-    found = [scenes.compacted(scene, density=0.044, k=k, **settings).gaussians for k in (1, 2, 4, 8)]
+    found = [scenes.compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in found]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in found]) > -0.05).all()
 
 
 @pytest.mark.parametrize("fit", ["color", "full"])
 def test_more_superpixels_show_more(scene: PixelScene, fit: str) -> None:
-    found = [scenes.compacted(scene, density=density, fit=fit).gaussians for density in (0.01, 0.03, 0.1)]
+    found = [scenes.compacted(scene, superpixels=share, fit=fit).gaussians for share in ("1%", "3%", "10%")]
     assert (np.diff([len(g) for g in found]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in found]) > -0.05).all()
 
@@ -62,7 +62,7 @@ def test_more_superpixels_show_more(scene: PixelScene, fit: str) -> None:
 def test_photos_keep_coverage_and_brightness(scene: PixelScene, settings: dict) -> None:
     """With the full fit or the choice among merges, within a hundredth."""
     before = coverage(scene.gaussians, scene)
-    after = coverage(scenes.compacted(scene, density=0.044, **settings).gaussians, scene)
+    after = coverage(scenes.compacted(scene, superpixels="4.4%", **settings).gaussians, scene)
     assert after[0] == pytest.approx(before[0], abs=0.01)
     assert after[1] == pytest.approx(before[1], abs=0.01)
 
@@ -71,7 +71,7 @@ def test_photos_keep_coverage_and_brightness(scene: PixelScene, settings: dict) 
 def test_matched_backing_keeps_coverage(scene: PixelScene, fit: str) -> None:
     """Matching also makes one backing layer of the views' several, so a little more shines through."""
     before = coverage(scene.gaussians, scene)
-    after = coverage(scenes.compacted(scene, density=0.044, fit=fit).gaussians, scene)
+    after = coverage(scenes.compacted(scene, superpixels="4.4%", fit=fit).gaussians, scene)
     assert after[0] == pytest.approx(before[0], abs=0.025)
     assert after[1] == pytest.approx(before[1], abs=0.015)
 
@@ -85,7 +85,7 @@ LOSSES = {(1, 1): 0.34, (1, 4): 0.16, (3, 1): 0.23, (3, 4): 0.08}
 def test_plain_merging_loses_a_known_part_of_coverage(clean: PixelScene, views: int, k: int) -> None:
     own = scenes.take_views(clean, list(range(views)))
     before = coverage(own.gaussians, own)
-    after = coverage(scenes.plain(own, density=0.044, k=k), own)
+    after = coverage(scenes.plain(own, superpixels="4.4%", k=k), own)
     for old, new in zip(before, after, strict=True):
         assert (1 - LOSSES[views, k]) * old < new < 1.01 * old
 
@@ -106,8 +106,8 @@ def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
 def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
     opacities = 0.05 * torch.ones_like(scene.gaussians.opacities)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
-    usual = scenes.compacted(scene, density=0.044, **settings).gaussians
-    found = scenes.compacted(faint, density=0.044, **settings).gaussians
+    usual = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
+    found = scenes.compacted(faint, superpixels="4.4%", **settings).gaussians
     assert len(found) > 0.8 * len(usual)
 
 
@@ -130,7 +130,7 @@ def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "color"}], ids=str)
 def test_a_second_pass_neither_blurs_nor_darkens(scene: PixelScene, settings: dict) -> None:
-    once = scenes.compacted(scene, density=0.044, **settings).gaussians
+    once = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
     loose = UnalignedScene(once, scene.cameras, scene.images, scene.names)
     twice = compact(loose, budget=len(once), **settings).gaussians
     assert 0.99 * len(once) <= len(twice) <= len(once)  # what no photo shows goes

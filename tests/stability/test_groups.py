@@ -66,7 +66,7 @@ def test_coincident_members_stack(small: PixelScene) -> None:
 
 
 def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
-    found = scenes.plain(small, density=1.0)
+    found = scenes.plain(small, superpixels="100%")
     order = torch.cdist(small.gaussians.means, found.means).argmin(1)
     assert len(order.unique()) == len(found) == len(small.gaussians)
     own, kept = small.gaussians, found[order]

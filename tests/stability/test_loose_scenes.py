@@ -23,7 +23,7 @@ def room() -> PixelScene:
 
 def compacted(scene: UnalignedScene, **settings: Any) -> CompactResult:
     """A tenth of the pixels, with what must hold of every result checked."""
-    result = compact(scene, **{"density": 0.1, "fit": "color", **settings})
+    result = compact(scene, **{"superpixels": "10%", "fit": "color", **settings})
     for name in scenes.FIELDS:
         assert torch.isfinite(getattr(result.gaussians, name)).all(), name
     assert 0 < len(result.gaussians) <= max(len(scene.gaussians), 1)
@@ -33,8 +33,8 @@ def compacted(scene: UnalignedScene, **settings: Any) -> CompactResult:
 
 SETTINGS = [
     {}, {"k": 2}, {"fit": "none"}, {"fit": "full", "fit_steps": 10}, {"budget": 150}, {"budget": 150, "fit": "full"},
-    {"k": "auto"}, {"robust": False}, {"match": "none"}, {"match": "aabb"}, {"segmentation": "slic"},
-    {"max_bytes": "12KB"}, {"unseen": "keep"}, {"rule": "paper", "robust": False}, {"min_owner_weight": 0.1},
+    {"budget": "auto"}, {"robust": False}, {"match": "none"}, {"match": "aabb"}, {"segmentation": "slic"},
+    {"budget": "12KB"}, {"unseen": "keep"}, {"rule": "paper", "robust": False}, {"min_owner_weight": 0.1},
 ]  # fmt: skip
 
 
@@ -126,7 +126,7 @@ def test_far_from_the_origin_without_cameras(room: PixelScene, shift: list[float
 def test_many_more_views_than_gaussians_for_each() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(30, 32, 24))
     few = replace(loose.loosened(scene), gaussians=scene.gaussians[:: 30 * 4])
-    result = compacted(few, density=0.3, fit="none")
+    result = compacted(few, superpixels="30%", fit="none")
     assert len(result.gaussians) <= 0.3 * len(few.gaussians) + 30
 
 

@@ -170,5 +170,5 @@ def test_more_views_do_not_hurt() -> None:
     found = []
     for views in (3, 6):
         scene = scenes.make_scene(scenes.room(), scenes.arc(views, 96, 72), noise=0.01)
-        found.append(scenes.psnr_of(scenes.compacted(scene, density=0.044).gaussians, between))
+        found.append(scenes.psnr_of(scenes.compacted(scene, superpixels="4.4%").gaussians, between))
     assert found[1] > found[0] - 0.5

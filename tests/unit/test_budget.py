@@ -1,4 +1,4 @@
-"""How many Gaussians a budget, a file size and a preset mean."""
+"""How many Gaussians a budget, a file size and a device mean."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import scenes
 
 from gsmerge import write_ply
-from gsmerge.budget import PRESETS, parse_budget, parse_bytes
+from gsmerge.budget import DEVICES, parse_budget, parse_bytes
 from gsmerge.io.formats.ply_writer import count_for_bytes, file_bytes
 
 
@@ -33,7 +33,7 @@ def test_budget(text: str | int, count: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "many", "-5", "2.5", "5%%", "1e4", "%", "4٤", "nan", "inf%"])
 def test_budgets_that_are_none(text: str) -> None:
-    with pytest.raises(ValueError, match='expected a number of Gaussians as "40000" or a share as "2%"'):
+    with pytest.raises(ValueError, match='expected a number of Gaussians as "40000", a share as "2%"'):
         parse_budget(text, 1000)
 
 
@@ -87,5 +87,5 @@ def test_count_for_bytes_out_of_range() -> None:
         count_for_bytes(10**6, 5)
 
 
-def test_presets_rise() -> None:
-    assert PRESETS["quest3"] < PRESETS["mobile"] < PRESETS["desktop"]
+def test_devices_rise() -> None:
+    assert DEVICES["quest3"] < DEVICES["mobile"] < DEVICES["desktop"]

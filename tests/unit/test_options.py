@@ -36,10 +36,10 @@ def test_a_draft_merges_no_views_and_takes_few_steps_on_small_photos() -> None:
 
 def test_settings_reach_their_stage() -> None:
     options = CompactOptions().with_settings(
-        {"k": 2, "density": 0.01, "match": "aabb", "robust": False, "fit": "none", "backing": 0.01, "seed": 3}
+        {"k": 2, "superpixels": "1%", "match": "aabb", "robust": False, "fit": "none", "backing": 0.01, "seed": 3}
     )
     assert options.decode.k == 2
-    assert options.segment.density == 0.01
+    assert options.segment.share == 0.01
     assert options.match.match == "aabb"
     assert options.robust.robust is False
     assert options.fit.fit == "none"
@@ -64,7 +64,7 @@ def test_options_are_frozen() -> None:
 
 
 def test_unknown_name_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"unknown setting 'kk'; known: .*\bdensity\b.*\bk\b"):
+    with pytest.raises(ValueError, match=r"unknown setting 'kk'; known: .*\bk\b.*\bquality\b"):
         CompactOptions().with_settings({"k": 2, "kk": 3})
 
 
@@ -77,7 +77,7 @@ def test_every_setting_is_documented(stage: str) -> None:
 @pytest.mark.parametrize(
     "setting",
     [
-        {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"density": 0.0}, {"density": 1.5},
+        {"k": 0}, {"k": 9}, {"k": -1}, {"superpixels": 0}, {"superpixels": "0%"}, {"superpixels": "150%"},
         {"segmentation": "voronoi"}, {"effort": "slow"}, {"match": "iou"}, {"rule": "mean"}, {"fit": "everything"},
         {"cluster_size": 0}, {"neighbors": 0}, {"fit_steps": 0}, {"time_budget": 0.0}, {"holdout": 2.0},
         {"dropout": 1.0}, {"dropout": -0.1}, {"holdout": 0.0}, {"iterations": 0}, {"prior_weight": -1.0},

@@ -28,7 +28,7 @@ def test_report(scene: PixelScene) -> None:
     assert report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, scene), abs=0.1)
     assert report.choices["merge"] in report.choices["merge_scores"]
     assert report.choices["clusters"] <= report.choices["groups"]
-    assert report.options["density"] == 0.1
+    assert report.options["superpixels"] == "10%"
 
 
 def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
@@ -191,7 +191,7 @@ def test_input_is_left_alone(scene: PixelScene) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"k": 0}, 'k: expected 1 to 8 or "auto", got 0'),
+        ({"k": 0}, "k: expected 1 to 8, got 0"),
         ({"superpixels": 32 * 24 + 1}, "superpixels: expected at most 768"),
         ({"match": "iou"}, "match: expected"),
         ({"kk": 1}, "unknown setting 'kk'"),

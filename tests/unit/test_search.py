@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gsmerge.budget import PRESETS, TargetOptions, exact_count, most_allowed
+from gsmerge.budget import DEVICES, BudgetOptions, exact_count, max_allowed, new_settings, parse_share, share_text
 from gsmerge.search import CurvePoint, count_within, curve_knee, level_counts, rungs, search_count
 
 
@@ -20,32 +20,32 @@ def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
     [
         ({}, None, 50_000_000),
         ({"budget": "2%"}, 1_000_000, 1_000_000),
-        ({"budget": 400, "max_bytes": "1GB"}, 400, 400),
-        ({"preset": "quest3"}, None, PRESETS["quest3"]),
-        ({"preset": "desktop", "budget": 5000}, 5000, 5000),
-        ({"preset": "quest3", "budget": "2%"}, 1_000_000, PRESETS["quest3"]),
+        ({"budget": 400}, 400, 400),
+        ({"budget": "20KB"}, 287, 287),
+        ({"budget": "auto"}, None, 50_000_000),
+        ({"budget": "quest3"}, None, DEVICES["quest3"]),
     ],
 )
 def test_limits(settings: dict[str, object], exact: int | None, most: int) -> None:
-    options = TargetOptions(**settings)  # type: ignore[arg-type]
+    options = BudgetOptions(**settings)  # type: ignore[arg-type]
     assert exact_count(options, 50_000_000, 0) == exact
-    assert most_allowed(options, 50_000_000, 0) == most
+    assert max_allowed(options, 50_000_000, 0) == most
 
 
 def test_a_small_scene_is_its_own_limit() -> None:
-    assert most_allowed(TargetOptions(preset="mobile"), 777, 0) == 777
-    assert exact_count(TargetOptions(budget=9999), 777, 0) == 777
+    assert max_allowed(BudgetOptions(budget="mobile"), 777, 0) == 777
+    assert exact_count(BudgetOptions(budget=9999), 777, 0) == 777
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"preset": "phone"}, "preset: expected one of quest3, mobile, desktop, got 'phone'"),
-        ({"max_drop": -0.1}, "max drop: expected at least 0 dB"),
-        ({"max_drop": math.nan}, "max drop"),
-        ({"target_psnr": 0.0}, "target psnr: expected more than 0 dB"),
-        ({"target_psnr": math.inf}, "target psnr"),
-        ({"target_psnr": 30.0, "max_drop": 0.2}, "one of max drop and target psnr"),
+        ({"budget": "phone"}, "budget: expected .* auto or quest3, mobile, desktop, got 'phone'"),
+        ({"budget": "MB"}, 'budget: expected a size as "5MB"'),
+        ({"budget": 0}, "budget: expected at least one Gaussian"),
+        ({"quality": "0dB"}, 'quality: expected a PSNR as "30dB" or a loss as "-0.2dB"'),
+        ({"quality": "30"}, "quality: expected a PSNR"),
+        ({"quality": "nandB"}, "quality: expected a PSNR"),
         ({"levels": 0}, "levels: expected 1 to 8"),
         ({"levels": 9}, "levels: expected 1 to 8"),
         ({"budget": "lots"}, "budget: expected"),
@@ -53,7 +53,36 @@ def test_a_small_scene_is_its_own_limit() -> None:
 )
 def test_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        TargetOptions(**settings)  # type: ignore[arg-type]
+        BudgetOptions(**settings)  # type: ignore[arg-type]
+
+
+def test_qualities() -> None:
+    psnr, loss, best = (BudgetOptions(quality=text) for text in ("30dB", "-0.2 db", "-0dB"))
+    assert (psnr.target_psnr, psnr.max_drop) == (30.0, None)
+    assert (loss.target_psnr, loss.max_drop) == (None, 0.2)
+    assert (best.target_psnr, best.max_drop) == (None, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ({"density": 0.044, "superpixels": None, "k": 2}, {"superpixels": "4.4%", "k": 2}),
+        ({"density": 0.044, "superpixels": 300}, {"superpixels": 300}),
+        ({"k": "auto", "preset": None}, {"budget": "auto"}),
+        ({"budget": None, "max_bytes": 5000}, {"budget": "5000B"}),
+        ({"budget": None, "preset": "mobile", "fit": "none"}, {"budget": "mobile", "fit": "none"}),
+        ({"target_psnr": 30.0, "max_drop": None}, {"quality": "30dB"}),
+        ({"target_psnr": None, "max_drop": 0.2}, {"quality": "-0.2dB"}),
+        ({"superpixels": "2%", "budget": "auto", "quality": "30dB"}, None),
+    ],
+)
+def test_settings_of_older_files(old: dict[str, object], new: dict[str, object] | None) -> None:
+    assert new_settings(old) == (old if new is None else new)
+
+
+@pytest.mark.parametrize("share", [0.044, 0.02, 1, 1e-6, 0.087, 1 / 3])
+def test_shares_are_exact(share: float) -> None:
+    assert parse_share(share_text(share)) == share
 
 
 def test_rungs_rise_within_their_limits() -> None:

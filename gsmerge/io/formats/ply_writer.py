@@ -91,7 +91,9 @@ def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     if not 0 <= sh_degree <= 4:
         raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
     if max_bytes < file_bytes(1, sh_degree):
-        raise UsageError(f"max bytes: expected at least {file_bytes(1, sh_degree)} for one Gaussian, got {max_bytes}")
+        raise UsageError(
+            f"budget: expected at least {file_bytes(1, sh_degree)} bytes for one Gaussian, got {max_bytes}"
+        )
     count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - file_bytes(1, sh_degree))
     while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
         count -= 1

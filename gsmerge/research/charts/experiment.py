@@ -9,13 +9,14 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from gsmerge.budget import share_text
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.tables import read_table
 from gsmerge.research.charts.record import INPUT
 
 OURS = "gsmerge"
 ALL = "all"  # word for all views
-SIZES = ("budget", "density")
+SIZES = ("budget", "superpixels")
 ONE_SIZE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
 FITTED = ("unmerged-fit",)  # baselines that effort changes
@@ -37,9 +38,9 @@ class Grid:
 
     Args:
         methods: ``gsmerge`` and baselines.
-        k: Gaussians per superpixel: 1 to 8 or "auto".
-        budgets: Gaussians in the result, such as 40000 or "2%".
-        densities: Superpixels per pixel; in addition to the budgets, not times them.
+        k: Gaussians per superpixel: 1 to 8.
+        budgets: Gaussians in the result, such as 40000, "2%" or "auto".
+        superpixels: Superpixels per view, such as 3000 or "4.4%"; in addition to the budgets, not times them.
         segmentations: Superpixel methods.
         fit: ``full``, ``color``, ``none``.
         efforts: ``draft``, ``fast``, ``default``, ``best``.
@@ -52,9 +53,9 @@ class Grid:
     """
 
     methods: tuple[str, ...] = (OURS,)
-    k: tuple[int | str, ...] = (1,)
+    k: tuple[int, ...] = (1,)
     budgets: tuple[int | str, ...] = ()
-    densities: tuple[float, ...] = ()
+    superpixels: tuple[int | str, ...] = ()
     segmentations: tuple[str, ...] = ("rdseg",)
     fit: tuple[str, ...] = ("full",)
     efforts: tuple[str, ...] = ("default",)
@@ -65,13 +66,10 @@ class Grid:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not value and f.name not in ("budgets", "densities", "fixed"):
+            if not value and f.name not in ("budgets", "superpixels", "fixed"):
                 raise ValueError(f"{f.name}: expected at least one value, got none")
             if len(set(value)) < len(value):
                 raise ValueError(f"{f.name}: expected every value once, got {', '.join(map(str, value))}")
-        for value in self.densities:
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ValueError(f"densities: expected numbers, got {value!r}")
         for value in self.views:
             if value != ALL and not (isinstance(value, int) and value >= 1):
                 raise ValueError(f'views: expected numbers from 1 or "all", got {value!r}')
@@ -103,7 +101,7 @@ class Grid:
 _PARSERS: dict[str, Any] = {
     "k": lambda text: int(text) if text.isdigit() else text,
     "budgets": lambda text: int(text) if text.isdigit() else text,
-    "densities": float,
+    "superpixels": lambda text: int(text) if text.isdigit() else text,
     "views": lambda text: int(text) if text.isdigit() else text,
 }
 
@@ -136,10 +134,14 @@ def read_grid(path: Path) -> Grid:
         SceneError: If the file cannot be read, or holds anything else.
     """
     values, known = read_table(path), {f.name for f in fields(Grid)}
+    densities = values.pop("densities", None)  # the name and form of version 0.1.0
     if values.keys() - known:
         odd = ", ".join(sorted(values.keys() - known))
         raise SceneError(path, f"expected lists named {', '.join(sorted(known))}, found {odd}")
     try:
+        if densities is not None:
+            shares = densities if isinstance(densities, list) else [densities]
+            values["superpixels"] = [share_text(share) for share in shares]
         return Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
     except (TypeError, ValueError) as error:
         raise SceneError(path, str(error)) from error
@@ -155,7 +157,7 @@ def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
         The combinations, the unmerged input first; one note per kind of combination that was left out.
     """
     defaults = {"k": 1, "segmentation": "rdseg", "fit": "full", "effort": "default", "match": "overlap"}
-    sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"density": d} for d in grid.densities]
+    sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"superpixels": s} for s in grid.superpixels]
     out: list[tuple[str, dict[str, Any]]] = [(INPUT, {})]
     dropped: dict[str, int] = {}
     for method in grid.methods:
@@ -186,8 +188,6 @@ def _skip_reason(
     other = chosen["effort"] != grid.efforts[0] and "draft" not in (chosen["effort"], grid.efforts[0])
     if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and other:
         return "effort changes nothing for other superpixels than rdseg without a full fit"
-    if chosen["k"] == "auto" and sizes and size != sizes[0]:
-        return "k = auto finds the number itself, so it has one size"
     return None
 
 

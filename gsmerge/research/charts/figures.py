@@ -174,7 +174,7 @@ def _over_common(rows: dict[str, list[RunRecord]]) -> dict[str, list[RunRecord]]
 
 def _size_words(records: Sequence[RunRecord]) -> str:
     size = typical_size(records)
-    return f"Size: {size}." if size else "Size: the default density."
+    return f"Size: {size}." if size else "Size: the default superpixels."
 
 
 def _stages(records: Sequence[RunRecord]) -> Bars | None:

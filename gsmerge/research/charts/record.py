@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
+from gsmerge.budget import new_settings, old_settings
 from gsmerge.io.content_hash import digest
 from gsmerge.runtime.jsonl import append_line, read_lines
 
@@ -115,6 +116,7 @@ class RunRecord:
             raise ValueError(f"expected a run record, got one with another {wrong}")
         for name in ("pictures", "notes"):
             known[name] = tuple(known.get(name, ()))
+        known["settings"] = new_settings(known.get("settings", {}))
         try:
             return RunRecord(**known)
         except TypeError as error:
@@ -137,7 +139,7 @@ def experiment_key(scene_sha256: str, method: str, settings: Mapping[str, Any], 
         {
             "scene": scene_sha256,
             "method": method,
-            "settings": dict(settings),
+            "settings": old_settings(settings),
             "views": views,
             "tool_version": __version__,
             "schema_version": SCHEMA_VERSION,

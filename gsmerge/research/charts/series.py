@@ -63,7 +63,8 @@ def size_label(record: RunRecord) -> str:
     for name in SIZES:
         if name in record.settings:
             value = record.settings[name]
-            return f"{value:,}" if isinstance(value, int) else str(value) if name == "budget" else f"density {value:g}"
+            number = f"{value:,}" if isinstance(value, int) else str(value)
+            return number if name == "budget" else f"{number} superpixels"
     return ""
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsmerge.budget import BudgetOptions
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import SceneLoad, align_scene, read_ply_with_hints
 from gsmerge.io.cameras.camera_file import from_viewmats, to_viewmats
@@ -201,8 +202,7 @@ def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> 
     """The result as a scene of its own, compacted to as many Gaussians as it has."""
     scene = given.scene
     unaligned = UnalignedScene(base.gaussians, scene.cameras, scene.images, scene.names)
-    plain = replace(options.target, budget=base.count, max_bytes=None, preset=None, max_drop=None, target_psnr=None)
-    once = replace(options, target=replace(plain, levels=1), decode=replace(options.decode, k=1))
+    once = replace(options, budget=BudgetOptions(budget=base.count), decode=replace(options.decode, k=1))
     after = _quality(given, compact(unaligned, once).gaussians)[1]
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 

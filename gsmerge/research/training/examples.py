@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from gsmerge import __version__
+from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io import SceneLoad, load_scene, read_held_out
@@ -224,7 +225,13 @@ def _fit_columns(
     training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None
 ) -> dict[str, Any]:
     """Arrays of an example, computed from scratch."""
-    changes = {"density": density, "match": options.match, "fit": "none", "robust": False, "seed": options.seed}
+    changes = {
+        "superpixels": share_text(density),
+        "match": options.match,
+        "fit": "none",
+        "robust": False,
+        "seed": options.seed,
+    }
     settings = CompactOptions().with_settings(changes)
     scene, members = training.scene, training.members
     groups = segment(scene_pictures(scene), settings.segment)

@@ -37,7 +37,7 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
-REMEDY = "choose another --out, or remove it to start again"
+REMEDY = "choose another --output, or remove it to start again"
 
 
 @dataclass(frozen=True, eq=False)

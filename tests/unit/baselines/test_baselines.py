@@ -14,7 +14,6 @@ import torch
 from gsmerge import CompactOptions, Gaussians, PixelScene, compact
 from gsmerge.baselines import BASELINES
 from gsmerge.baselines.simple import summed_weights
-from gsmerge.cli.options import Method
 from gsmerge.errors import UsageError
 from gsmerge.options import METHODS
 from gsmerge.pipeline import CompactResult
@@ -46,7 +45,6 @@ def rows_of(part: Gaussians, whole: Gaussians) -> list[int]:
 
 def test_one_list_of_methods() -> None:
     assert ("gsmerge", *BASELINES) == METHODS
-    assert tuple(method.value for method in Method) == METHODS
     assert all(name == baseline.name for name, baseline in BASELINES.items())
 
 
@@ -66,8 +64,8 @@ def test_budgets_are_met(scene: PixelScene, method: str, count: int) -> None:
 
 @pytest.mark.parametrize("method", EXACT)
 def test_the_usual_count_without_a_budget(scene: PixelScene, method: str) -> None:
-    assert len(made(scene, method, budget=None, density=0.1).gaussians) == 3 * 76
-    assert len(made(scene, method, budget=None, density=0.1, k=2).gaussians) == 2 * 3 * 76
+    assert len(made(scene, method, budget=None, superpixels="10%").gaussians) == 3 * 76
+    assert len(made(scene, method, budget=None, superpixels="10%", k=2).gaussians) == 2 * 3 * 76
 
 
 @pytest.mark.parametrize("method", OWN)
@@ -123,11 +121,11 @@ def test_the_others_do_without_photos(scene: PixelScene, method: str) -> None:
 
 @pytest.mark.parametrize(
     ("settings", "what"),
-    [({"k": "auto"}, "k auto"), ({"levels": 2}, "levels"), ({"target_psnr": 20.0}, "target psnr"),
-     ({"max_drop": 0.2}, "max drop")],
+    [({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"), ({"quality": "20dB"}, "quality 20dB"),
+     ({"quality": "-0.2dB"}, "quality -0.2dB")],
 )  # fmt: skip
 def test_a_count_has_to_be_settled(settings: dict[str, Any], what: str) -> None:
-    with pytest.raises(ValueError, match=f"method voxel: expected a budget, a preset or a density, got {what}"):
+    with pytest.raises(ValueError, match=f"method voxel: expected a budget or superpixels, got {what}"):
         CompactOptions().with_settings({"method": "voxel", **settings})
 
 

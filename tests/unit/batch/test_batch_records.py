@@ -330,7 +330,7 @@ def test_totals_do_not_grow_with_the_number_of_scenes(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_told_before_anything_is_done(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(SceneError, match=r"cannot be written .*--out"):
+    with pytest.raises(SceneError, match=r"cannot be written .*--output"):
         check_folder(tmp_path / "file" / "out")
     check_folder(tmp_path / "new" / "out")
     assert (tmp_path / "new" / "out" / RECORDS).exists()

@@ -16,7 +16,7 @@ from gsmerge import Encoded, Gaussians, PixelScene, UnalignedScene, compact, dec
 from gsmerge.encoded.decode import plan_decode
 from gsmerge.errors import UsageError
 
-DENSITY = 0.1
+SHARE = "10%"
 Scene = PixelScene | UnalignedScene
 
 
@@ -32,21 +32,21 @@ def bare(pixels: PixelScene) -> PixelScene:
 
 @pytest.fixture(scope="module")
 def encoded(pixels: PixelScene) -> Encoded:
-    return encode_scene(pixels, density=DENSITY)
+    return encode_scene(pixels, superpixels=SHARE)
 
 
 @pytest.fixture(scope="module")
 def encoded_bare(bare: PixelScene) -> Encoded:
-    return encode_scene(bare, density=DENSITY)
+    return encode_scene(bare, superpixels=SHARE)
 
 
 def unfitted(scene: Scene, **settings: Any) -> Gaussians:
-    return compact(scene, **{"density": DENSITY, "fit": "none", **settings}).gaussians
+    return compact(scene, **{"superpixels": SHARE, "fit": "none", **settings}).gaussians
 
 
 def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:
     """What is decoded as it was encoded."""
-    found = decode_scene(encode_scene(scene, **{"density": DENSITY, **settings}))
+    found = decode_scene(encode_scene(scene, **{"superpixels": SHARE, **settings}))
     assert scenes.identical(found, unfitted(scene, **settings))
     assert len(found) > 10
     return found
@@ -74,9 +74,9 @@ def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene
     [
         {"budget": "5%"},
         {"budget": 300, "k": 2},
-        {"max_bytes": "20KB"},
+        {"budget": "20KB"},
         {"k": 8},
-        {"k": "auto"},
+        {"budget": "auto"},
         {"effort": "draft", "k": 2},
         {"robust": False, "match": "aabb", "k": 2},
         {"rule": "paper", "k": 2},
@@ -89,7 +89,7 @@ def test_the_same_settings_give_the_same_gaussians(settings: dict[str, Any], pix
     assert_equal_to_compact(pixels, **settings)
 
 
-@pytest.mark.parametrize("settings", [{"budget": "6%"}, {"k": "auto"}, {"preset": "quest3", "k": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{"budget": "6%"}, {"budget": "auto"}, {"budget": "quest3", "k": 2}], ids=str)
 def test_the_same_without_photos(settings: dict[str, Any], bare: PixelScene) -> None:
     assert_equal_to_compact(bare, **settings)
 
@@ -99,7 +99,7 @@ def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Pixe
     checkpoint = written(tmp_path / "networks.safetensors", noisy())
     found = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
     assert not scenes.identical(found, unfitted(pixels, **settings))
-    kept = encode_scene(pixels, density=DENSITY, checkpoint=str(checkpoint), **settings)
+    kept = encode_scene(pixels, superpixels=SHARE, checkpoint=str(checkpoint), **settings)
     checkpoint.unlink()
     gsmerge.save_encoded(tmp_path / "scene.gsm", kept)
     assert scenes.identical(decode_scene(gsmerge.load_encoded(tmp_path / "scene.gsm")), found)
@@ -108,10 +108,10 @@ def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Pixe
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_scenes_in_no_order(k: int, pixels: PixelScene) -> None:
     loose = voxels(pixels, 0.05)
-    found = encode_scene(loose, density=0.2)
+    found = encode_scene(loose, superpixels="20%")
     assert found.settings.num_slots is not None
     assert found.settings.max_k == 8
-    assert scenes.identical(decode_scene(found, k=k), unfitted(loose, k=k, density=0.2))
+    assert scenes.identical(decode_scene(found, k=k), unfitted(loose, k=k, superpixels="20%"))
 
 
 def test_shuffled_rows_and_a_budget(pixels: PixelScene) -> None:
@@ -123,7 +123,7 @@ def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: PixelScene)
     loose = shuffled(pixels)
     hidden = far_behind(loose.gaussians, 200)
     both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
-    found = encode_scene(both, density=DENSITY, unseen="keep", **settings)
+    found = encode_scene(both, superpixels=SHARE, unseen="keep", **settings)
     assert found.num_kept > 0
     assert scenes.identical(decode_scene(found), unfitted(both, unseen="keep", **settings))
 
@@ -147,30 +147,30 @@ def test_more_than_there_is_to_divide_is_told(encoded: Encoded) -> None:
 
 
 def test_auto_takes_what_compact_would_without_photos(bare: PixelScene, encoded_bare: Encoded) -> None:
-    wanted = len(unfitted(bare, k="auto"))
+    wanted = len(unfitted(bare, budget="auto"))
     assert encoded_bare.settings.knee_count == wanted
-    plan = plan_decode(encoded_bare, k="auto")
+    plan = plan_decode(encoded_bare, budget="auto")
     assert plan.counts.sum() == max(wanted, len(encoded_bare))
     fewer = replace(encoded_bare, settings=replace(encoded_bare.settings, knee_count=len(encoded_bare) - 1))
-    plan = plan_decode(fewer, k="auto")
+    plan = plan_decode(fewer, budget="auto")
     assert plan.counts.tolist() == [1] * len(encoded_bare)
     assert "fewer than there are groups" in plan.notes[0]
 
 
 def test_auto_of_what_was_encoded_so(pixels: PixelScene) -> None:
-    found = encode_scene(pixels, density=DENSITY, k="auto")
-    assert scenes.identical(decode_scene(found), decode_scene(found, k="auto"))
+    found = encode_scene(pixels, superpixels=SHARE, budget="auto")
+    assert scenes.identical(decode_scene(found), decode_scene(found, budget="auto"))
 
 
 def test_the_result_does_not_depend_on_the_threads(pixels: PixelScene, encoded: Encoded) -> None:
-    one = decode_scene(encode_scene(pixels, density=DENSITY, threads=1), k=2, threads=1)
+    one = decode_scene(encode_scene(pixels, superpixels=SHARE, threads=1), k=2, threads=1)
     assert scenes.identical(one, decode_scene(encoded, k=2, threads=2))
 
 
 @pytest.mark.parametrize(
     ("wish", "words"),
     [
-        ({"k": 5}, 'k: expected 1 to 4 or "auto", as encoded'),
+        ({"k": 5}, "k: expected 1 to 4, as encoded"),
         ({"k": 0}, "k: expected 1 to 4"),
         ({"k": "many"}, "k: expected 1 to 4"),
         ({"k": 2, "budget": 900}, "expected one of k and budget, got both"),
@@ -191,8 +191,8 @@ def test_wishes_that_cannot_be_met(wish: dict[str, Any], words: str, encoded: En
         ({"fit": "color"}, "fit color: cannot be encoded"),
         ({"method": "voxel"}, "method voxel: cannot be encoded"),
         ({"levels": 2}, "levels: cannot be encoded"),
-        ({"max_drop": 0.1}, "max drop: cannot be encoded"),
-        ({"target_psnr": 20.0}, "target psnr: cannot be encoded"),
+        ({"quality": "-0.1dB"}, "quality -0.1dB: cannot be encoded"),
+        ({"quality": "20dB"}, "quality 20dB: cannot be encoded"),
         ({"max_k": 9}, "max k: expected 1 to 8, got 9"),
         ({"max_k": 2, "k": 3}, "max k: expected at least 3, which is k, got 2"),
     ],
@@ -208,7 +208,7 @@ def test_a_budget_that_keeps_everything_needs_no_encoding(pixels: PixelScene) ->
 
 
 def test_fewer_children_take_less_space(pixels: PixelScene, encoded: Encoded) -> None:
-    small = encode_scene(pixels, density=DENSITY, max_k=1)
+    small = encode_scene(pixels, superpixels=SHARE, max_k=1)
     assert len(small.division.children) == 0
     assert scenes.identical(decode_scene(small), decode_scene(encoded, k=1))
     with pytest.raises(UsageError, match="expected 1 to 1"):
@@ -218,7 +218,7 @@ def test_fewer_children_take_less_space(pixels: PixelScene, encoded: Encoded) ->
 def test_it_tells_where_it_comes_from(encoded: Encoded) -> None:
     about = encoded.about
     assert about["gsmerge"] == gsmerge.__version__
-    assert about["options"]["density"] == DENSITY
+    assert about["options"]["superpixels"] == SHARE
     assert about["options"]["fit"] == "none"
     assert "threads" not in about["options"]
     assert about["choices"]["clusters"] <= about["choices"]["groups"]

@@ -42,7 +42,7 @@ def scene() -> PixelScene:
 def drawn(scene: PixelScene, degree: int) -> Gaussians:
     """Merged Gaussians with random rotations, sizes and harmonics."""
     rng = torch.Generator().manual_seed(degree)
-    g = scenes.plain(scene, density=0.1)
+    g = scenes.plain(scene, superpixels="10%")
     quats = torch.nn.functional.normalize(torch.randn(g.quats.shape, generator=rng), dim=1)
     shN = 0.1 * torch.randn((len(g), (degree + 1) ** 2 - 1, 3), generator=rng)
     scales = g.scales * (0.5 + torch.rand(g.scales.shape, generator=rng))

@@ -224,7 +224,10 @@ def test_every_member_counts_in_the_mass_even_when_sampled(scene: Made) -> None:
 
 @pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
 def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
-    learned, f = scene.learned(noisy(replace(SMALL, members=64))), scene.features  # a sample hangs on the bits of means
+    learned, f = (
+        scene.learned(noisy(replace(SMALL, members=64))),
+        scene.features,
+    )  # a sample depends on the bits of means
     cameras = scene.scene.cameras
     viewmats = cameras.viewmats.clone()
     viewmats[:, :3, 3] *= factor

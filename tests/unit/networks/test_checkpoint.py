@@ -37,9 +37,9 @@ def with_header(**changes: object) -> Spoil:
 
 def with_tensors(change: Callable[[dict[str, torch.Tensor]], object]) -> Spoil:
     def spoil(path: Path) -> None:
-        told, tensors = header(path), load_file(path)
+        header_text, tensors = header(path), load_file(path)
         change(tensors)
-        save_file(tensors, path, told)
+        save_file(tensors, path, header_text)
 
     return spoil
 

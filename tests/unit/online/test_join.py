@@ -136,4 +136,4 @@ def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], 
     division = divide_all(after.features, child_members(after), 4, "depth")
     assert division.children.sh0.isfinite().all()
     assert DecodeOptions().count == 1
-    assert FAST["density"] == 0.1
+    assert FAST["superpixels"] == "10%"

@@ -37,7 +37,7 @@ def test_settings_within_range(values: dict[str, Any]) -> None:
     assert vars(OnlineOptions(**values)).items() >= values.items()
 
 
-@pytest.mark.parametrize("values", [{"mood": 1}, {"density": -1}, {"k": 0}, {"fit": "some"}], ids=str)
+@pytest.mark.parametrize("values", [{"mood": 1}, {"superpixels": -1}, {"k": 0}, {"fit": "some"}], ids=str)
 def test_other_settings_are_checked_too(values: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(values))):
         Compactor(**values)
@@ -51,10 +51,10 @@ def test_colours_are_fitted_unless_told_otherwise() -> None:
 
 
 def test_the_state_s_settings_come_before_the_defaults() -> None:
-    told = {"density": 0.07, "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
+    told = {"superpixels": "7%", "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
     state: Any = SimpleNamespace(about={"options": told, "batches": []})
     options, online = merge_settings({"tolerance": 0.3, "seed": 4}, state)
-    assert options.to_dict().items() >= {"density": 0.07, "fit": "none", "seed": 4}.items()
+    assert options.to_dict().items() >= {"superpixels": "7%", "fit": "none", "seed": 4}.items()
     assert online.tolerance == 0.3
 
 

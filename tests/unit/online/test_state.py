@@ -245,7 +245,7 @@ def pixels() -> PixelScene:
 @pytest.mark.parametrize("networks", [False, True])
 def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: PixelScene, tmp_path: Path) -> None:
     checkpoint = str(written(tmp_path / "a.safetensors", noisy())) if networks else "none"
-    encoded = encode_scene(pixels, density=0.05, max_k=most, checkpoint=checkpoint)
+    encoded = encode_scene(pixels, superpixels="5%", max_k=most, checkpoint=checkpoint)
     assert (encoded.heads is not None) == networks
     state = from_encoded(encoded)
     assert (len(state), len(state.replay), state.sh_degree) == (len(encoded), 0, 1)
@@ -255,9 +255,9 @@ def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: PixelSce
         assert_same_children(decode_scene(again, k=k), decode_scene(encoded, k=k))
 
 
-@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"k": "auto"}, {"k": 2, "rule": "paper"}], ids=str)
+@pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"k": 2, "rule": "paper"}], ids=str)
 def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: PixelScene) -> None:
-    encoded = encode_scene(pixels, density=0.05, checkpoint="none", robust=False, **settings)
+    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False, **settings)
     state = from_encoded(encoded)
     assert state.settings.target_count is None
     assert state.settings.max_k == encoded.settings.max_k
@@ -270,7 +270,7 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Pixel
 def test_division_between_one_and_most_is_about_as_good(pixels: PixelScene) -> None:
     """Children are divided again, of what they are and not of the pixels: close, not equal."""
     for rule in ("depth", "paper"):
-        encoded = encode_scene(pixels, density=0.05, checkpoint="none", robust=False, rule=rule)
+        encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False, rule=rule)
         again = to_encoded(from_encoded(encoded))
         for k in (2, 3):
             before, after = (scenes.psnr_of(decode_scene(one, k=k), pixels) for one in (encoded, again))
@@ -279,13 +279,13 @@ def test_division_between_one_and_most_is_about_as_good(pixels: PixelScene) -> N
 
 def test_scenes_in_no_order_and_what_no_view_sees(pixels: PixelScene) -> None:
     loose = voxels(pixels, 0.05)
-    state = from_encoded(encode_scene(loose, density=0.1))
+    state = from_encoded(encode_scene(loose, superpixels="10%"))
     assert state.settings.num_slots is None
     assert len(decode_scene(to_encoded(state), k=2)) > len(state)
     loose = shuffled(pixels)
     hidden = far_behind(loose.gaussians, 200)
     both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
-    encoded = encode_scene(both, density=0.1, unseen="keep")
+    encoded = encode_scene(both, superpixels="10%", unseen="keep")
     state = from_encoded(encoded)
     assert state.kept is not None
     assert scenes.identical(state.kept, encoded.kept)  # type: ignore[arg-type]
@@ -293,9 +293,9 @@ def test_scenes_in_no_order_and_what_no_view_sees(pixels: PixelScene) -> None:
 
 
 def test_what_is_told_of_an_encoded_scene(pixels: PixelScene) -> None:
-    encoded = encode_scene(pixels, density=0.05, checkpoint="none")
+    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
     about = from_encoded(encoded).about
-    assert about["options"]["density"] == 0.05
+    assert about["options"]["superpixels"] == "5%"
     assert "fit" not in about["options"]
     assert [one["num_groups"] for one in about["batches"]] == [len(encoded)]
     assert about["batches"][0]["num_views"] == 3
@@ -303,7 +303,7 @@ def test_what_is_told_of_an_encoded_scene(pixels: PixelScene) -> None:
 
 
 def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: PixelScene) -> None:
-    state = from_encoded(encode_scene(pixels, density=0.05, checkpoint="none", robust=False))
+    state = from_encoded(encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False))
     state = replace(state, groups=replace(state.groups, fitted_sh0=state.groups.fitted_sh0 + 0.2 / SH_C0))
     as_came, fitted = to_encoded(state, fitted_colors=False), to_encoded(state)
     assert torch.equal(as_came.features.sh0, state.groups.features.sh0)

@@ -102,18 +102,18 @@ def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
 @pytest.mark.slow
 def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
     read = read_held_out(load, made_scene / "targets")
-    told: list[tuple[str, int, int]] = []
+    steps: list[tuple[str, int, int]] = []
     found = stress(
         load,
-        CompactOptions().with_settings({"fit_steps": 30, "density": 0.1}),
+        CompactOptions().with_settings({"fit_steps": 30, "superpixels": "10%"}),
         targets=Views(read.cameras, read.images, read.names),
-        progress=lambda *step: told.append(step),
+        progress=lambda *step: steps.append(step),
     )
     assert [outcome.case for outcome in found] == list(CASES)
     failed = {o.case: o.measured for o in found if o.passed is False}
     assert failed == {}
     assert [o.case for o in found if o.passed is None] == ["c2w-opengl"]
-    assert told[-1] == ("done", len(CASES), len(CASES))
+    assert steps[-1] == ("done", len(CASES), len(CASES))
 
 
 def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:

@@ -78,7 +78,7 @@ def plan(*, photos: bool = True, views: int = 12, count: int | None = None, **se
         photos=photos,
         threads=2,
         fit_steps=options.fit.steps,
-        default_count=views * 800 * options.decode.count,
+        default_count=views * 800 * options.decode.k,
         budget=count,
     )
 
@@ -87,7 +87,7 @@ def test_plan_counts() -> None:
     assert plan(k=2)["output"]["num_gaussians_at_most"] == 12 * 800 * 2
     assert plan(views=1, k=8)["output"]["num_gaussians_at_most"] == 6400
     assert plan()["input"]["num_gaussians"] == 240_000
-    assert plan(k="auto")["output"]["num_gaussians_at_most"] == 12 * 800
+    assert plan(budget="auto")["output"]["num_gaussians_at_most"] == 12 * 800
 
 
 def test_plan_of_a_budget() -> None:
@@ -95,7 +95,7 @@ def test_plan_of_a_budget() -> None:
     assert document["output"]["num_gaussians_at_most"] == 4800
     assert document["superpixels_per_view"] is None
     assert any("at most 4,800" in line for line in plan_lines(document))
-    assert all(plan_lines(plan(k="auto")))
+    assert all(plan_lines(plan(budget="auto")))
 
 
 def test_plan_says_what_will_not_run() -> None:

@@ -80,11 +80,6 @@ def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k:
         assert (decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).abs().max() > 0.1
 
 
-def test_auto_is_one_child(features: FeatureGaussians, members: Members) -> None:
-    assert DecodeOptions(k="auto").count == 1
-    assert_alike(decode(features, members, DecodeOptions(k="auto")), feature_to_gaussians(features))
-
-
 def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -> None:
     same = Members(
         *(np.repeat(getattr(members, n)[:1], 10, axis=0) for n in members.__dataclass_fields__ if n != "pixels")
@@ -156,5 +151,5 @@ def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
 
 @pytest.mark.parametrize("k", [0, -1, 9])
 def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
-    with pytest.raises(ValueError, match=f'k: expected 1 to 8 or "auto", got {k}'):
+    with pytest.raises(ValueError, match=f"k: expected 1 to 8, got {k}"):
         decode(features, members, DecodeOptions(k=k))

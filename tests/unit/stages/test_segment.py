@@ -92,17 +92,17 @@ def test_options_are_checked(options: dict, message: str) -> None:
 
 def test_counts_of_options() -> None:
     assert count_for(SegmentOptions(superpixels=7), 100, 100) == 7
-    assert count_for(SegmentOptions(density=0.05), 20, 30) == 30
-    assert count_for(SegmentOptions(density=0.001), 5, 5) == 1
+    assert count_for(SegmentOptions(superpixels="5%"), 20, 30) == 30
+    assert count_for(SegmentOptions(superpixels="0.1%"), 5, 5) == 1
     with pytest.raises(ValueError, match="superpixels: expected at least 1, got 0"):
         SegmentOptions(superpixels=0)
-    with pytest.raises(ValueError, match=r"density: expected a number in \(0, 1\], got 0"):
-        SegmentOptions(density=0)
+    with pytest.raises(ValueError, match=r'superpixels: expected a number, or a share as "4\.4%", above 0'):
+        SegmentOptions(superpixels="0%")
 
 
 def test_segment_treats_each_view_alone() -> None:
     images = torch.from_numpy(np.stack([random_image(16, 24, seed) for seed in range(3)]))
-    groups = segment(images, SegmentOptions(density=0.1))
+    groups = segment(images, SegmentOptions(superpixels="10%"))
     assert groups.counts == (38, 38, 38)
     for view in range(3):
         assert torch.equal(groups.labels[view], superpixels(images[view], 38))

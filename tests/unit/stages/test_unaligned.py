@@ -120,7 +120,7 @@ def test_depths_are_those_of_the_surfaces(room: PixelScene) -> None:
 
 
 def test_density_is_of_the_gaussians_where_those_are_fewer(room: PixelScene) -> None:
-    options = CompactOptions().with_settings({"density": 0.1})
+    options = CompactOptions().with_settings({"superpixels": "10%"})
     whole = loose.loosened(room)
     assert superpixels_per_view(whole, options) == superpixels_per_view(room, options) == 76
     assert superpixels_per_view(replace(whole, gaussians=room.gaussians[::2]), options) == 38
@@ -165,7 +165,7 @@ def test_neighbours_are_merged(room: PixelScene) -> None:
 def test_unseen_ones_are_dropped_or_kept(room: PixelScene, settings: dict) -> None:
     hidden = loose.far_behind(room.gaussians, 600)
     scene = replace(loose.loosened(room), gaussians=type(hidden).concat([room.gaussians, hidden]))
-    options = {"density": 0.1, "robust": False, "fit": "none", **settings}
+    options = {"superpixels": "10%", "robust": False, "fit": "none", **settings}
     dropped, kept = (compact(scene, unseen=unseen, **options) for unseen in ("drop", "keep"))
     behind = [int((result.gaussians.means[:, 2] < -5).sum()) for result in (dropped, kept)]
     assert behind[0] == 0

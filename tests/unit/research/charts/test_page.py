@@ -1,4 +1,4 @@
-"""The page stands alone, escapes what it is told, and the drawings repeat to the byte."""
+"""The page stands alone, escapes text, and the drawings repeat to the byte."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def test_targets_are_one_file_or_a_template(scene_copy: Path) -> None:
         assert place.num_views == 5
     (named,) = find_scenes([ply], "{parent}/{stem}.ply")
     assert named.targets == ply
-    (scene_copy / "transforms.json").write_text("{")  # told when the scene is read
+    (scene_copy / "transforms.json").write_text("{")  # an error when the scene is read
     assert find_scenes([scene_copy])[0].num_views is None
     with pytest.raises(SceneError, match="expected cameras of held-out views"):
         find_scenes([scene_copy], "{scene}/nothing.json")

@@ -64,9 +64,9 @@ def test_names_tell_only_what_differs() -> None:
 
 
 def test_sizes_have_names() -> None:
-    sizes = [{"budget": "2%"}, {"budget": 40000}, {"density": 0.01}, {}]
-    told = [size_label(replace(make_record("fern", "gsmerge"), settings=settings)) for settings in sizes]
-    assert told == ["2%", "40,000", "density 0.01", ""]
+    sizes = [{"budget": "2%"}, {"budget": 40000}, {"superpixels": "1%"}, {}]
+    labels = [size_label(replace(make_record("fern", "gsmerge"), settings=settings)) for settings in sizes]
+    assert labels == ["2%", "40,000", "1% superpixels", ""]
 
 
 def test_means_are_over_the_same_scenes() -> None:

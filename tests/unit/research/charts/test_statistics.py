@@ -134,6 +134,6 @@ def test_nothing_is_said_where_ours_has_nothing_as_cheap() -> None:
 
 def test_one_scene_of_several_says_nothing() -> None:
     curve = {"a": [(1.0, 20.0)], "b": [(9.0, 20.0)]}
-    found = judge("rival", {"a": (2.0, 15.0), "b": (2.0, 15.0)}, curve)
+    found = judge("voxel", {"a": (2.0, 15.0), "b": (2.0, 15.0)}, curve)
     assert (found.words, found.ahead and found.ahead.count) == ("undecided", 1)
-    assert judge("rival", {"a": (2.0, 15.0)}, curve).words == "ours above"
+    assert judge("voxel", {"a": (2.0, 15.0)}, curve).words == "ours above"

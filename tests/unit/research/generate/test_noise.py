@@ -159,7 +159,7 @@ def test_what_is_drawn_lies_in_the_ranges() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (lambda: NoiseOptions(grain=(0.2, 0.1)), "grain"),
         (lambda: NoiseOptions(drift=(0.0, 0.1)), "drift"),
@@ -172,8 +172,8 @@ def test_what_is_drawn_lies_in_the_ranges() -> None:
         (lambda: GenerateOptions(noise=-1.0), "noise: expected 0 to 10"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(options, told: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=told):
+def test_settings_that_make_no_sense_are_refused(options, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
         options()
 
 

@@ -229,7 +229,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
 
         found = torch.autograd.grad(loss(), parameters)
         directions = [torch.randn(p.shape, generator=generator) for p in parameters]
-        told = sum(float((g * d).sum()) for g, d in zip(found, directions, strict=True))
+        derivative = sum(float((g * d).sum()) for g, d in zip(found, directions, strict=True))
         before, values = [p.detach().clone() for p in parameters], []
         for step in (1e-2, -1e-2):
             with torch.no_grad():
@@ -239,7 +239,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
         with torch.no_grad():
             for p, b in zip(parameters, before, strict=True):
                 p.copy_(b)
-        assert told == pytest.approx((values[0] - values[1]) / 2e-2, rel=0.1, abs=2e-3)
+        assert derivative == pytest.approx((values[0] - values[1]) / 2e-2, rel=0.1, abs=2e-3)
 
 
 def test_every_network_learns_from_renders(example: Example) -> None:

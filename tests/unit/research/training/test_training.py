@@ -112,8 +112,8 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
     start = example.levels[1].children
     made = corrections_between(start, final, learned.describe(merge(example.features, example.matches)).frames)
     for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
-        told, real = total[:, columns].reshape(-1), made[:, columns].reshape(-1)
-        assert float(torch.corrcoef(torch.stack([told, real]))[0, 1]) > 0.8
+        given, real = total[:, columns].reshape(-1), made[:, columns].reshape(-1)
+        assert float(torch.corrcoef(torch.stack([given, real]))[0, 1]) > 0.8
 
 
 def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> None:
@@ -144,7 +144,7 @@ def test_training_lowers_the_loss(example: Example, tmp_path: Path) -> None:
 
 def test_a_trained_checkpoint_works(example: Example, tmp_path: Path) -> None:
     done = train([example], [], tmp_path, replace(OPTIONS, steps=4))
-    chosen = {"fit": "none", "density": 0.1, "robust": False}
+    chosen = {"fit": "none", "superpixels": "10%", "robust": False}
     plain = gsmerge.compact(scene(), **chosen)
     learned = gsmerge.compact(scene(), **chosen, checkpoint=str(done.last), require_checkpoint=True)
     assert not torch.equal(plain.gaussians.means, learned.gaussians.means)
@@ -190,12 +190,12 @@ def test_another_run_is_not_gone_on_with(example: Example, tmp_path: Path) -> No
 def test_examples_are_kept_by_content(tmp_path: Path) -> None:
     fits: list[int] = []
 
-    def told(step: int, _: int) -> None:
+    def report(step: int, _: int) -> None:
         fits.append(step)
 
-    first = make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, told)
+    first = make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, report)
     assert len(fits) == 2 * OPTIONS.fit_steps
-    second = make_example(training_scene(), OPTIONS, 0.1, "b", tmp_path, told)
+    second = make_example(training_scene(), OPTIONS, 0.1, "b", tmp_path, report)
     assert len(fits) == 2 * OPTIONS.fit_steps
     assert first.sha256 == second.sha256
     for k in OPTIONS.levels:
@@ -205,7 +205,7 @@ def test_examples_are_kept_by_content(tmp_path: Path) -> None:
     (kept,) = tmp_path.iterdir()
     kept.write_bytes(kept.read_bytes()[:1000])
     assert (
-        make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, told)
+        make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, report)
         .levels[1]
         .targets.equal(first.levels[1].targets)
     )
@@ -283,10 +283,10 @@ def test_rate_rises_and_falls() -> None:
 
 
 def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for there, told in ((False, "cpu"), (True, "cuda")):
+    for there, expected in ((False, "cpu"), (True, "cuda")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         assert choose_device("cpu") == "cpu"
-        assert choose_device("auto") == told
+        assert choose_device("auto") == expected
     assert choose_device("cuda") == "cuda"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for expected in ("cuda", "tpu"):

@@ -175,7 +175,7 @@ def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
 
 def test_growing_pays(scene: PixelScene, photos: Pair) -> None:
     """At the same final number, against nothing but the first ones."""
-    start = scenes.plain(scene, density=0.03)
+    start = scenes.plain(scene, superpixels="3%")
     start = replace(start, means=start.means.float())
     alone, grown = (fit_full(start, photos, LONG, count=c * len(start))[0] for c in (1, 2))
     assert scenes.psnr_of(grown, scene) > scenes.psnr_of(alone, scene) + 0.5

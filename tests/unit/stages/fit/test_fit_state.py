@@ -21,7 +21,7 @@ from gsmerge.stages.fit.state import State, gaussians_of, start_state
 
 def make(degree: int) -> tuple[PixelScene, Gaussians]:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
-    found = scenes.plain(scene, density=0.08)
+    found = scenes.plain(scene, superpixels="8%")
     return scene, replace(found, means=found.means.float())
 
 
