@@ -95,6 +95,12 @@ def made_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPat
     return folder
 
 
+@pytest.fixture(scope="session")
+def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same in a quarter of the pixels, 5 views of 48 x 32, where size does not matter. Read only."""
+    return make_scene(tmp_path_factory.mktemp("small") / "scene", num_views=5, width=48, height=32)
+
+
 @pytest.fixture
 def scene_copy(made_scene: Path, tmp_path: Path) -> Path:
     """A copy of the made scene that a test may change."""

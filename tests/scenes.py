@@ -176,9 +176,16 @@ def make_scene(
         pixel_gaussians(TrueView(image, hits.depth, hits.normals, c2w), lens, errors, rng)
         for image, (c2w, hits, _) in zip(images, found, strict=True)
     ]
+    gaussians = Gaussians.concat(parts)
+    means = gaussians.means.double()
+    if not noise:  # exactly on the surfaces, so that what is equal is so in float64
+        means = torch.from_numpy(
+            np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in found])
+        )
+    gaussians = nudged(replace(gaussians, means=means))
     valid = torch.ones((len(cameras), cameras.height, cameras.width), dtype=torch.bool)
     pictures = torch.from_numpy(np.stack(images)) if photos else None
-    return PixelScene(nudged(Gaussians.concat(parts)), cameras, pictures, valid, names(len(cameras)))
+    return PixelScene(gaussians, cameras, pictures, valid, names(len(cameras)))
 
 
 def names(count: int) -> tuple[str, ...]:

@@ -420,6 +420,7 @@ def test_a_full_disk_leaves_the_old_state(state: Path, states: list[Path], walks
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="signals as Linux has them")
+@pytest.mark.slow
 def test_killed_in_the_middle(state: Path, states: list[Path], walks: list[Path], run: Run) -> None:
     """While it works, then right when it writes: the old state stays whole, and a rerun gives the usual bytes."""
     process = subprocess.Popen(

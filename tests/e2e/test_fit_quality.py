@@ -55,7 +55,7 @@ def test_short_fits_reach_the_floor(
     floor(found)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_full_fit_beats_the_colour_fit(
     seed: int, compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:

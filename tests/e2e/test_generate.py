@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
+
+from gsmerge.cli import main
 
 from .conftest import Run, listing
 
@@ -13,13 +16,26 @@ COMPILING = "compiling kernels for their first use, up to 30 s\n"
 SMALL = ("--scenes", 2, "--views", "3", "--size", "48x36")
 
 
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes. Read only."""
+    folder = tmp_path_factory.mktemp("generate") / "made"
+    assert main(["generate", "-o", str(folder), *map(str, SMALL), "--quiet"]) == 0
+    return folder
+
+
 @pytest.fixture
-def made(tmp_path: Path, run: Run) -> Path:
+def made(generated: Path, tmp_path: Path) -> Path:
+    """A copy of these that a test may change."""
+    return Path(shutil.copytree(generated, tmp_path / "made"))
+
+
+def test_scenes_are_made_and_counted(generated: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("generate", "-o", tmp_path / "made", *SMALL)
     assert outcome.code == 0
     assert outcome.err in ("", COMPILING)
     assert outcome.out == f"{tmp_path / 'made'}: 2 scenes\n"
-    return tmp_path / "made"
+    assert listing(tmp_path / "made") == listing(generated)
 
 
 def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:

@@ -81,7 +81,11 @@ def one_line(err: str) -> None:
     assert "unexpected" not in err.split(":")[2]
 
 
-@pytest.mark.parametrize("name", CASES)
+# one in four by default, all with -m slow: a tenth of a second each
+SWEEP = [pytest.param(name, marks=[pytest.mark.slow] if i % 4 else []) for i, name in enumerate(CASES)]
+
+
+@pytest.mark.parametrize("name", SWEEP)
 def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, run: Run) -> None:
     case = CASES[name]
     arguments = [str(argument) for argument in case.spoil(scene) or [scene]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,12 @@ from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_scene
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture
+def scene_copy(small_scene: Path, tmp_path: Path) -> Path:
+    """A copy that a test may change, of 5 views of 48 x 32: all readings of the cameras are tried on every pixel."""
+    return Path(shutil.copytree(small_scene, tmp_path / "scene"))
 
 
 def with_poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -64,7 +71,7 @@ def test_wrong_poses_are_measured(scene_copy: Path) -> None:
 
 def test_swapped_width_and_height(scene_copy: Path) -> None:
     with_values(scene_copy, lambda v: {"w": v["h"], "h": v["w"]})
-    with pytest.raises(SceneError, match="found 64 x 96; width and height are swapped"):
+    with pytest.raises(SceneError, match="found 32 x 48; width and height are swapped"):
         read_scene(scene_copy)
 
 
@@ -73,10 +80,10 @@ def test_cameras_of_the_original_photos(scene_copy: Path) -> None:
     with_values(scene_copy, lambda v: {k: 3 * v[k] for k in ("w", "h", "fl_x", "fl_y", "cx", "cy") if k in v})
     loaded = load_scene(scene_copy)
     assert np.allclose(loaded.scene.cameras.Ks, before.Ks)
-    assert loaded.notes == ("intrinsics scaled from 288 x 192 to the images' 96 x 64",)
+    assert loaded.notes == ("intrinsics scaled from 144 x 96 to the images' 48 x 32",)
 
 
-@pytest.mark.parametrize("size", [(192, 128), (84, 56), (96, 60)])
+@pytest.mark.parametrize("size", [(96, 64), (42, 28), (48, 30)])
 def test_images_of_another_size_are_brought_to_the_grid(scene_copy: Path, size: tuple[int, int]) -> None:
     usual = read_scene(scene_copy).images
     for path in (scene_copy / "images").iterdir():
@@ -84,14 +91,14 @@ def test_images_of_another_size_are_brought_to_the_grid(scene_copy: Path, size: 
     loaded = load_scene(scene_copy)
     assert float((loaded.scene.images - usual).abs().mean()) < 0.05
     assert loaded.notes == (
-        f"photos of {size[0]} x {size[1]} are resized to 96 x 64, the cameras' and the Gaussian grid's size",
+        f"photos of {size[0]} x {size[1]} are resized to 48 x 32, the cameras' and the Gaussian grid's size",
     )
 
 
 def test_previews_name_both_sizes(scene_copy: Path) -> None:
     for path in (scene_copy / "images").iterdir():
-        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (48, 32)))
-    with pytest.raises(SceneError, match="Gaussian grid's size 96 x 64 or larger, found 48 x 32"):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (24, 16)))
+    with pytest.raises(SceneError, match="Gaussian grid's size 48 x 32 or larger, found 24 x 16"):
         read_scene(scene_copy)
 
 
@@ -100,7 +107,7 @@ def test_fewer_cameras_than_views(scene_copy: Path) -> None:
     data = json.loads(path.read_text())
     data["frames"] = data["frames"][:3]
     path.write_text(json.dumps(data))
-    expected = "3 x 64 x 96 = 18432 .views x height x width., found 30720; that is 5 views of this size"
+    expected = "3 x 32 x 48 = 4608 .views x height x width., found 7680; that is 5 views of this size"
     with pytest.raises(SceneError, match=expected):
         read_scene(scene_copy)
 

@@ -42,9 +42,8 @@ def test_positions_stay_exact_in_wide_pictures() -> None:
     assert np.array_equal(near, far)
 
 
-@pytest.mark.parametrize(
-    "density", [DENSITIES[0], *(pytest.param(density, marks=pytest.mark.slow) for density in DENSITIES[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("density", DENSITIES)
 def test_photos_are_described_well(density: int, floor: Callable[..., None]) -> None:
     scores = []
     for image in photos().values():

@@ -203,7 +203,9 @@ KILLS = {
 }
 
 
-@pytest.mark.parametrize("moment", KILLS)
+@pytest.mark.parametrize(
+    "moment", [pytest.param(name, marks=[] if name == "before the record" else [pytest.mark.slow]) for name in KILLS]
+)
 def test_a_kill_at_any_moment_loses_nothing(
     moment: str, scene: Path, out: Path, root: Path, undisturbed: dict[str, str]
 ) -> None:

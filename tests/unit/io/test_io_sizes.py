@@ -94,7 +94,7 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
 
 
-@pytest.mark.parametrize("shape", ["larger", "cropped"])
+@pytest.mark.parametrize("shape", [pytest.param("larger", marks=pytest.mark.slow), "cropped"])
 @pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
 def test_photos_of_another_size_and_poses_read_in_another_way(
     tmp_path: Path, true: tuple[str, str], shape: str

@@ -17,6 +17,8 @@ from gsmerge.io.alignment.similarity import IDENTITY
 from gsmerge.io.alignment.unordered import unordered_layout
 from gsmerge.types import SH_C0, UnalignedScene
 
+MANY_OR_FEW = [3, pytest.param(8, marks=pytest.mark.slow)]  # views
+
 
 def scene_on_rays(views: int, jitter: float = 0.0, size: tuple[int, int] = (64, 48)) -> Tiny:
     """Views of a waved surface from an arc, each Gaussian within ``jitter`` pixels of its pixel's centre."""
@@ -61,7 +63,7 @@ def share_at_home(found: object, tiny: Tiny, kept: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("photos", [True, False])
-@pytest.mark.parametrize("views", [3, 8])
+@pytest.mark.parametrize("views", MANY_OR_FEW)
 @pytest.mark.parametrize("dropped", [0.0, 0.3, 0.6])
 def test_rows_sorted_by_opacity_come_to_their_pixels(tmp_path: Path, views: int, dropped: float, photos: bool) -> None:
     tiny = scene_on_rays(views)
@@ -112,7 +114,7 @@ def test_a_turned_world(tmp_path: Path) -> None:
     assert share_at_home(loaded, tiny, kept) >= 0.99
 
 
-@pytest.mark.parametrize("views", [3, 8])
+@pytest.mark.parametrize("views", MANY_OR_FEW)
 @pytest.mark.parametrize("jitter", [0.25, 0.5])
 def test_rows_anywhere_in_their_pixels_stay_unaligned(tmp_path: Path, views: int, jitter: float) -> None:
     tiny = scene_on_rays(views, jitter)
@@ -121,6 +123,7 @@ def test_rows_anywhere_in_their_pixels_stay_unaligned(tmp_path: Path, views: int
         assert isinstance(load_scene(folder, order=order).scene, UnalignedScene)
 
 
+@pytest.mark.slow
 def test_many_views_make_chance(tmp_path: Path) -> None:
     """Sixty views: most rows are within a twentieth of a pixel of some view's centre."""
     tiny = scene_on_rays(60, 0.5, (32, 24))

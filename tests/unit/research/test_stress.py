@@ -99,6 +99,7 @@ def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
     assert cases.repeat_views(scene_in).scene.names == scene.names * 2
 
 
+@pytest.mark.slow
 def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
     read = read_held_out(load, made_scene / "targets")
     steps: list[tuple[str, int, int]] = []

@@ -324,6 +324,7 @@ def test_pairs_of_siblings() -> None:
     assert len(sibling_pairs(torch.zeros(0, dtype=torch.int64))[0]) == 0
 
 
+@pytest.mark.slow
 def test_training_on_renders_makes_them_better(example: Example, tmp_path: Path) -> None:
     done = train([example], [example], tmp_path, replace(PHOTO, steps=40, save_every=20, warmup=5))
     rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))

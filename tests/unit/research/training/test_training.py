@@ -151,6 +151,7 @@ def test_a_trained_checkpoint_works(example: Example, tmp_path: Path) -> None:
     assert learned.report.choices["networks"]["training"]["step"] == 4
 
 
+@pytest.mark.slow
 def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(example: Example, tmp_path: Path) -> None:
     train([example], [example], tmp_path / "whole", OPTIONS, threads=1)
 
