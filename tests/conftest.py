@@ -66,8 +66,23 @@ def root() -> Path:
 
 @pytest.fixture(scope="session")
 def make_scene() -> Callable[..., Path]:
-    """``make_scene(out, num_views=, width=, height=, seed=)`` of the first example."""
-    return load_script(ROOT / "examples" / "01_make_scene.py").make_scene
+    """``make_scene(out, num_views=, width=, height=, seed=)`` of the first example, as other programs write files.
+
+    That is without the comment by which the project's own files name the encoding of their opacities.
+    """
+    example = load_script(ROOT / "examples" / "01_make_scene.py").make_scene
+
+    def make(out: Path, **sizes: int) -> Path:
+        ply = example(out, **sizes) / "scene.ply"
+        if NUDGE in os.environ:
+            import gsmerge
+
+            gsmerge.write_ply(ply, nudged(gsmerge.read_ply(ply).gaussians), overwrite=True)
+        head, rows = ply.read_bytes().split(b"end_header\n", 1)
+        ply.write_bytes(head.replace(b"comment opacity: logit\n", b"") + b"end_header\n" + rows)
+        return out
+
+    return make
 
 
 @pytest.fixture
@@ -86,13 +101,7 @@ def target_psnr() -> Callable[[Path, Path], float]:
 @pytest.fixture(scope="session")
 def made_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scene.ply, transforms.json, images/ and targets/: 5 views of 96 x 64. Read only."""
-    folder = make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=96, height=64)
-    if NUDGE in os.environ:
-        import gsmerge
-
-        gaussians = gsmerge.read_scene(folder).gaussians
-        gsmerge.write_ply(folder / "scene.ply", nudged(gaussians), overwrite=True)
-    return folder
+    return make_scene(tmp_path_factory.mktemp("made") / "scene", num_views=5, width=96, height=64)
 
 
 @pytest.fixture(scope="session")

@@ -82,7 +82,7 @@ def test_a_scene_too_large_for_the_machine_is_told_before_it_is_read(
 ) -> None:
     said = "this machine has 0.1 GB: use fewer views"
     assert said not in run("inspect", scene_copy).out
-    for module in ("gsmerge.runtime.memory", "gsmerge.report"):
+    for module in ("gsmerge.runtime.memory", "gsmerge.runtime.estimate"):
         monkeypatch.setattr(f"{module}.machine_memory", lambda: 10**8)
     outcome = run("compact", scene_copy, *SMALL, "--fit", "none", "--effort", "draft", "--overwrite")
     assert outcome.code == 0
@@ -232,7 +232,7 @@ def test_render(made_scene: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames")
     assert outcome.code == 0, outcome.err
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
-    assert names == [f"view_{i:02d}.png" for i in range(VIEWS)]
+    assert names == [f"view_{i:03d}.png" for i in range(VIEWS)]
     photos = [cv2.imread(str(made_scene / "images" / name)).astype(float) for name in names]
     for i, name in enumerate(names):
         render = cv2.imread(str(tmp_path / "frames" / name)).astype(float)

@@ -100,7 +100,7 @@ def test_the_solution_is_where_the_gradient_vanishes(drawn: tuple[Gaussians, Pho
     """The equations by hand: a dense least-squares problem with what is held on its diagonal."""
     gaussians, photos, views = drawn
     precision = np.random.default_rng(1).uniform(1, 50, len(gaussians))
-    options = replace(FEW, pull=1e-9, iterations=400, huber=1e6, min_gain=1.0, max_gain=1.0)
+    options = replace(FEW, prior_weight=1e-9, iterations=400, huber=1e6, min_gain=1.0, max_gain=1.0)
     found, report = fit_colors(gaussians, views, photos, options, 0, precision)
     assert report.accepted
     n = len(gaussians)

@@ -189,11 +189,11 @@ def test_knee_of_a_wall_and_of_a_texture() -> None:
 
 def test_auto_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
-    assert auto_count(wall) == wall.least < 150
-    labels = cut_tree(wall, wall.least).labels[0].numpy()
-    boxes = [np.nonzero(labels == i) for i in range(wall.least)]
+    assert auto_count(wall) == wall.min_regions < 150
+    labels = cut_tree(wall, wall.min_regions).labels[0].numpy()
+    boxes = [np.nonzero(labels == i) for i in range(wall.min_regions)]
     assert max(max(np.ptp(y), np.ptp(x)) for y, x in boxes) < WIDTH / 8
-    assert auto_count(texture) == knee(texture.counts, texture.distortions) > wall.least
+    assert auto_count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
 
 
 def test_knee_is_where_the_slope_is_the_one_asked_for() -> None:
