@@ -12,6 +12,7 @@ from pathlib import Path
 ROOT, TOOLS = Path(__file__).parent, Path(sys.executable).parent
 TASKS = {
     "tests": (("python", "-m", "pytest"),),
+    "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
     "lint": (("ruff", "check", "."), ("ruff", "format", "--check", ".")),
     "types": (("mypy", "-p", "gsmerge"),),
     "imports": (("lint-imports",),),
@@ -19,7 +20,7 @@ TASKS = {
     "reference": (("python", "docs/generate_reference.py"),),
     "small": (("python", "tools/small_modules.py"),),
 }
-CHECKS = ("lint", "types", "imports", "docs", "tests")
+CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")
 
 
 def main(names: list[str]) -> int:

@@ -26,7 +26,7 @@ from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
 from gsmerge.stages.decode import decode_merged
 from gsmerge.stages.encode import encode
-from gsmerge.stages.fit import fit_scene
+from gsmerge.stages.fit import fit
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
@@ -64,20 +64,15 @@ def compact(
         baseline, log.notes[:] = choose_baseline(options, scene)
         prepared = prepare(scene, options, log)
         make = build if baseline is None else baseline.build
-
-        def build_scored(count: int | None, log: RunLog) -> CompactResult:
-            gaussians = make(prepared, count, log)
-            if prepared.hidden is not None:
-                gaussians = Gaussians.concat([gaussians, prepared.hidden])
-            return score(prepared.frame.leave(gaussians), prepared, log)
-
         if options.budget.target_psnr is not None:
-            result = search_quality(prepared, build_scored, log)
+            result = search_quality(prepared, make, score, log)
         else:
-            result = build_scored(choose_count(prepared, build, log), log)
-        counts = level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count)
-        coarser = tuple(build_scored(count, RunLog(progress)) for count in counts)
-        result = score_input(replace(result, coarser=coarser), prepared, RunLog(progress))
+            result = score(make(prepared, choose_count(prepared, build, log), log), prepared, log)
+        coarser = []
+        for count in level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count):
+            own = RunLog(progress)
+            coarser.append(score(make(prepared, count, own), prepared, own))
+        result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress))
     if progress:
         progress("done", len(STAGES), len(STAGES))
     return result
@@ -103,9 +98,16 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
             groups = merged.segmentation.groups
             analytic = feature_to_gaussians(encode(scene, merged.members, groups, options.encode))
         del merged  # frees more memory than the fit takes
-    return fit_scene(
-        gaussians, scene, options.fit, count, exact=exact, seed=options.seed, log=log, baseline_start=analytic
-    )
+    if scene.images is None or not options.fit.needs_photos:
+        return gaussians
+    with log.stage("fit"):
+        photos = scene_photos(scene), scene_photos(scene, 2)
+        log.choices["begun_with"] = len(gaussians)
+        gaussians, report = fit(
+            gaussians, photos, options.fit, count, options.seed, log.fit_progress, analytic, exact=exact
+        )
+    log.add_fit(report)
+    return gaussians
 
 
 def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> MergedViews:
@@ -154,7 +156,10 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
 
 
 def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog) -> CompactResult:
-    """A result of world-frame Gaussians with its report, scored on the input views."""
+    """Canonical Gaussians as a result in the world frame, with its report, scored on the input views."""
+    if prepared.hidden is not None:
+        gaussians = Gaussians.concat([gaussians, prepared.hidden])
+    gaussians = prepared.frame.leave(gaussians)
     after = None
     if prepared.given.images is not None:
         with log.stage("score"):

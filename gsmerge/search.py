@@ -25,6 +25,7 @@ from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
 Build = Callable[[PreparedScene, int | None, RunLog], Gaussians]
+Score = Callable[[Gaussians, PreparedScene, RunLog], CompactResult]
 
 SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' blocks
@@ -79,14 +80,13 @@ def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | No
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 
-def search_quality(
-    prepared: PreparedScene, build_scored: Callable[[int, RunLog], CompactResult], log: RunLog
-) -> CompactResult:
+def search_quality(prepared: PreparedScene, build: Build, score: Score, log: RunLog) -> CompactResult:
     """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do.
 
     Args:
         prepared: The scene, with a PSNR as ``quality`` among its options.
-        build_scored: Number of Gaussians and a log -> scored result.
+        build: What makes Gaussians of it.
+        score: What makes a result of those.
         log: Of what came before; its seconds and notes enter the report.
     """
     target, limits = prepared.options.budget.target_psnr, prepared.limits
@@ -94,7 +94,8 @@ def search_quality(
     results: dict[int, CompactResult] = {}
 
     def run(count: int) -> float:
-        results[count] = build_scored(count, RunLog(log.progress))
+        own = RunLog(log.progress)
+        results[count] = score(build(prepared, count, own), prepared, own)
         return results[count].report.psnr_after or 0.0
 
     max_count = min(limits.max_count, MAX_FACTOR * limits.default)

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from gsmerge.baselines.baseline import Baseline, merge_groups, most_important, own_gaussians, view_shares
 from gsmerge.render import contributions, plan_view, prepare
+from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit import FitOptions, fit_scene
+from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import grid_labels
 from gsmerge.types import Cameras, Gaussians, Groups
@@ -41,7 +42,11 @@ def unmerged_fit(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
 def _fit_input(prepared: PreparedScene, options: FitOptions, log: RunLog) -> Gaussians:
     """All Gaussians, fitted to the photos."""
     gaussians = own_gaussians(prepared.scene)
-    return fit_scene(gaussians, prepared.scene, options, len(gaussians), seed=prepared.options.seed, log=log)
+    with log.stage("fit"):
+        photos = scene_photos(prepared.scene), scene_photos(prepared.scene, 2)
+        gaussians, report = fit(gaussians, photos, options, len(gaussians), prepared.options.seed, log.fit_progress)
+    log.add_fit(report)
+    return gaussians
 
 
 def prune_by_opacity(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:

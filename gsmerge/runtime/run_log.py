@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from gsmerge.runtime.memory import release_memory
@@ -38,6 +38,14 @@ class RunLog:
         """One step of the fit is done."""
         if self.progress:
             self.progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)
+
+    def add_fit(self, report: Any) -> None:
+        """What a fit did (a dataclass with ``accepted``); None: nothing was asked for."""
+        if report is None:
+            return
+        self.choices["fit"] = asdict(report)
+        if not report.accepted:
+            self.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
 
     def curve_progress(self, done: int, total: int) -> None:
         """One point of the curve is measured."""

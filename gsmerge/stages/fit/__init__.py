@@ -2,6 +2,6 @@
 
 from gsmerge.stages.fit.options import Fit, FitOptions, LearningRates
 from gsmerge.stages.fit.report import FitReport
-from gsmerge.stages.fit.stage import fit, fit_scene, start_share, visible_mask
+from gsmerge.stages.fit.stage import fit, start_share, visible_mask
 
-__all__ = ["Fit", "FitOptions", "FitReport", "LearningRates", "fit", "fit_scene", "start_share", "visible_mask"]
+__all__ = ["Fit", "FitOptions", "FitReport", "LearningRates", "fit", "start_share", "visible_mask"]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.render.photos import Photos, photo_errors, scene_photos
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.render.photos import Photos, photo_errors
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.fit.color import draw, fit_colors
 from gsmerge.stages.fit.device import engine_for
@@ -18,49 +17,11 @@ from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import gaussians_of, start_state
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians
 
 CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
-
-
-def fit_scene(
-    gaussians: Gaussians,
-    scene: PixelScene | UnalignedScene,
-    options: FitOptions,
-    count: int,
-    *,
-    exact: bool = False,
-    seed: int = 0,
-    log: RunLog,
-    baseline_start: Gaussians | None = None,
-) -> Gaussians:
-    """Leave out what no photo of a scene shows, and fit the rest to the photos; nothing without photos.
-
-    Args:
-        gaussians: Canonical Gaussians.
-        scene: The canonical scene.
-        options: What to fit.
-        count: Number of Gaussians that the full fit may grow to.
-        exact: Whether that number is to be met.
-        seed: Everything random.
-        log: Takes seconds, progress, what was done, and a note where the fit was not accepted.
-        baseline_start: See :func:`fit`.
-    """
-    if scene.images is None or not options.needs_photos:
-        return gaussians
-    if exact and not options.grows:  # nothing grows to the number asked for, so nothing may fall below it either
-        options = replace(options, min_contribution=0.0)
-    log.choices["begun_with"] = len(gaussians)
-    with log.stage("fit"):
-        photos = scene_photos(scene), scene_photos(scene, 2)
-        gaussians, report = fit(gaussians, photos, options, count, seed, log.fit_progress, baseline_start)
-    if report:
-        log.choices["fit"] = asdict(report)
-        if not report.accepted:
-            log.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
-    return gaussians
 
 
 def fit(
@@ -71,6 +32,8 @@ def fit(
     seed: int = 0,
     progress: Progress | None = None,
     baseline_start: Gaussians | None = None,
+    *,
+    exact: bool = False,
 ) -> tuple[Gaussians, FitReport | None]:
     """Leave out what no photo shows, and fit the rest to the photos; a draft without a fit leaves out nothing.
 
@@ -82,13 +45,16 @@ def fit(
         options: What to fit.
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
-        progress: Told after every step of the full fit.
+        progress: Called after every step of the full fit.
         baseline_start: Another start that the full fit may beat instead, see
             :func:`gsmerge.stages.fit.full.score_to_beat`.
+        exact: Whether ``count`` is to be met: where nothing grows to it, nothing is left out either.
 
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
+    if exact and not options.grows:
+        options = replace(options, min_contribution=0.0)
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
     keep = visible_mask(gaussians, photos[1], options.min_contribution)

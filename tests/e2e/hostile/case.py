@@ -55,7 +55,7 @@ def without_transforms(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def names() -> list[str]:
-    return [f"view_{view:02d}" for view in range(VIEWS)]
+    return [f"view_{view:03d}" for view in range(VIEWS)]
 
 
 def sparse(path: Path, size: int, start: bytes = b"") -> None:

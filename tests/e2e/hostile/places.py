@@ -30,8 +30,8 @@ def images_named(form: str) -> Spoil:
     def spoil(folder: Path) -> None:
         path = folder / "transforms.json"
         for i in range(3):
-            (folder / "images" / f"view_{i:02d}.png").rename(folder / "images" / f"{form % i}.png")
-            path.write_text(path.read_text().replace(f"view_{i:02d}", form % i), encoding="utf-8")
+            (folder / "images" / f"view_{i:03d}.png").rename(folder / "images" / f"{form % i}.png")
+            path.write_text(path.read_text().replace(f"view_{i:03d}", form % i), encoding="utf-8")
 
     return spoil
 
