@@ -30,8 +30,8 @@ def compacted(made_scene: Path, tmp_path: Path, target_psnr: Measure) -> Callabl
 
 @pytest.mark.parametrize(
     ("superpixels", "settings"),
-    [(256, {}), (256, {"fit_steps": 300}), (256, {"k": 2}), (64, {})],
-    ids=["default", "best", "K2", "1%"],
+    [(256, {}), (256, {"k": 2}), (64, {})],
+    ids=["default", "K2", "1%"],
 )
 def test_full_fit_reaches_the_floor_with_exactly_the_count(
     superpixels: int,
@@ -49,9 +49,9 @@ def test_full_fit_reaches_the_floor_with_exactly_the_count(
 def test_short_fits_reach_the_floor(
     steps: int, compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
-    """They do not grow: what matching merges is not spent again."""
+    """They do not grow: what matching merges, nearly half of them here, is not spent again."""
     result, found = compacted(superpixels=256, fit_steps=steps)
-    assert 0.7 * NUM_VIEWS * 256 <= len(result.gaussians) <= NUM_VIEWS * 256
+    assert 0.5 * NUM_VIEWS * 256 <= len(result.gaussians) <= 0.8 * NUM_VIEWS * 256
     floor(found)
 
 
@@ -68,10 +68,31 @@ def test_full_fit_beats_the_colour_fit(
 
 
 def test_hardly_any_time_still_helps(
-    compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
+    compacted: Callable[..., tuple[CompactResult, float]],
+    made_scene: Path,
+    target_psnr: Measure,
+    floor: Callable[..., None],
 ) -> None:
     """A few steps, whatever the machine."""
     result, found = compacted(superpixels=256, time_budget=1e-3)
     assert result.report.choices["fit"]["stopped"] == "time budget spent"
     assert len(result.gaussians) <= NUM_VIEWS * 256
-    floor(found - compacted(superpixels=256, fit="none", checkpoint="none")[1])
+    floor(found - target_psnr(made_scene / "targets", made_scene / "scene.ply"), "over the input")
+
+
+def test_plain_merging_without_photos(
+    compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
+) -> None:
+    result, found = compacted(superpixels=256, robust=False, fit="none")
+    assert len(result.gaussians) <= NUM_VIEWS * 256
+    floor(found)
+
+
+def test_photos_help(
+    compacted: Callable[..., tuple[CompactResult, float]],
+    made_scene: Path,
+    target_psnr: Measure,
+    floor: Callable[..., None],
+) -> None:
+    """With the photos the compact scene beats its input by far on views that nobody has seen."""
+    floor(compacted(superpixels=256)[1] - target_psnr(made_scene / "targets", made_scene / "scene.ply"))
