@@ -181,7 +181,7 @@ CASES: dict[str, tuple[Spoil, int, list[str]]] = {
     "K = 0": (given("--k", 0), 2, ["--k"]),
     "K = 9": (given("--k", 9), 2, ["--k"]),
     "more superpixels than pixels": (given("--superpixels", 48 * 32 + 1), 2, ["1536", "1537"]),
-    "no superpixels": (given("--superpixels", 0), 2, ["--superpixels"]),
+    "no superpixels": (given("--superpixels", 0), 2, ["superpixels"]),
     "share zero": (given("--superpixels", "0%"), 2, ["superpixels"]),
     "share above one": (given("--superpixels", "150%"), 2, ["superpixels"]),
     "unknown segmentation": (given("--segmentation", "magic"), 2, ["--segmentation", "rdseg"]),

@@ -89,7 +89,7 @@ def test_similarity_of_equal_opacities(room: PixelScene) -> None:
     counts = [len(scenes.plain(even))]
     for seed in range(4):
         counts.append(len(scenes.plain(scenes.move(even, scenes.random_rotation(seed), 1.0, np.zeros(3)))))
-    assert max(counts) - min(counts) <= 0.005 * max(counts)
+    assert max(counts) - min(counts) <= 2  # pairs whose overlap lies at the threshold to the last bits
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])

@@ -113,7 +113,7 @@ def test_each_scene_comes_once() -> None:
 
 def test_two_scenes_are_not_written_to_one_file() -> None:
     touch("s/a/scene.ply", "t/a/scene.ply")
-    with pytest.raises(UsageError, match=r"out/a\.ply.* of s/a and of t/a; .*--output"):
+    with pytest.raises(UsageError, match=r"out/a\.ply.* of s/a and of t/a; .*--name"):
         outputs("s", "t")
     apart = outputs("s", "t", options=BatchOptions(output="{parent}/{stem}.ply"))
     assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}

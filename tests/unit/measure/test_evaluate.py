@@ -49,7 +49,8 @@ def test_figures_are_scikit_image_s(found: Evaluation, half: Gaussians) -> None:
     scores = [s for s in found.results[1].scores if s.split == "target"]
     for score, image, photo in zip(scores, images, views.images.numpy(), strict=True):
         assert score.full.psnr == pytest.approx(peak_signal_noise_ratio(photo, image, data_range=1), abs=1e-5)
-        expected = structural_similarity(photo, image, channel_axis=2, data_range=1)
+        options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+        expected = structural_similarity(photo, image, channel_axis=2, data_range=1, **options)
         assert score.full.ssim == pytest.approx(expected, abs=1e-5)
 
 

@@ -135,5 +135,5 @@ def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], 
     after = merge_into(sides[0], new, rows, 4)
     division = divide_all(after.features, child_members(after), 4, "depth")
     assert division.children.sh0.isfinite().all()
-    assert DecodeOptions().count == 1
+    assert DecodeOptions().k == 1
     assert FAST["superpixels"] == "10%"
