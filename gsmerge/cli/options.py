@@ -35,6 +35,8 @@ REQUIRED = Parameter.empty
 # Old option -> what to use instead; "command option" where an option was renamed in one command alone
 RENAMED = {
     "--out": "-o/--output",
+    "--dialect": "--exporter",
+    "--precision": "gone: networks always work in float32",
     "batch --output": "--name; -o/--output is the folder",
     "--density": "--superpixels, such as --superpixels 4.4%",
     "--densities": "--superpixels, such as --superpixels 2%,4.4%",
