@@ -195,13 +195,13 @@ def _text() -> dict[str, Case]:
             sparse(folder / "sparse" / "0" / name, 2**33)
 
         cases[f"{name} of 8 GB of zeros"] = Case(spoil)
-    lens = b"1 OPENCV 24 16 20 20 12 8 .1 0 0 0"
+    lens = b"1 OPENCV 24 16 38.755 38.755 12 8 .1 0 0 0"
     cases["cameras.txt with a lens"] = Case(model(lambda c, i: (lens, i), text=True), READ)
     return cases
 
 
 def _pose_lists() -> dict[str, Case]:
-    def spoil(change: Callable[[list[str]], list[str]], intrinsics: str = "22.8 22.8 12 8") -> Spoil:
+    def spoil(change: Callable[[list[str]], list[str]], intrinsics: str = "38.755 38.755 12 8") -> Spoil:
         def both(folder: Path) -> None:
             c2w, _ = without_transforms(folder)
             lines = [" ".join(map(repr, pose[:3].reshape(-1).tolist())) for pose in c2w]
