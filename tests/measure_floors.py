@@ -1,7 +1,7 @@
 """Measure the floors of the tests anew: ``python tests/measure_floors.py [pytest's choice of tests]``.
 
-Takes half an hour on two idle cores. Rows of ``floors.csv`` whose tests are not chosen stay; all are measured, and those
-of tests that are gone dropped, without a choice. Look at the differences before you commit them: a mean that falls
+Takes half an hour on two idle cores. Rows of ``floors.csv`` whose tests are not chosen stay; without a choice all are
+measured, and those of tests that are gone dropped. Look at the differences before you commit them: a mean that falls
 by more than its deviation is a change for the worse.
 """
 

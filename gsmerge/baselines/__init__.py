@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsmerge.baselines.baseline import Baseline
 from gsmerge.baselines.greedy import GREEDY
-from gsmerge.baselines.paper import PAPER
+from gsmerge.baselines.moment_matching import MOMENT_MATCHING
 from gsmerge.baselines.simple import (
     BLOCKS,
     CONTRIBUTION,
@@ -21,7 +21,7 @@ from gsmerge.options import CompactOptions
 from gsmerge.types import PixelScene, UnalignedScene
 
 _ALL = (
-    UNMERGED, UNMERGED_COLOR, UNMERGED_FIT, PAPER, VOXEL, OPACITY, CONTRIBUTION, RANDOM, BLOCKS, GREEDY,
+    UNMERGED, UNMERGED_COLOR, UNMERGED_FIT, MOMENT_MATCHING, VOXEL, OPACITY, CONTRIBUTION, RANDOM, BLOCKS, GREEDY,
     SPLAT_TRANSFORM,
 )  # fmt: skip
 BASELINES = {baseline.name: baseline for baseline in _ALL}

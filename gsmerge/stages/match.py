@@ -60,6 +60,8 @@ class MatchOptions:
         for name, low in (("overlap", 0), ("iou", 0), ("similarity", -1)):
             if not low <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected {low} to 1, got {getattr(self, name)}")
+        if not self.max_color >= 0:
+            raise ValueError(f"max_color: expected at least 0, got {self.max_color}")
         if self.neighbors < 1:
             raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
         if self.cluster_size is not None and self.cluster_size < 1:

@@ -30,4 +30,4 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     return merge_groups(prepared, groups, log, rule="paper")
 
 
-PAPER = Baseline("paper", "the superpixel merging paper's moment matching", run)
+MOMENT_MATCHING = Baseline("moment-matching", "the superpixel merging paper's moment matching", run)
