@@ -47,7 +47,7 @@ class MatchOptions:
     geometry: Geometry = "analytic"
     overlap: float = 0.7
     iou: float = 0.2
-    similarity: float = 0.5
+    similarity: float = 0.8
     max_color: float = 0.12
     neighbors: int = 16
     cluster_size: int | None = None
