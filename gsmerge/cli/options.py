@@ -289,7 +289,7 @@ _TABLE = (
         option("overlap", float, "Least overlap of Gaussians that --match overlap merges.", shown="0.7", rare=True),
         option("iou", float, "Least intersection over union of boxes that --match aabb merges.", shown="0.2",
                rare=True),
-        option("similarity", float, "Least cosine of the networks' latents that --match aabb merges.", shown="0.5",
+        option("similarity", float, "Least cosine of the networks' latents that --match aabb merges.", shown="0.8",
                rare=True),
         option("max_color", float, "Largest difference of colours that are merged.", shown="0.12", rare=True),
         option("min_opacity", float, "Gaussians below this opacity are left out.", shown="1/255", rare=True),
