@@ -29,11 +29,7 @@ COMMON_SETTINGS = {"method", "seed", "threads"}  # that every method uses
 
 
 def find_baseline(name: str) -> Baseline | None:
-    """The baseline of that name; None for our own method, "gsmerge".
-
-    Raises:
-        ValueError: If there is none of that name.
-    """
+    """The baseline of that name, None for our own method, "gsmerge"; a ValueError if there is none of that name."""
     if name == "gsmerge":
         return None
     if name not in BASELINES:
@@ -44,8 +40,7 @@ def find_baseline(name: str) -> Baseline | None:
 def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene) -> tuple[Baseline | None, list[str]]:
     """The baseline of the options, fit for the scene, and a note on changed settings that it does not use.
 
-    Raises:
-        UsageError: If the scene does not have what it needs, or a program is missing.
+    A UsageError if the scene does not have what it needs, or a program is missing.
     """
     baseline = find_baseline(options.method)
     if baseline is None:
@@ -62,10 +57,6 @@ def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene)
 
 
 def check_program(baseline: Baseline) -> None:
-    """Refuse a method whose program is missing.
-
-    Raises:
-        UsageError: If it is.
-    """
+    """Raise a UsageError if a method's program is missing."""
     if "node" in baseline.needs:
         find_program()

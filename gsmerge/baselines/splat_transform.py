@@ -25,11 +25,7 @@ MAX_OUTPUT = 300  # characters of the program's own output in an error
 
 
 def find_program() -> str:
-    """Path of the program.
-
-    Raises:
-        UsageError: If there is none.
-    """
+    """Path of the program; a UsageError if there is none."""
     named = os.environ.get(VARIABLE)
     program = shutil.which(named or PROGRAM)
     if program is None:
@@ -41,12 +37,7 @@ def find_program() -> str:
 
 
 def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
-    """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that.
-
-    Raises:
-        UsageError: If the program is not installed.
-        GsmergeError: If it fails.
-    """
+    """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that."""
     gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:
         return gaussians

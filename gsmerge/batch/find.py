@@ -22,21 +22,13 @@ SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *
 
 @dataclass(frozen=True)
 class Job:
-    """One scene of a batch.
+    """One scene of a batch."""
 
-    Args:
-        index: Its place in the list.
-        scene: A ``.ply``, or the folder of one.
-        output: Name of the result in the output folder.
-        num_gaussians: By the header of its file; 0 where it cannot be read.
-        num_rest: Columns of higher harmonics, likewise.
-    """
-
-    index: int
-    scene: str
-    output: str
-    num_gaussians: int
-    num_rest: int = 0
+    index: int  # its place in the list
+    scene: str  # a ``.ply``, or the folder of one
+    output: str  # name of the result in the output folder
+    num_gaussians: int  # by the header of its file; 0 where it cannot be read
+    num_rest: int = 0  # columns of higher harmonics, likewise
 
     @property
     def memory(self) -> int:
@@ -108,9 +100,7 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
     """The scenes of the arguments, in their order and sorted within each; some may come twice.
 
-    Raises:
-        SceneError: If an argument does not exist or holds no scene.
-        UsageError: If the output folder is searched for scenes.
+    A SceneError if an argument does not exist or holds no scene, a UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in given:

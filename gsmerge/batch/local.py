@@ -22,11 +22,7 @@ LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Worker:
-    """A process and its scene.
-
-    Args:
-        context: What all tasks share.
-    """
+    """A process and its scene."""
 
     def __init__(self, context: BatchContext) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -58,12 +54,7 @@ class Worker:
 
 
 class LocalPool:
-    """Up to ``jobs`` processes.
-
-    Args:
-        context: What all tasks share.
-        jobs: Processes at once.
-    """
+    """Up to ``jobs`` processes."""
 
     def __init__(self, context: BatchContext, jobs: int) -> None:
         self.context, self.jobs, self.workers = context, jobs, list[Worker]()

@@ -55,9 +55,7 @@ class Lock:
 def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
     """A block in which no other process works on a result; the lock's file stays unless :meth:`Lock.finish` is called.
 
-    Args:
-        folder: The output folder.
-        outputs: Names of the result and of its further levels.
+    ``outputs`` are names of the result and of its further levels.
 
     Raises:
         BusyError: If another process works on it.
@@ -102,12 +100,7 @@ def _open(path: Path) -> int:
 
 
 def _lock(descriptor: int, path: Path, *, shared: bool) -> bool:
-    """Take the lock.
-
-    Raises:
-        BusyError: If another process holds it.
-        SceneError: If the file system knows no locks.
-    """
+    """Take the lock: a BusyError if another process holds it, a SceneError if the file system knows no locks."""
     if fcntl is None:
         raise SceneError(path, "expected a system with file locks, found none", "run batches on Linux or macOS")
     try:
@@ -143,11 +136,7 @@ def _read(descriptor: int) -> dict[str, object]:
 
 @contextmanager
 def run_lock(folder: Path, name: str) -> Iterator[None]:
-    """A block of a run, which shares the folder only with runs of the same name.
-
-    Args:
-        folder: The output folder.
-        name: See :meth:`gsmerge.batch.options.BatchOptions.name`.
+    """A block of a run, which shares the folder only with runs of the same name, see :meth:`BatchOptions.name`.
 
     Raises:
         UsageError: If a run of another name uses the folder.

@@ -88,11 +88,9 @@ class BatchOptions:
 
 
 def check_template(template: str) -> None:
-    """Refuse a template that gives no valid names for results.
+    """A ValueError if a template gives no valid names for results.
 
-    Raises:
-        ValueError: If it holds another field than those in ``FIELDS``, does not end as one of the formats that
-            can be written, or leaves the folder.
+    It may hold the fields in ``FIELDS``, ends as one of the formats that can be written, and stays in the folder.
     """
     try:
         names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]

@@ -23,28 +23,18 @@ FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 
 @dataclass(frozen=True)
 class Schedule:
-    """How many scenes are compacted at once.
+    """How many scenes are compacted at once."""
 
-    Args:
-        jobs: Scenes at once; 0: as many as the cluster has processors for.
-        threads: Of each.
-        memory: Bytes that the largest of them may take together.
-        notes: Where it differs from the options.
-    """
-
-    jobs: int
-    threads: int
-    memory: int
-    notes: tuple[str, ...] = ()
+    jobs: int  # scenes at once; 0: as many as the cluster has processors for
+    threads: int  # of each
+    memory: int  # bytes that the largest of them may take together
+    notes: tuple[str, ...] = ()  # where it differs from the options
 
 
 def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
     """Distribute scenes over processors: one thread each where there are enough scenes and memory allows.
 
-    Args:
-        jobs: All scenes, of which the largest may come together.
-        options: Of the batch.
-        processors: To use; None: all.
+    Memory must do for the largest scenes, which may come together; ``processors`` are all without a number.
     """
     processors = available_threads() if processors is None else processors
     threads = options.settings.threads

@@ -92,11 +92,7 @@ def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -
 
 
 def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until every scene has ended; see :func:`run_batch`.
-
-    Raises:
-        SceneError: If nothing can be recorded any more.
-    """
+    """Keep a pool busy until every scene has ended; a SceneError if nothing can be recorded any more."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0

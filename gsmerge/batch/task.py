@@ -36,45 +36,27 @@ from gsmerge.runtime.jsonl import append_line
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to be compacted.
+    """A scene to be compacted."""
 
-    Args:
-        job: The scene.
-        known: Its result of former runs; None without one.
-        attempt: From 1.
-    """
-
-    job: Job
-    known: DoneResult | None
-    attempt: int = 1
+    job: Job  # the scene
+    known: DoneResult | None  # its result of former runs; None without one
+    attempt: int = 1  # from 1
 
 
 @dataclass(frozen=True)
 class BatchContext:
-    """What all tasks of a run share.
+    """What all tasks of a run share."""
 
-    Args:
-        folder: The output folder.
-        options: Of the run, with the threads of a scene.
-        start: Byte of the records up to which ``Task.known`` was read.
-    """
-
-    folder: Path
-    options: BatchOptions
-    start: int
+    folder: Path  # the output folder
+    options: BatchOptions  # of the run, with the threads of a scene
+    start: int  # byte of the records up to which ``Task.known`` was read
 
 
 def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dict[str, Any]:
-    """Compact a scene, unless it is done.
+    """Compact a scene, unless it is done, and return its record.
 
-    Args:
-        task: The scene.
-        context: What all tasks share.
-        new_records: Records since the run began, shared by the tasks of a process.
-
-    Returns:
-        Its record; one that is not written has the ``status`` skipped, busy (another process has the scene), or
-        stuck (records cannot be written).
+    One that is not written has the ``status`` skipped, busy (another process has the scene), or stuck (records cannot
+    be written). ``new_records``, since the run began, are shared by the tasks of a process.
     """
     job = task.job
     try:

@@ -23,9 +23,8 @@ _STYLE = (
 def comparison_document(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]:
     """A comparison as plain JSON types.
 
-    Returns:
-        ``schema_version`` 1: tool, before, after (storage, factors, speeds, overdraw, merge seconds, break-even
-        frames), quality as of ``evaluate``, notes. Keys are only ever added within one schema version.
+    ``schema_version`` 1: tool, before, after (storage, factors, speeds, overdraw, merge seconds, break-even frames),
+    quality as of ``evaluate``, notes. Keys are only ever added within one schema version.
     """
     files = {
         side.name: {"path": side.storage.path, "bytes": side.storage.bytes}
@@ -128,12 +127,7 @@ def _line(cells: Row) -> str:
 
 
 def comparison_html(document: Mapping[str, Any], picture: bytes | None = None) -> str:
-    """The comparison as one HTML file, which loads nothing.
-
-    Args:
-        document: As of :func:`comparison_document`.
-        picture: A PNG to be shown, such as a contact sheet; None: none.
-    """
+    """The comparison, with a PNG such as a contact sheet if there is one, as one HTML file, which loads nothing."""
     title = html.escape(f"{document['before']['path']}: before and after")
     parts = [f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
     for heading, head, rows in _tables(document):

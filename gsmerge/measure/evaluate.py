@@ -75,57 +75,34 @@ class Views:
 
 @dataclass(frozen=True)
 class Quality:
-    """How close an image is to another one; None where it was not measured.
+    """How close an image is to another one; None where it was not measured."""
 
-    Args:
-        psnr: dB; inf for equal pictures.
-        ssim: At most 1.
-        lpips_vgg: At least 0, lower is closer.
-        lpips_alex: The same with AlexNet.
-    """
-
-    psnr: float | None = None
-    ssim: float | None = None
-    lpips_vgg: float | None = None
-    lpips_alex: float | None = None
+    psnr: float | None = None  # dB; inf for equal pictures
+    ssim: float | None = None  # at most 1
+    lpips_vgg: float | None = None  # at least 0, lower is closer
+    lpips_alex: float | None = None  # the same with AlexNet
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One result in one view.
+    """One result in one view."""
 
-    Args:
-        split: "context": an input view; "target": one that was held out.
-        view: Its name.
-        visible: Share of the pixels that the input views have seen.
-        full: Over all pixels.
-        masked: Over those that the input views have seen (supplement A).
-    """
-
-    split: str
-    view: str
-    visible: float
-    full: Quality
-    masked: Quality
+    split: str  # "context": an input view; "target": one that was held out
+    view: str  # its name
+    visible: float  # share of the pixels that the input views have seen
+    full: Quality  # over all pixels
+    masked: Quality  # over those that the input views have seen (supplement A)
 
 
 @dataclass(frozen=True)
 class ResultScores:
-    """One result.
+    """One result."""
 
-    Args:
-        name: As given.
-        num_gaussians: Their number.
-        ratio: Of the input's.
-        render_seconds: Mean wall time of one view, all threads.
-        scores: One for each view.
-    """
-
-    name: str
-    num_gaussians: int
-    ratio: float
-    render_seconds: float
-    scores: tuple[ViewScore, ...]
+    name: str  # as given
+    num_gaussians: int  # their number
+    ratio: float  # of the input's
+    render_seconds: float  # mean wall time of one view, all threads
+    scores: tuple[ViewScore, ...]  # one for each view
 
     def mean(self, split: str) -> tuple[Quality, Quality]:
         """Means over the views of a split: over all pixels, and over the visible ones."""
@@ -202,11 +179,7 @@ def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) ->
 
 
 def near_plane(scene: PixelScene | UnalignedScene) -> float:
-    """Near plane where a scene and its results are compared, world units.
-
-    Raises:
-        ValueError: If there is no valid Gaussian or no view.
-    """
+    """Near plane where a scene and its results are compared, world units; there must be a valid Gaussian and a view."""
     return NEAR * scene_frame(scene).unit
 
 

@@ -17,40 +17,24 @@ _VISIBLE = 1 / 255  # opacity; less does not show in an 8-bit image
 
 @dataclass(frozen=True)
 class Extents:
-    """Where the Gaussians lie and how large they are, world units.
+    """Where the Gaussians lie and how large they are, world units."""
 
-    Args:
-        box_low: 1 % quantile of the positions per axis.
-        box_high: 99 % quantile of the same.
-        diagonal: Of that box.
-        share_outliers: Share of the Gaussians outside of the box made ten times as large about its middle.
-        scale_median: Of each Gaussian's largest scale.
-        scale_max: The largest scale of all.
-        share_huge: Share of the Gaussians whose largest scale is above a tenth of the diagonal.
-    """
-
-    box_low: tuple[float, ...]
-    box_high: tuple[float, ...]
-    diagonal: float
-    share_outliers: float
-    scale_median: float
-    scale_max: float
-    share_huge: float
+    box_low: tuple[float, ...]  # 1 % quantile of the positions per axis
+    box_high: tuple[float, ...]  # 99 % quantile of the same
+    diagonal: float  # of that box
+    share_outliers: float  # share of the Gaussians outside of the box made ten times as large about its middle
+    scale_median: float  # of each Gaussian's largest scale
+    scale_max: float  # the largest scale of all
+    share_huge: float  # share of the Gaussians whose largest scale is above a tenth of the diagonal
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What one view shows.
+    """What one view shows."""
 
-    Args:
-        name: Of its image.
-        share_of_pixels: Share of the pixels that have a visible Gaussian of their own; None without pixels.
-        share_of_gaussians: Share of all Gaussians whose centre is inside the picture.
-    """
-
-    name: str
-    share_of_pixels: float | None
-    share_of_gaussians: float
+    name: str  # of its image
+    share_of_pixels: float | None  # share of the pixels that have a visible Gaussian of their own; None without pixels
+    share_of_gaussians: float  # share of all Gaussians whose centre is inside the picture
 
 
 def extents(gaussians: Gaussians) -> Extents:

@@ -43,87 +43,50 @@ _OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
 
 @dataclass(frozen=True)
 class Inspection:
-    """Everything that was recognised, in plain Python values.
+    """Everything that was recognised, in plain Python values."""
 
-    Args:
-        path: The ``.ply``.
-        layout: Name of the column layout.
-        format: "ascii", "binary little-endian" or "binary big-endian".
-        count: Gaussians in the file.
-        bytes: Size of the file.
-        bytes_by_attribute: Bytes of the rows by attribute.
-        extra_columns: Columns that mean nothing here.
-        extra_elements: Elements besides ``vertex``.
-        sh_degree: 0 to 4.
-        opacity_encoding: "logit" or "raw".
-        extents: How far the Gaussians reach, outliers, and how large they are.
-        box_low: 1 % quantile of the positions per axis, world units.
-        box_high: 99 % quantile of the same.
-        num_nonfinite: Rows with NaN or inf.
-        num_clipped_scales: Gaussians with a scale beyond what a float32 covariance can hold.
-        num_zero_quats: Gaussians without a rotation.
-        num_opaque: Gaussians with an opacity of at least 0.995.
-        num_transparent: Finite Gaussians with an opacity below 1/255.
-        num_saturated: Finite Gaussians with an opacity within 1e-6 of 0 or 1.
-        num_views: Cameras, 0 without; with pixels, those that the file has.
-        per_pixel: Gaussians of each pixel; 0 without pixels.
-        num_missing: Pixels of the views that the file has no Gaussian for.
-        width: Of the Gaussian grid, pixels; 0 while it is not verified.
-        height: The same.
-        cameras: Where the cameras are; None without.
-        camera_format: Name of their format.
-        images: Where the images are; None without.
-        alignment: The measured alignment; None if it could not be measured.
-        alignment_problem: Why the scene is not known to have one Gaussian per pixel; None if it has.
-        exporter: The exporters that may have written the file.
-        rows: Which order of the rows fits best, and by how much; None without pixels.
-        alignment_score: Share of the Gaussians at most one pixel from their pixels' centres; None without pixels.
-        alignment_margin: How many times nearer they are than in the second-best order; None without pixels.
-        sight: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
-            cameras that fit.
-        coverage: What every view shows.
-        estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
-            ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would
-            refuse the scene.
-        notes: Warnings about the input and what was adapted, one sentence each.
-    """
-
-    path: str
-    layout: str
-    format: str
-    count: int
-    bytes: int
-    bytes_by_attribute: dict[str, int]
-    extra_columns: tuple[str, ...]
-    extra_elements: tuple[str, ...]
-    sh_degree: int
-    opacity_encoding: str
-    extents: Extents
-    box_low: tuple[float, ...]
-    box_high: tuple[float, ...]
-    num_nonfinite: int
-    num_clipped_scales: int
-    num_zero_quats: int
-    num_opaque: int
-    num_transparent: int
-    num_saturated: int
-    notes: tuple[str, ...]
-    exporter: str
-    num_views: int = 0
-    per_pixel: int = 0
-    num_missing: int = 0
-    width: int = 0
-    height: int = 0
-    cameras: str | None = None
-    camera_format: str | None = None
-    images: str | None = None
-    alignment: Alignment | None = None
-    alignment_problem: str | None = None
-    rows: str | None = None
+    path: str  # the ``.ply``
+    layout: str  # name of the column layout
+    format: str  # "ascii", "binary little-endian" or "binary big-endian"
+    count: int  # Gaussians in the file
+    bytes: int  # size of the file
+    bytes_by_attribute: dict[str, int]  # bytes of the rows by attribute
+    extra_columns: tuple[str, ...]  # columns that mean nothing here
+    extra_elements: tuple[str, ...]  # elements besides ``vertex``
+    sh_degree: int  # 0 to 4
+    opacity_encoding: str  # "logit" or "raw"
+    extents: Extents  # how far the Gaussians reach, outliers, and how large they are
+    box_low: tuple[float, ...]  # 1 % quantile of the positions per axis, world units
+    box_high: tuple[float, ...]  # 99 % quantile of the same
+    num_nonfinite: int  # rows with NaN or inf
+    num_clipped_scales: int  # Gaussians with a scale beyond what a float32 covariance can hold
+    num_zero_quats: int  # Gaussians without a rotation
+    num_opaque: int  # Gaussians with an opacity of at least 0.995
+    num_transparent: int  # finite Gaussians with an opacity below 1/255
+    num_saturated: int  # finite Gaussians with an opacity within 1e-6 of 0 or 1
+    notes: tuple[str, ...]  # warnings about the input and what was adapted, one sentence each
+    exporter: str  # the exporters that may have written the file
+    num_views: int = 0  # cameras, 0 without; with pixels, those that the file has
+    per_pixel: int = 0  # Gaussians of each pixel; 0 without pixels
+    num_missing: int = 0  # pixels of the views that the file has no Gaussian for
+    width: int = 0  # of the Gaussian grid, pixels; 0 while it is not verified
+    height: int = 0  # the same
+    cameras: str | None = None  # where the cameras are; None without
+    camera_format: str | None = None  # name of their format
+    images: str | None = None  # where the images are; None without
+    alignment: Alignment | None = None  # the measured alignment; None if it could not be measured
+    alignment_problem: str | None = None  # why the scene is not known to have one Gaussian per pixel; None if it has
+    rows: str | None = None  # which order of the rows fits best, and by how much; None without pixels
+    # share of the Gaussians at most one pixel from their pixels' centres; None without pixels
     alignment_score: float | None = None
+    # how many times nearer they are than in the second-best order; None without pixels
     alignment_margin: float | None = None
+    # how many of the Gaussians the cameras see, and how far colours are from the photos; None without cameras that fit
     sight: CameraCheck | None = None
-    coverage: tuple[Coverage, ...] = ()
+    coverage: tuple[Coverage, ...] = ()  # what every view shows
+    # what ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
+    # ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would refuse the
+    # scene.
     estimate: dict[str, float] | None = None
 
     def to_dict(self) -> dict[str, Any]:

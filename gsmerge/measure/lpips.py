@@ -110,29 +110,17 @@ def lpips(
 
 
 def lpips_available(net: str = "vgg") -> bool:
-    """Whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed.
-
-    Raises:
-        ValueError: If ``net`` is unknown.
-    """
+    """Whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed."""
     return _find_weights(net) is not None
 
 
 def require_lpips(net: str) -> None:
-    """Refuse to go on without the weights of ``net``.
-
-    Raises:
-        GsmergeError: If they are not installed.
-    """
+    """Raise a GsmergeError if the weights of ``net`` are not installed."""
     _weights_file(net)
 
 
 def min_size(net: str) -> int:
-    """Pixels per side of the smallest image that ``net`` takes.
-
-    Raises:
-        ValueError: If ``net`` is unknown.
-    """
+    """Pixels per side of the smallest image that ``net`` takes."""
     return _architecture(net).min_size
 
 
@@ -143,19 +131,9 @@ def _architecture(net: str) -> _Architecture:
 
 
 def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
-    """:func:`lpips`, differentiable in ``image``.
+    """:func:`lpips`, differentiable in ``image``, ``[h,w,3]`` float32 on the CPU; the reference has no gradient.
 
-    Args:
-        image: ``[h,w,3]`` float32 on the CPU, sRGB in [0, 1].
-        reference: ``[h,w,3]``, without gradient.
-        mask: ``[h,w]`` pixels that count.
-        net: As there.
-
-    Returns:
-        The distance; 0 where the images are too small for the network or no pixel counts.
-
-    Raises:
-        GsmergeError: If the package with the weights is not installed.
+    0 where the images are too small for the network or no pixel counts.
     """
     if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
         return image.new_zeros(())
@@ -237,11 +215,7 @@ def _weights_file(net: str) -> Path:
 
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[_Layer, ...]:
-    """The layers of ``net`` from its file.
-
-    Raises:
-        SceneError: If the file is no pickle of float arrays, or of other ones.
-    """
+    """The layers of ``net`` from its file; a SceneError if that is no pickle of float arrays, or of other ones."""
     with path.open("rb") as stream:
         try:
             return _layers(_ArrayUnpickler(stream).load(), _architecture(net))

@@ -22,16 +22,10 @@ CSV_COLUMNS = (
 def evaluation_document(
     evaluation: Evaluation, files: Mapping[str, Mapping[str, Any]], notes: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """An evaluation as plain JSON types.
+    """An evaluation as plain JSON types, with what is known of each result's file (path, bytes, bytes by attribute).
 
-    Args:
-        evaluation: The figures.
-        files: For each result what is known of its file: path, bytes, bytes by attribute.
-        notes: What the readers had to say.
-
-    Returns:
-        ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a
-        score for each view), notes. Keys are only ever added within one schema version.
+    ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a score
+    for each view), notes. Keys are only ever added within one schema version.
     """
     return {
         **document_head(),

@@ -30,14 +30,7 @@ def text(value: object) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Row], *, texts: Sequence[int] = (0,), ours: Sequence[int] = ()) -> str:
-    """A table.
-
-    Args:
-        head: Names of the columns.
-        rows: Cells of each row.
-        texts: Columns of text, aligned left; the rest are numbers.
-        ours: Rows that are ours.
-    """
+    """A table; ``texts`` are the columns of text, aligned left, and ``ours`` the rows that are ours."""
     words = set(texts)
     top = "".join(
         f'<th scope="col"{_class(["text"] if i in words else [])}>{text(name)}</th>' for i, name in enumerate(head)
@@ -68,12 +61,9 @@ def data_uri(path: Path) -> str:
 
 
 def inline_svg(svg: str, name: str, label: str) -> str:
-    """A drawing as part of the page: without prologue, metadata and addresses, with unique ids, scalable.
+    """A drawing of matplotlib's as part of the page: without prologue, metadata and addresses, scalable.
 
-    Args:
-        svg: As matplotlib writes it.
-        name: Put before every id, because a page has several drawings.
-        label: Alternative text.
+    ``name`` is put before every id, because a page has several drawings; ``label`` is the alternative text.
     """
     drawing = svg[svg.index("<svg") :]
     drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)

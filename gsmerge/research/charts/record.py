@@ -102,11 +102,7 @@ class RunRecord:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> RunRecord:
-        """The record that :meth:`to_dict` gave, through JSON.
-
-        Raises:
-            ValueError: If it is of another schema version, or a field is missing or of another kind.
-        """
+        """The record that :meth:`to_dict` gave, through JSON; a ValueError if it is of another version or damaged."""
         version = values.get("schema_version")
         if version != SCHEMA_VERSION:
             raise ValueError(f"expected a run record of schema version {SCHEMA_VERSION}, got {version!r}")
@@ -127,14 +123,7 @@ RUNS, PROXIES, PICTURES, CHARTS, PAGE = "runs.jsonl", "proxies.jsonl", "pictures
 
 
 def experiment_key(scene_sha256: str, method: str, settings: Mapping[str, Any], views: int | None) -> str:
-    """The key of a run: a hash of the scene's content, all settings, and the versions.
-
-    Args:
-        scene_sha256: Of all files that the run reads.
-        method: Name of the method.
-        settings: By flat name.
-        views: Number of views that was asked for; None: all.
-    """
+    """The key of a run: a hash of the scene's content, all settings, the number of views asked for, and versions."""
     return digest(
         {
             "scene": scene_sha256,

@@ -29,13 +29,10 @@ class SceneSource:
 def find_scenes(
     scenes: Sequence[Path], targets: str | None = None, target_images: str | None = None
 ) -> list[SceneSource]:
-    """The files of all scenes.
+    """The files of all scenes: ``.ply`` files, or the folders that they are in.
 
-    Args:
-        scenes: ``.ply`` files, or the folders that they are in.
-        targets: Cameras of the held-out views: one path for all scenes, or a template with ``{scene}`` (as given),
-            ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it.
-        target_images: The same for the folder of their photos.
+    ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
+    template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it.
 
     Raises:
         SceneError: If a file is missing.
@@ -51,8 +48,7 @@ def find_scenes(
 def scene_names(scenes: Sequence[Path]) -> list[str]:
     """A short name for every scene: its own, with as many folders before it as it takes to distinguish them.
 
-    Raises:
-        UsageError: If a scene is given twice.
+    A UsageError if a scene is given twice.
     """
     parts = [(*scene.absolute().parent.parts, stem_of(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0) + 1):

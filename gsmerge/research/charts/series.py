@@ -91,10 +91,7 @@ def newest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     """The last record for each scene, method, settings and number of views, so that no scene counts twice in a mean.
 
     A folder has several where the files of a scene changed, other scenes of the same name were run by another command,
-    or LPIPS or seed were set differently.
-
-    Returns:
-        The records, and a note for each name of scenes with records that were left out.
+    or LPIPS or seed were set differently. With a note for each name of scenes with records that were left out.
     """
     content = {record.scene: record.scene_sha256 for record in records}
     foreign: dict[str, int] = {}

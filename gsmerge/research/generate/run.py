@@ -37,9 +37,7 @@ def plan(
 ) -> list[SceneFolder]:
     """The folders that :func:`generate` would write; nothing is written.
 
-    Raises:
-        ValueError: If ``count`` or ``seed`` is out of range.
-        UsageError: If a folder holds something else.
+    A ValueError if ``count`` or ``seed`` is out of range, a UsageError if a folder holds something else.
     """
     if count < 1 or seed < 0:
         raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
@@ -137,11 +135,7 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
 
 
 def check_replaceable(folder: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a folder that holds something else.
-
-    Raises:
-        UsageError: If it holds a scene of other options and ``overwrite`` is False, or no synthetic scene.
-    """
+    """A UsageError where a folder holds no synthetic scene, or one of other options and ``overwrite`` is False."""
     if not os.path.lexists(folder):
         return
     if not (folder / RECORD).is_file():
@@ -155,11 +149,7 @@ def check_replaceable(folder: Path, *, overwrite: bool) -> None:
 
 
 def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a scene, in place of an existing one, and return its record.
-
-    Raises:
-        SceneError: If the folder cannot be written.
-    """
+    """Write a scene, in place of an existing one, and return its record; a SceneError if it cannot be written."""
     record = {
         **key,
         "style": scene.style,

@@ -9,13 +9,7 @@ import numpy as np
 from gsmerge.research.generate.shapes import Array, Material, Shape
 from gsmerge.research.generate.textures import KINDS, Picture
 
-MAX_TEXTURES = {
-    "label": 8,
-    "printed": 6,
-    "plain": 6,
-    "foliage": 4,
-    "cloth": 4,
-}  # in a scene; other kinds 3
+MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # in a scene; other kinds 3
 
 
 @dataclass
@@ -30,10 +24,7 @@ class Palette:
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
         """A material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
 
-        Args:
-            kinds: Names of :data:`gsmerge.research.generate.textures.KINDS`.
-            repeat: Repeats per world unit; 0: once over every face.
-            gloss: Strength of highlights; None: at random, mostly none.
+        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` is at random if None, mostly none.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         known = self.by_kind.setdefault(kind, [])

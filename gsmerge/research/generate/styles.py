@@ -68,18 +68,13 @@ def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     w, d, h = width / 2, depth / 2, height
     out = [quad((0, 0, 0), (w, d), floor, LYING), quad((0, -h, 0), (w, d), pal.material("plain", gloss=0.0), LYING)]
     out += [quad((0, -h / 2, z), (w, h / 2), papers[0]) for z in (d, -d)]
-    out += [
-        quad((x, -h / 2, 0), (d, h / 2), material, FACING)
-        for x, material in ((-w, papers[1]), (w, papers[rng.integers(2)]))
-    ]
+    out += [quad((x, -h / 2, 0), (d, h / 2), papers[k], FACING) for x, k in ((-w, 1), (w, rng.integers(2)))]
     out = _shell(out)
     skirting = pal.material("plain", "wood")
     out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
     out += [box((x - 0.02, -0.09, -d), (x + 0.02, 0, d), skirting) for x in (-w, w)]
-    for side in range(3):
-        wall = _wall_objects(pal, (w, d, d)[side], h)
-        spot = ((0, 0, d), (-w, 0, 0), (w, 0, 0))[side]
-        out += place(wall, spot, rotation=(np.eye(3), FACING.T, FACING)[side])
+    for half, spot, facing in ((w, (0, 0, d), np.eye(3)), (d, (-w, 0, 0), FACING.T), (d, (w, 0, 0), FACING)):
+        out += place(_wall_objects(pal, half, h), spot, rotation=facing)
     pipe = rng.uniform(-w, w)
     return [*out, rod((pipe, 0, d - 0.06), (pipe, -h, d - 0.06), rng.uniform(0.01, 0.04), skirting)]
 
@@ -113,9 +108,8 @@ def room(pal: Palette) -> Stage:
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
         at = spots[i][0] + rng.normal(0, 0.15), 0.0, spots[i][1] + rng.normal(0, 0.15)
         shapes += place(_furniture(pal), at, yaw=rng.normal(0, 0.5))
-    shapes += place(
-        plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90))), (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d)
-    )
+    pot = plant(pal, rng.uniform(0.6, 1.6), int(rng.integers(20, 90)))
+    shapes += place(pot, (rng.uniform(-0.4, 0.4) * w, 0, 0.4 * d))
     shapes += place(lamp(pal, rng.uniform(1.1, 1.8)), (rng.uniform(-0.4, 0.4) * w, 0, rng.uniform(0, 0.4) * d))
     a, b = (np.array([x * w, -h * rng.uniform(0.75, 1), rng.uniform(0, 0.45) * d]) for x in (-0.5, 0.5))
     shapes += wire(pal, a, b, rng.uniform(0.05, 0.4), rng.uniform(0.003, 0.008))
@@ -182,14 +176,11 @@ def garden(pal: Palette) -> Stage:
         at = rng.uniform(-1.6, 1.6), 0, rng.uniform(-0.3, 1.2)
         shapes += place(bush(pal, rng.uniform(0.25, 0.6), int(rng.integers(200, 500))), at)
     for _ in range(rng.integers(1, 4)):
-        shapes += place(
-            plant(pal, rng.uniform(0.4, 1.0), int(rng.integers(30, 120))),
-            (rng.uniform(-1.2, 1.2), 0, rng.uniform(-0.8, 0.4)),
-        )
+        pot = plant(pal, rng.uniform(0.4, 1.0), int(rng.integers(30, 120)))
+        shapes += place(pot, (rng.uniform(-1.2, 1.2), 0, rng.uniform(-0.8, 0.4)))
     for _ in range(rng.integers(1, 5)):
-        shapes += place(
-            tree(pal, rng.uniform(2.0, 4.5), int(rng.integers(30, 120))), (rng.uniform(-4, 4), 0, rng.uniform(2, 6))
-        )
+        one = tree(pal, rng.uniform(2.0, 4.5), int(rng.integers(30, 120)))
+        shapes += place(one, (rng.uniform(-4, 4), 0, rng.uniform(2, 6)))
     if rng.random() < 0.6:
         shapes += place(fence(pal, rng.uniform(2, 6), rng.uniform(0.6, 1.2)), (0, 0, rng.uniform(1.2, 2.5)))
     if rng.random() < 0.6:
@@ -207,10 +198,8 @@ def facade(pal: Palette) -> Stage:
     rng = pal.rng
     shapes = _outside(pal, ("gravel", "tiles", "grass", "plaster"), 10.0)
     w, h, z = rng.uniform(6, 12), rng.uniform(4, 8), 2.0
-    wall, trim = (
-        pal.material("bricks", "plaster", "plaster", "plain", repeat=0.35),
-        pal.material("plaster", "plain", "granite", repeat=0.5),
-    )
+    wall = pal.material("bricks", "plaster", "plaster", "plain", repeat=0.35)
+    trim = pal.material("plaster", "plain", "granite", repeat=0.5)
     shapes.append(box((-w / 2, -h, z), (w / 2, 0, z + 3), wall))
     floors, columns = int(rng.integers(2, 4)), int(rng.integers(3, 7))
     pane, pitch, storey = pal.material("gradient", "sky", gloss=0.9), w / columns, h / floors
@@ -220,20 +209,13 @@ def facade(pal: Palette) -> Stage:
             x = (k + 0.5) * pitch - w / 2
             if i == 0 and abs(x) < 0.6 * pitch:
                 continue
-            wide, tall = 0.45 * pitch, 0.55 * storey
-            shapes += place(window(pal, wide, tall, pane, glow=False), (x, -storey * (i + 0.25), z - 0.01))
-            shapes.append(
-                box(
-                    (x - 0.6 * wide, -storey * (i + 0.25), z - 0.12),
-                    (x + 0.6 * wide, 0.08 - storey * (i + 0.25), z),
-                    trim,
-                )
-            )
+            wide, sill = 0.45 * pitch, -storey * (i + 0.25)
+            shapes += place(window(pal, wide, 0.55 * storey, pane, glow=False), (x, sill, z - 0.01))
+            shapes.append(box((x - 0.6 * wide, sill, z - 0.12), (x + 0.6 * wide, 0.08 + sill, z), trim))
     count, porch = int(rng.integers(2, 6)), rng.uniform(1.0, 1.8)
     shapes += place(steps(pal, 2.4 * porch, count), (0, 0, z - 0.3 * (count + 1)))
-    shapes.append(
-        box((-0.5 * porch, -0.75 * storey, z - 0.03), (0.5 * porch, 0, z), pal.material("wood", "plain", "printed"))
-    )
+    door = pal.material("wood", "plain", "printed")
+    shapes.append(box((-0.5 * porch, -0.75 * storey, z - 0.03), (0.5 * porch, 0, z), door))
     for x in (-porch, porch, -0.75 * porch, 0.75 * porch)[: 2 * int(rng.integers(0, 3))]:
         shapes.append(column((x, 0, z - 0.4), 0.9 * storey, 0.14, trim, top=0.85))
         shapes.append(box((x - 0.2, -0.9 * storey - 0.1, z - 0.6), (x + 0.2, -0.9 * storey, z - 0.2), trim))
@@ -241,9 +223,8 @@ def facade(pal: Palette) -> Stage:
     shapes += [box((-w / 2 - 0.3, -h - 0.25, z - 0.3), (w / 2 + 0.3, -h, z + 3), trim)]
     shapes += [column((x, -h, z + 0.8), rng.uniform(1, 2), 0.9, roof, top=0.02) for x in (-w / 2 + 0.9, w / 2 - 0.9)]
     for x in rng.uniform(-0.7, 0.7, rng.integers(1, 4)) * w:
-        shapes += place(
-            tree(pal, rng.uniform(2, 5), 60) if abs(x) > w / 2 else bush(pal, 0.4, 250), (x, 0, z - rng.uniform(0.8, 2))
-        )
+        green = tree(pal, rng.uniform(2, 5), 60) if abs(x) > w / 2 else bush(pal, 0.4, 250)
+        shapes += place(green, (x, 0, z - rng.uniform(0.8, 2)))
     shapes += place(fence(pal, rng.uniform(2, 5), 0.9), (rng.uniform(-4, 4), 0, z - 2.2))
     focus = np.array([rng.normal(0, 0.5), -rng.uniform(0.25, 0.5) * h, z])
     return Stage(tuple(shapes), tuple(pal.textures), light(rng, None), focus, (0.7 * w, 1.2 * w), (0.8, 2.5), 45)

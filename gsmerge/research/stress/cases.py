@@ -166,25 +166,17 @@ def _choose(count: int, share: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Case:
-    """One bad condition.
+    """One bad condition."""
 
-    Args:
-        name: On the command line.
-        words: The change in words.
-        check: Which property must hold, see ``PROPERTIES``.
-        needs: "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file.
-        change: Returns the changed scene; None: the scene stays, the run differs.
-        threads: Threads of the run; None: as in the options.
-        convention: Pose convention to write, in the terms of camera files.
-    """
-
-    name: str
-    words: str
-    check: Check
+    name: str  # on the command line
+    words: str  # the change in words
+    check: Check  # which property must hold, see ``PROPERTIES``
+    # "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file
     needs: Needs = "anything"
+    # returns the changed scene; None: the scene stays, the run differs
     change: Callable[[StressScene], StressScene] | None = None
-    threads: int | None = None
-    convention: tuple[str, str] | None = None
+    threads: int | None = None  # threads of the run; None: as in the options
+    convention: tuple[str, str] | None = None  # pose convention to write, in the terms of camera files
 
 
 def _rewrite_poses(direction: str, axes: str) -> Case:

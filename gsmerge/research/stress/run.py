@@ -34,23 +34,14 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class StressOutcome:
-    """The outcome of one case.
+    """The outcome of one case."""
 
-    Args:
-        case: Its name.
-        change: How the scene was changed, in words.
-        expected: The property that must hold.
-        passed: Whether it does; None where the case does not apply to the scene.
-        measured: The figures, or why the case does not apply.
-        seconds: Wall time.
-    """
-
-    case: str
-    change: str
-    expected: str
-    passed: bool | None
-    measured: str
-    seconds: float
+    case: str  # its name
+    change: str  # how the scene was changed, in words
+    expected: str  # the property that must hold
+    passed: bool | None  # whether it does; None where the case does not apply to the scene
+    measured: str  # the figures, or why the case does not apply
+    seconds: float  # wall time
 
     def to_dict(self) -> dict[str, Any]:
         """The outcome under the keys of the report."""
