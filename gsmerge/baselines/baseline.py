@@ -28,7 +28,6 @@ class Baseline:
     """One other method."""
 
     name: str  # as on the command line
-    title: str  # what it does, in a few words
     # prepared scene, number of Gaussians, log -> canonical Gaussians, at most that many unless the method keeps the
     # input's. It times itself, by stages of the log.
     run: Run

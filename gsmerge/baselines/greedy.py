@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.runtime.run_log import RunLog
@@ -188,6 +188,3 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         return gaussians
     with log.stage("reduce"):
         return gaussians_of(reduce_to(cloud_of(gaussians), count))
-
-
-GREEDY = Baseline("greedy", "pairwise greedy merging, as NanoGS", run)

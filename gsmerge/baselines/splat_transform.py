@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.io import read_ply, write_ply
 from gsmerge.runtime.run_log import RunLog
@@ -56,6 +56,3 @@ def _failure(program: str, done: subprocess.CompletedProcess[bytes]) -> str:
     """One line: the exit code and the end of the program's output."""
     output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
     return f"{program}: expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
-
-
-SPLAT_TRANSFORM = Baseline("splat-transform", "PlayCanvas' splat-transform, if installed", run, needs=("node",))

@@ -14,6 +14,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.errors import SceneError, UsageError
@@ -32,17 +33,13 @@ class BusyError(Exception):
     """Another process holds the lock."""
 
 
+@dataclass(frozen=True)
 class Lock:
-    """A lock that this process holds.
+    """A lock that this process holds."""
 
-    Args:
-        path: Its file.
-        abandoned: Whether a process was killed while it held it.
-        fresh: Whether there was no result before the first process that held it.
-    """
-
-    def __init__(self, path: Path, *, abandoned: bool, fresh: bool) -> None:
-        self.path, self.abandoned, self.fresh = path, abandoned, fresh
+    path: Path  # its file
+    abandoned: bool  # whether a process was killed while it held it
+    fresh: bool  # whether there was no result before the first process that held it
 
     def finish(self) -> None:
         """Remove the file: nothing is left unfinished."""
@@ -68,7 +65,7 @@ def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
         if abandoned:
             fresh = _read(descriptor).get("fresh") is True
         _write(descriptor, outputs[0], fresh=fresh)
-        yield Lock(path, abandoned=abandoned, fresh=fresh)
+        yield Lock(path, abandoned, fresh)
     finally:
         os.close(descriptor)
 
@@ -94,9 +91,8 @@ def _open(path: Path) -> int:
         except OSError as error:
             if isinstance(error, FileNotFoundError) and path.parent.parent.is_dir():
                 continue  # another run ended and removed the folder of locks
-            raise SceneError(
-                path, f"cannot be written ({error.strerror})", "name another folder with --output"
-            ) from error
+            problem = f"cannot be written ({error.strerror})"
+            raise SceneError(path, problem, "name another folder with --output") from error
 
 
 def _lock(descriptor: int, path: Path, *, shared: bool) -> bool:
@@ -167,13 +163,11 @@ def _join_run(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
         _write(descriptor, name)
     except BusyError:
         descriptor = _open(path)
-    try:
+    with suppress(BusyError):
         _lock(descriptor, path, shared=True)  # between the two locks another run may have had it
         holder = _read(descriptor)
         if _is_same_file(descriptor, path) and {"what", "pid", "host"} <= holder.keys():
             return descriptor, holder
-    except BusyError:
-        pass
     os.close(descriptor)
     return None
 
@@ -181,10 +175,9 @@ def _join_run(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
 def _leave(descriptor: int, path: Path) -> None:
     """Unlock; the last run removes the lock's file, and the folder of locks if no scene was left unfinished."""
     try:
-        _lock(descriptor, path, shared=False)
-        path.unlink(missing_ok=True)
-        path.parent.rmdir()
-    except (BusyError, OSError, SceneError):
-        pass  # other runs use the folder, or unfinished scenes are left in it
+        with suppress(BusyError, OSError, SceneError):  # other runs use the folder, or unfinished scenes are left in it
+            _lock(descriptor, path, shared=False)
+            path.unlink(missing_ok=True)
+            path.parent.rmdir()
     finally:
         os.close(descriptor)

@@ -16,7 +16,7 @@ from gsmerge.batch.locks import run_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.plan import Schedule, make_schedule
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
-from gsmerge.batch.task import BatchContext, Task, record_failure, with_threads
+from gsmerge.batch.task import BatchContext, Task, record_failure
 from gsmerge.errors import SceneError
 
 POLL_SECONDS = 0.5  # between two queries of the pool
@@ -81,7 +81,7 @@ def run_batch(
 
 def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -> tuple[Pool, BatchContext]:
     """Where the scenes are compacted, and what they share."""
-    options = with_threads(options, schedule.threads)
+    options = replace(options, settings=replace(options.settings, threads=schedule.threads))
     if options.engine == "ray":
         from gsmerge.batch.ray_engine import RayPool, with_whole_paths
 

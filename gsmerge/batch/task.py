@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -59,18 +61,27 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
     be written). ``new_records``, since the run began, are shared by the tasks of a process.
     """
     job = task.job
+
+    def work(lock: Lock) -> dict[str, Any]:
+        try:
+            new_records.read_on()
+            outcome = _process(task, context, new_records, lock)
+        except Exception as error:  # a bad scene must not end the batch
+            outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
+        known = new_records.known.get(job.output, task.known)
+        if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
+            append_line(context.folder / RECORDS, outcome)
+        lock.finish()
+        return outcome
+
+    return _locked(job, context, work)
+
+
+def _locked(job: Job, context: BatchContext, work: Callable[[Lock], dict[str, Any]]) -> dict[str, Any]:
+    """What ``work`` returns under the scene's lock, or that another process has it, or that nothing can be written."""
     try:
         with scene_lock(context.folder, _output_names(job, context.options)) as lock:
-            try:
-                new_records.read_on()
-                outcome = _process(task, context, new_records, lock)
-            except Exception as error:  # a bad scene must not end the batch
-                outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
-            known = new_records.known.get(job.output, task.known)
-            if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
-                append_line(context.folder / RECORDS, outcome)
-            lock.finish()
-            return outcome
+            return work(lock)
     except BusyError:
         return record(BUSY, job.scene, job.output)
     except SceneError as error:  # locks or records cannot be written, whatever the scene
@@ -151,28 +162,22 @@ def _clean(job: Job, context: BatchContext) -> None:
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
     """The record of a scene whose process died or took too long, after all retries."""
-    job = task.job
-    failed = record(FAILED, job.scene, job.output, error=error, attempt=task.attempt)
-    try:
-        with scene_lock(context.folder, _output_names(job, context.options)) as lock:
-            _clean(job, context)
-            append_line(context.folder / RECORDS, failed)
-            _finish(lock, task, context)
-    except BusyError:
-        return record(BUSY, job.scene, job.output)
-    except SceneError as stuck:
-        return record(STUCK, job.scene, job.output, error=str(stuck))
-    return failed
+    failed = record(FAILED, task.job.scene, task.job.output, error=error, attempt=task.attempt)
+
+    def work(lock: Lock) -> dict[str, Any]:
+        _clean(task.job, context)
+        append_line(context.folder / RECORDS, failed)
+        _finish(lock, task, context)
+        return failed
+
+    return _locked(task.job, context, work)
 
 
 def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove unfinished files of a scene whose process was ended on purpose."""
-    try:
-        with scene_lock(context.folder, _output_names(task.job, context.options)) as lock:
-            _clean(task.job, context)
-            _finish(lock, task, context)
-    except (BusyError, SceneError):
-        return  # another process removes them, or the next run does
+    """Remove unfinished files of a scene whose process was ended on purpose; another process or the next run may."""
+    with suppress(BusyError, SceneError), scene_lock(context.folder, _output_names(task.job, context.options)) as lock:
+        _clean(task.job, context)
+        _finish(lock, task, context)
 
 
 def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
@@ -182,8 +187,3 @@ def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
     recorded = task.known is not None or task.job.output in new_records.known
     if recorded or not os.path.lexists(context.folder / task.job.output):
         lock.finish()
-
-
-def with_threads(options: BatchOptions, threads: int) -> BatchOptions:
-    """The options with the threads of a scene."""
-    return replace(options, settings=replace(options.settings, threads=threads))

@@ -196,15 +196,13 @@ def _splits(
     scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, near: float
 ) -> dict[str, Views]:
     """The views by split, with their photos or the input's renders."""
-    splits = {}
-    if options.context or targets is None:
-        images = scene.images
-        if images is None:
-            images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
-        splits["context"] = Views(scene.cameras, images, scene.names)
-    if targets is not None:
-        splits["target"] = targets
-    return splits
+    target = {} if targets is None else {"target": targets}
+    if targets is not None and not options.context:
+        return target
+    images = scene.images
+    if images is None:
+        images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
+    return {"context": Views(scene.cameras, images, scene.names), **target}
 
 
 def _score_result(
@@ -226,9 +224,8 @@ def _score_result(
             seconds, count = seconds + time.perf_counter() - start, count + 1
             nets = options.lpips if i in perceptual else ()
             scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[split][i], nets))
-    return ResultScores(
-        name, len(gaussians), len(gaussians) / max(num_input, 1), seconds / max(count, 1), tuple(scores)
-    )
+    ratio = len(gaussians) / max(num_input, 1)
+    return ResultScores(name, len(gaussians), ratio, seconds / max(count, 1), tuple(scores))
 
 
 def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
@@ -255,8 +252,5 @@ def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | Non
 
 
 def _mean(scores: Sequence[Quality]) -> Quality:
-    means = {}
-    for field in fields(Quality):
-        values = [value for score in scores if (value := getattr(score, field.name)) is not None]
-        means[field.name] = float(np.mean(values)) if values else None
-    return Quality(**means)
+    columns = {f.name: [v for one in scores if (v := getattr(one, f.name)) is not None] for f in fields(Quality)}
+    return Quality(**{name: float(np.mean(values)) if values else None for name, values in columns.items()})

@@ -97,16 +97,18 @@ def lpips(
         SceneError: If a file of weights does not hold what it should.
         ValueError: If the shapes differ, the images are too small, no pixel counts or ``net`` is unknown.
     """
-    architecture = _architecture(net)
     first, second = image_pair(image, reference)
     if first.shape[2] != 3:
         raise ValueError(f"expected two images [h,w,3] of one shape, got {list(first.shape)} and {list(second.shape)}")
-    if min(first.shape[:2]) < architecture.min_size:
-        size = architecture.min_size
+    size = min_size(net)
+    if min(first.shape[:2]) < size:
         raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
-    return _distance(first, second, _load(_weights_file(net), net))
+    layers = _load(_weights_file(net), net)
+    features = _kept_features(second, layers)
+    with torch.inference_mode():
+        return float(_weighted(_unit_features(_as_tensor(first), layers), features, layers))
 
 
 def lpips_available(net: str = "vgg") -> bool:
@@ -125,6 +127,7 @@ def min_size(net: str) -> int:
 
 
 def _architecture(net: str) -> _Architecture:
+    """A ValueError if ``net`` is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
@@ -143,13 +146,6 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
 
 
-def _distance(image: Array, reference: Array, layers: tuple[_Layer, ...]) -> float:
-    """Of arrays, without gradients."""
-    kept = _kept_features(reference, layers)
-    with torch.inference_mode():
-        return float(_weighted(_unit_features(_as_tensor(image), layers), kept, layers))
-
-
 def _as_tensor(image: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image, np.float32))
 
@@ -157,14 +153,10 @@ def _as_tensor(image: Array) -> Tensor:
 def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_Layer, ...]) -> Tensor:
     """Squared differences of unit features, weighted, averaged over pixels, added up (equation 1 of Zhang et al.)."""
     distance = torch.zeros((), dtype=torch.float64)
-    for weights, unit, other in zip(_compared(layers), units, others, strict=True):
+    compared = [layer.weights for layer in layers if layer.weights is not None]
+    for weights, unit, other in zip(compared, units, others, strict=True):
         distance = distance + ((unit - other).square().mean((1, 2)) @ weights).double()
     return distance
-
-
-def _compared(layers: tuple[_Layer, ...]) -> list[Tensor]:
-    """The weights of those layers that are compared."""
-    return [layer.weights for layer in layers if layer.weights is not None]
 
 
 def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]:

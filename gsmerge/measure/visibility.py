@@ -64,10 +64,5 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
     """Pixels per side, an odd number, of the square that a sample marks in a view with the intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
-    own = np.median(_focal(sources.Ks.double().numpy()))
-    return max(_DILATION, 2 * round((_DILATION * float(_focal(K) / own) - 1) / 2) + 1)
-
-
-def _focal(Ks: np.ndarray) -> np.ndarray:
-    """``[...]`` mean focal lengths of ``[...,3,3]`` intrinsics, pixels."""
-    return np.asarray(np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]))
+    focals = [np.sqrt(one[..., 0, 0] * one[..., 1, 1]) for one in (K, sources.Ks.double().numpy())]  # pixels
+    return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,8 +24,9 @@ from gsmerge.research.charts.series import (
     input_mean,
     is_typical,
     line_key,
-    line_names,
     list_metrics,
+    names_of,
+    ours_first,
     scene_points,
     score_getter,
     successful,
@@ -43,6 +44,8 @@ INTERVAL_NOTE = (
     "Means over {scenes}; bands, from three scenes on: 95 % t intervals of the differences between"
     " settings, without those between scenes."
 )
+
+DIGITS = {"psnr": 2, "ssim": 3, "lpips_vgg": 3, "lpips_alex": 3}  # decimals that are shown of a metric
 
 
 @dataclass(frozen=True)
@@ -128,16 +131,21 @@ def _over(lines: Sequence[Line]) -> str:
     return INTERVAL_NOTE.format(scenes=f"{len(scenes)} scenes ({names})")
 
 
-def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | None:
-    """Quality against seconds or against the share of Gaussians that is kept."""
+def _panels(records: Sequence[RunRecord], part: str, lines_of: Callable[[Getter], list[Line]]) -> list[Panel]:
+    """One for each metric that was measured, with its level for the input at the typical number of views."""
     panels = []
     for metric in list_metrics(records, part):
         value = score_getter(metric, part)
-        lines = by_size(records, _cost(cost), value)
+        lines = lines_of(value)
         level = input_mean(records, value, _scenes(lines))
         reference = None if level is None else ("input", level)
         panels.append(Panel(METRIC_LABELS[metric], HIGHER_IS_BETTER[metric], tuple(lines), reference))
-    panels = [panel for panel in panels if panel.lines]
+    return panels
+
+
+def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | None:
+    """Quality against seconds or against the share of Gaussians that is kept."""
+    panels = [one for one in _panels(records, part, lambda value: by_size(records, _cost(cost), value)) if one.lines]
     if not panels:
         return None
     words = f"Measured on {PART_LABELS[part]}. Rings: the Pareto front. {_over(panels[0].lines)}"
@@ -154,9 +162,8 @@ def _typical_runs(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     """Runs of the typical size and number of views by the name of their line, ours first, all over the same scenes."""
     size, views = typical_size(records), typical_views(records)
     chosen = [r for r in records if is_typical(r, size) and r.views_asked == views]
-    names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
-    rows: dict[str, list[RunRecord]] = {}
-    for record in sorted(chosen, key=lambda r: (r.method != OURS, len(line_key(r)[1]))):
+    names, rows = names_of(records), dict[str, list[RunRecord]]()
+    for record in ours_first(chosen):
         rows.setdefault(names[line_key(record)], []).append(record)
     return _over_common(rows)
 
@@ -246,11 +253,8 @@ def _coincide(one: Line, other: Line) -> bool:
 
 
 def _over_views(records: Sequence[RunRecord], part: str) -> Curves | None:
-    panels = []
-    for metric in list_metrics(records, part):
-        lines = by_views(records, score_getter(metric, part), with_input=True)
-        panels.append(Panel(METRIC_LABELS[metric], HIGHER_IS_BETTER[metric], tuple(lines)))
-    panels = [panel for panel in panels if any(line.ours for line in panel.lines)]
+    panels = _panels(records, part, lambda value: by_views(records, value, with_input=True))
+    panels = [replace(panel, reference=None) for panel in panels if any(line.ours for line in panel.lines)]
     if not panels:
         return None
     caption = (
@@ -304,6 +308,5 @@ def make_verdict_tables(records: Sequence[RunRecord]) -> list[VerdictTable]:
                 if not line.ours and (cost != "ratio" or RATIOS[0] <= point.x <= RATIOS[1])
             ]
             if rows and ours:
-                decimals = 2 if metric == "psnr" else 3
-                tables.append(VerdictTable(f"{METRIC_LABELS[metric]} {words}", tuple(rows), decimals))
+                tables.append(VerdictTable(f"{METRIC_LABELS[metric]} {words}", tuple(rows), DIGITS[metric]))
     return tables

@@ -67,15 +67,11 @@ def measure_proxies(
     pixels = images.shape[1] * images.shape[2]
     for key, (name, share) in points.items():
         count = max(1, round(share * pixels))
-        values = parallel_map(partial(_one_view, images, count, name), views)
+        values = parallel_map(partial(proxy_psnr, count=count, segmentation=name), images[views])
         finite = [min(value, 100.0) for value in values]  # a flat photo is reproduced exactly
         point = Proxy(key, scene, name, count, share, len(views), float(np.mean(finite)))
         append_line(folder / PROXIES, asdict(point))
         progress()
-
-
-def _one_view(images: Tensor, count: int, segmentation: str, view: int) -> float:
-    return proxy_psnr(images[view], count, segmentation)
 
 
 def read_proxies(folder: Path) -> tuple[dict[str, Proxy], Sequence[str]]:

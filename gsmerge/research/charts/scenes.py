@@ -38,11 +38,8 @@ def find_scenes(
         SceneError: If a file is missing.
         UsageError: If a scene is given twice or a template holds another name.
     """
-    names = scene_names(scenes)
-    return [
-        _make_source(scene, name, filled(targets, scene), filled(target_images, scene))
-        for scene, name in zip(scenes, names, strict=True)
-    ]
+    named = zip(scenes, scene_names(scenes), strict=True)
+    return [_make_source(one, name, filled(targets, one), filled(target_images, one)) for one, name in named]
 
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +16,7 @@ from gsmerge.research.charts.statistics import Interval, paired_intervals
 MIN_SHARE = 0.5  # of the scenes that a point of a line must have
 MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
 TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes
-PARTS = (
-    "target_visible",
-    "target",
-    "context_visible",
-    "context",
-)  # what scores are means over, the most meaningful first
-PART_LABELS = {
+PART_LABELS = {  # what scores are means over, the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
     "context_visible": "input views, pixels that they see",
@@ -87,6 +81,17 @@ def _setting_label(name: str, value: Any) -> str:
     return f"K = {value}" if name == "k" else str(value) if name == "segmentation" else f"{name} {value}"
 
 
+def names_of(records: Sequence[RunRecord]) -> dict[LineKey, str]:
+    """The name of the line of every run; that of the input is its method."""
+    merged = line_names(list(dict.fromkeys(line_key(r) for r in ours_first(records) if r.method != INPUT)))
+    return {line_key(r): INPUT for r in records if r.method == INPUT} | merged
+
+
+def ours_first(records: Iterable[RunRecord]) -> list[RunRecord]:
+    """Runs of ours, then those of baselines, those with the fewest settings first."""
+    return sorted(records, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
+
+
 def newest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     """The last record for each scene, method, settings and number of views, so that no scene counts twice in a mean.
 
@@ -115,8 +120,8 @@ def successful(records: Sequence[RunRecord]) -> list[RunRecord]:
 
 def choose_part(records: Sequence[RunRecord]) -> str:
     """What scores are means over: the most meaningful that nine of ten runs have."""
-    known = {part: sum(record.score(f"psnr_{part}") is not None for record in records) for part in PARTS}
-    return next((part for part in PARTS if records and known[part] >= 0.9 * len(records)), PARTS[-1])
+    known = {part: sum(record.score(f"psnr_{part}") is not None for record in records) for part in PART_LABELS}
+    return next((part for part in known if records and known[part] >= 0.9 * len(records)), "context")
 
 
 def list_metrics(records: Sequence[RunRecord], part: str) -> list[str]:
