@@ -37,13 +37,10 @@ class Job:
 
 
 def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
-    """All scenes, each once, and where their results go.
+    """All scenes, each once, and where their results go in the output folder.
 
-    Args:
-        given: Folders, which are searched; patterns; ``.ply`` files; text files with one of these per line.
-        out: The output folder, which is not searched.
-        options: For the names of the results.
-        own: Real paths of results of former runs, which are no scenes.
+    ``given`` are folders, which are searched, except for ``out``; patterns; ``.ply`` files; text files with one of
+    these per line. ``own`` has the real paths of results of former runs, which are no scenes.
 
     Raises:
         SceneError: If something in ``given`` does not exist or holds no scene.

@@ -50,18 +50,9 @@ def run_batch(
 ) -> Generator[dict[str, Any], None, None]:
     """Compact scenes, each on its own; those that are done are skipped.
 
-    Each is recorded in ``folder/batch.jsonl`` before it is yielded, so that a run that ends at any moment can be
-    continued. Runs with the same settings may share a folder: each scene is compacted by one of them.
-
-    Args:
-        jobs: See :func:`find_jobs`.
-        folder: For the results; made where it does not exist.
-        options: Of the batch.
-        index: The folder's records, if they are read already.
-        schedule: Of :func:`make_schedule`, if it is made already.
-
-    Yields:
-        One record for each scene as it ends, in any order: ``status`` done, failed or skipped.
+    Each is recorded in ``folder/batch.jsonl`` before its record is yielded, in any order, so that a run that ends at
+    any moment can be continued. Runs with the same settings may share a folder: each scene is compacted by one of them.
+    ``index``, the folder's records, and ``schedule`` are made if they are not given.
 
     Raises:
         SceneError: If the folder cannot be written.

@@ -153,10 +153,6 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         cells.append(
             (row["output"], f"{row['num_output']:,}", f"{row['num_input']:,}", share, *quality, f"{row['seconds']:.1f}")
         )
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    return [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in cells
-    ]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ([cell.rjust(width) for cell, width in zip(row, widths, strict=True)] for row in cells)
+    return ["  ".join([row[0].ljust(widths[0]), *line[1:]]) for row, line in zip(cells, lines, strict=True)]

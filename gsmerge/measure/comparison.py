@@ -66,17 +66,9 @@ def compare(
 ) -> Comparison:
     """Measure a scene and its compact versions.
 
-    Args:
-        scene: The input, with views.
-        results: Compact Gaussians by name, in the scene's world.
-        storage: What their files hold, by name; the scene's under "input".
-        targets: Held-out views; None: the input views alone.
-        options: Which measures of quality.
-        long_sides: Pixels along the longer side to render at; None: the views' own, and twice that.
-        merge_seconds: Time that making the results took, by name, where it is known.
-
-    Raises:
-        UsageError: If a size is not positive, or as :func:`gsmerge.evaluate`.
+    ``storage`` has what their files hold, by name, the scene's under "input"; ``merge_seconds`` the time that making
+    them took, where it is known. ``long_sides`` are pixels along the longer side to render at, by default the views'
+    own, and twice that. A UsageError if one is not positive, or as :func:`gsmerge.evaluate`.
     """
     own = max(scene.cameras.width, scene.cameras.height)
     sides = (own, 2 * own) if long_sides is None else long_sides

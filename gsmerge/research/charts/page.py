@@ -8,24 +8,14 @@ from importlib.resources import files
 from pathlib import Path
 
 from gsmerge.report import human_bytes
+from gsmerge.research.charts import series
 from gsmerge.research.charts.experiment import OURS
 from gsmerge.research.charts.figures import DIGITS, Curves, Figure, VerdictTable
 from gsmerge.research.charts.markup import Cell, Row, details, inline_svg, table, text
 from gsmerge.research.charts.pictures import error_section, find_pictures, slider_section
 from gsmerge.research.charts.record import RunRecord
 from gsmerge.research.charts.run import describe
-from gsmerge.research.charts.series import (
-    PART_LABELS,
-    by_size,
-    choose_part,
-    line_key,
-    list_metrics,
-    names_of,
-    score_getter,
-    size_label,
-    successful,
-    typical_views,
-)
+from gsmerge.research.charts.series import PART_LABELS
 from gsmerge.research.charts.statistics import Interval
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -46,7 +36,7 @@ def make_page(
 
     ``drawings`` are the SVG of each figure by name; ``command`` is the command line that draws the page again.
     """
-    done = successful(records)
+    done = series.successful(records)
     scenes = list(dict.fromkeys(record.scene for record in records))
     failed = [record for record in records if record.error is not None]
     pictures = find_pictures(done, folder)
@@ -88,22 +78,22 @@ def _results(records: Sequence[RunRecord]) -> str:
     """Means over the scenes by method, settings and size."""
     if not records:
         return ""
-    part = choose_part(records)
-    metrics = list_metrics(records, part)
-    views = typical_views(records)
+    part = series.choose_part(records)
+    metrics = series.list_metrics(records, part)
+    views = series.typical_views(records)
     scores = {
         metric: {
             (line.name, point.label): point.y
-            for line in by_size(records, lambda record: record.ratio, score_getter(metric, part))
+            for line in series.by_size(records, lambda record: record.ratio, series.score_getter(metric, part))
             for point in line.points
         }
         for metric in metrics
     }
-    names, groups = names_of(records), dict[tuple[str, str], list[RunRecord]]()
+    names, groups = series.names_of(records), dict[tuple[str, str], list[RunRecord]]()
     lines = list(names)
-    for record in sorted(records, key=lambda r: (lines.index(line_key(r)), r.ratio or 0.0)):
+    for record in sorted(records, key=lambda r: (lines.index(series.line_key(r)), r.ratio or 0.0)):
         if record.views_asked == views:
-            groups.setdefault((names[line_key(record)], size_label(record)), []).append(record)
+            groups.setdefault((names[series.line_key(record)], series.size_label(record)), []).append(record)
     rows = []
     for (name, size), group in groups.items():
         cells = [

@@ -153,28 +153,15 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
 
 @dataclass(frozen=True)
 class GenerateOptions:
-    """Settings of synthetic scenes.
+    """Settings of synthetic scenes; a ValueError if one is out of range."""
 
-    Args:
-        views: Range of the number of views of a scene; there is one target between any two neighbours.
-        width: Pixels.
-        height: Pixels.
-        style: One of :data:`gsmerge.research.generate.styles.STYLES`, or "mixed": each in turn.
-        path: One of :data:`gsmerge.research.generate.paths.PATHS`, or "mixed": any.
-        noise: Factor on the errors of :class:`NoiseOptions`.
-        ranges: The errors and habits.
-
-    Raises:
-        ValueError: If a setting is out of range.
-    """
-
-    views: tuple[int, int] = (6, 6)
-    width: int = 320
-    height: int = 240
-    style: str = MIXED
-    path: str = MIXED
-    noise: float = 1.0
-    ranges: NoiseOptions = field(default_factory=NoiseOptions)
+    views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours
+    width: int = 320  # of the views, pixels: 16 to 2048
+    height: int = 240  # the same
+    style: str = MIXED  # one of STYLES, or "mixed": each in turn
+    path: str = MIXED  # one of PATHS, or "mixed": any
+    noise: float = 1.0  # factor on the errors: 0 to 10
+    ranges: NoiseOptions = field(default_factory=NoiseOptions)  # the errors and habits
 
     def __post_init__(self) -> None:
         low, high = self.views

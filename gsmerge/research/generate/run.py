@@ -81,23 +81,12 @@ def generate(
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
     ``generated.json`` with the random settings. A folder that holds the same scene already is left as it is, so an
-    interrupted call can be repeated, and a call with a larger ``count`` adds scenes.
-
-    Args:
-        out: Folder of the scenes, created if it does not exist.
-        count: Number of scenes, at least 1.
-        options: Settings of the scenes.
-        seed: Random numbers depend only on it and on the scene's number.
-        overwrite: Replace scenes of other options.
-        threads: Threads; None: all processors.
-        progress: Called with scenes done and scenes in all.
-
-    Returns:
-        The scenes in order.
+    interrupted call can be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on
+    ``seed`` and the scene's number; ``progress`` is called with scenes done and scenes in all.
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
-        UsageError: If a folder holds something else.
+        UsageError: If a folder holds a scene of other options and ``overwrite`` is False, or no synthetic scene.
         SceneError: If a folder cannot be written.
     """
     options = options or GenerateOptions()

@@ -57,10 +57,6 @@ class _Result:
     before: float
     after: float
 
-    @property
-    def count(self) -> int:
-        return len(self.gaussians)
-
 
 def stress(
     load: SceneLoad,
@@ -71,16 +67,11 @@ def stress(
     hints: ReadHints = AUTO,
     progress: Progress | None = None,
 ) -> tuple[StressOutcome, ...]:
-    """Compact a scene under bad conditions.
+    """Compact a scene under bad conditions: all ``CASES``, or those with some names.
 
-    Args:
-        load: The scene, with views.
-        options: Settings of every run.
-        targets: Held-out views that results are compared with; None: the input views with their photos, or with renders
-            of the input where there are none.
-        cases: Names of ``CASES``; None: all.
-        hints: Given when the scene was read.
-        progress: Called with (case, done, total).
+    Results are compared on held-out views (``targets``), or on the input views with their photos, or with renders of
+    the input where there are none. ``hints`` are those that the scene was read with; ``progress`` is called with (case,
+    done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -172,8 +163,8 @@ def _property_text(case: Case, options: CompactOptions) -> str:
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
-    figures = f"{result.count:,} Gaussians, {result.after:.2f} dB"
-    both = f"{figures}; unchanged {base.count:,}, {base.after:.2f} dB"
+    figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
+    both = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
     if case.check == "better":
         if math.isinf(result.before):
             return True, f"{figures} against renders of the input"
@@ -185,15 +176,15 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
         return result.after >= base.after - MAX_NEAR - slack, both
     near = result.after >= base.after - MAX_SAME - slack
     if case.check == "once":
-        return near and result.count <= ONCE_COUNT * base.count, both
-    return near and abs(result.count - base.count) <= max(1, SAME_COUNT * base.count), both
+        return near and len(result.gaussians) <= ONCE_COUNT * len(base.gaussians), both
+    return near and abs(len(result.gaussians) - len(base.gaussians)) <= max(1, SAME_COUNT * len(base.gaussians)), both
 
 
 def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
     """The result as a scene of its own, compacted to as many Gaussians as it has."""
     scene = given.scene
     unaligned = UnalignedScene(base.gaussians, scene.cameras, scene.images, scene.names)
-    once = replace(options, budget=BudgetOptions(budget=base.count), decode=replace(options.decode, k=1))
+    once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
     after = _quality(given, compact(unaligned, once).gaussians)[1]
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
@@ -205,19 +196,15 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
     stored = from_viewmats(load.cameras.viewmats.numpy(), case.convention)
     wrong = replace(load.cameras, viewmats=torch.from_numpy(to_viewmats(stored, load.cameras.convention)))
     try:
-        ply = read_ply_with_hints(load.files.ply, opacity=_encoding(load), hints=hints)
+        opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
+        ply = read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints)
         read = align_scene(ply, load.files, wrong, hints=hints).scene
     except SceneError as error:
         return True, f"refused: {error.problem}"
     expected, viewmats = load.scene.cameras.viewmats.numpy(), read.cameras.viewmats.numpy()
-    same = expected.shape == viewmats.shape and np.allclose(
-        expected, viewmats, atol=1e-3 * (1 + np.abs(expected).max())
-    )
+    tolerance = 1e-3 * (1 + np.abs(expected).max())
+    same = expected.shape == viewmats.shape and np.allclose(expected, viewmats, atol=tolerance)
     return bool(same), "recognised" if same else "taken for something else"
-
-
-def _encoding(load: SceneLoad) -> OpacityChoice:
-    return "raw" if load.ply.opacity_encoding == "raw" else "logit"
 
 
 def _find_defect(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:
