@@ -30,9 +30,8 @@ def find_program() -> str:
     program = shutil.which(named or PROGRAM)
     if program is None:
         place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
-        raise UsageError(
-            f"method splat-transform: expected the program {place}, found none; install it with: {INSTALL}"
-        )
+        problem = f"expected the program {place}, found none; install it with: {INSTALL}"
+        raise UsageError(f"method splat-transform: {problem}")
     return program
 
 
@@ -48,11 +47,7 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         with log.stage("reduce"):
             done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
         if done.returncode != 0 or not after.exists():
-            raise GsmergeError(_failure(program, done))
+            output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
+            problem = f"expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
+            raise GsmergeError(f"{program}: {problem}")
         return read_ply(after, opacity="logit").gaussians
-
-
-def _failure(program: str, done: subprocess.CompletedProcess[bytes]) -> str:
-    """One line: the exit code and the end of the program's output."""
-    output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
-    return f"{program}: expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"

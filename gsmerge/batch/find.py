@@ -56,7 +56,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
             continue
         inputs.add(real)
         job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
-        for name in (job.output, *further_outputs(job.output, options.settings.budget.levels)):
+        for name in result_names(job.output, options):
             if name in owners:
                 raise UsageError(
                     f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
@@ -70,9 +70,9 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
     return jobs
 
 
-def further_outputs(output: str, levels: int) -> list[str]:
-    """Names of the further levels of detail of a result."""
-    return [str(level_output(Path(output), level)) for level in range(1, levels)]
+def result_names(output: str, options: BatchOptions) -> list[str]:
+    """Names of a result and of its further levels of detail."""
+    return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
 
 
 def _ply_of(scene: Path) -> Path:

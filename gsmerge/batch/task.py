@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.batch.find import Job, further_outputs
+from gsmerge.batch.find import Job, result_names
 from gsmerge.batch.locks import BusyError, Lock, scene_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import (
@@ -80,7 +80,7 @@ def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dic
 def _locked(job: Job, context: BatchContext, work: Callable[[Lock], dict[str, Any]]) -> dict[str, Any]:
     """What ``work`` returns under the scene's lock, or that another process has it, or that nothing can be written."""
     try:
-        with scene_lock(context.folder, _output_names(job, context.options)) as lock:
+        with scene_lock(context.folder, result_names(job.output, context.options)) as lock:
             return work(lock)
     except BusyError:
         return record(BUSY, job.scene, job.output)
@@ -100,7 +100,7 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: 
         if known is not None and known.holds(context.folder, key):
             return record(SKIPPED, job.scene, job.output, key=key, files=_as_written(context.folder, known))
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
-    for name in _output_names(job, options):
+    for name in result_names(job.output, options):
         if os.path.lexists(context.folder / name) and name not in own and not (lock.fresh or options.overwrite):
             problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
             raise UsageError(f"{context.folder / name}: {problem}")
@@ -120,11 +120,6 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
     names = [job.output, *(os.path.relpath(level["path"], context.folder) for level in document["levels"])]
     facts = {"key": key, "files": written_files(context.folder, names), "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
-
-
-def _output_names(job: Job, options: BatchOptions) -> list[str]:
-    """Names of the result and of its further levels."""
-    return [job.output, *further_outputs(job.output, options.settings.budget.levels)]
 
 
 def _as_written(folder: Path, known: DoneResult) -> list[dict[str, Any]]:
@@ -155,9 +150,9 @@ def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
 
 def _clean(job: Job, context: BatchContext) -> None:
     """Remove what a killed process left next to a result and its further levels."""
-    for path in (context.folder / name for name in _output_names(job, context.options)):
-        if path.parent.is_dir():
-            remove_leftovers(path)
+    for name in result_names(job.output, context.options):
+        if (context.folder / name).parent.is_dir():
+            remove_leftovers(context.folder / name)
 
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
@@ -175,7 +170,8 @@ def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, A
 
 def clean_up(task: Task, context: BatchContext) -> None:
     """Remove unfinished files of a scene whose process was ended on purpose; another process or the next run may."""
-    with suppress(BusyError, SceneError), scene_lock(context.folder, _output_names(task.job, context.options)) as lock:
+    names = result_names(task.job.output, context.options)
+    with suppress(BusyError, SceneError), scene_lock(context.folder, names) as lock:
         _clean(task.job, context)
         _finish(lock, task, context)
 

@@ -82,15 +82,9 @@ def lpips(
 ) -> float:
     """Learned perceptual distance (LPIPS, Zhang et al. 2018, version 0.1): 0 for equal images, lower is closer.
 
-    Args:
-        image: ``[h,w,3]`` sRGB in [0, 1], at least 16 x 16 pixels for vgg, 31 x 31 for alex.
-        reference: ``[h,w,3]``.
-        net: ``"vgg"`` (VGG-16) or ``"alex"`` (AlexNet); the figures of the two do not compare.
-        mask: ``[h,w]`` pixels that count; the others are taken from ``reference`` before the networks see them,
-            so they add nothing of their own, and the mean stays over the whole image. None: all count.
-
-    Returns:
-        The distance, at least 0.
+    The images are ``[h,w,3]`` sRGB in [0, 1], at least 16 x 16 pixels for ``"vgg"`` (VGG-16), 31 x 31 for ``"alex"``
+    (AlexNet); the figures of the two do not compare. Pixels outside of ``mask [h,w]`` are taken from ``reference``
+    before the networks see them, so they add nothing of their own, and the mean stays over the whole image.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.

@@ -69,17 +69,18 @@ def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float)
     """Seconds per view of each scene, one after the other and again."""
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
     for gaussians in scenes.values():  # compiles, and fills caches
-        _draw(gaussians, views[[0]], near)
+        time_render(gaussians, views[[0]], near)
     for turn in range(REPEATS):
         for name, gaussians in scenes.items():
             if turn and shortest[name].max() > MAX_REPEATED_SECONDS:
                 continue
             for view in range(len(views)):
-                shortest[name][view] = min(shortest[name][view], _draw(gaussians, views[[view]], near))
+                shortest[name][view] = min(shortest[name][view], time_render(gaussians, views[[view]], near))
     return {name: float(seconds.mean()) for name, seconds in shortest.items()}
 
 
-def _draw(gaussians: Gaussians, view: Cameras, near: float) -> float:
+def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
+    """Seconds to render a view."""
     start = time.perf_counter()
     image = render(gaussians, view, near=near).images
     if image.is_cuda:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,13 +15,12 @@ from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plan
 from gsmerge.measure.preview import Picture, heat_map, to_picture
 from gsmerge.render import render
 from gsmerge.research.charts.record import picture_path
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
 Scene = PixelScene | UnalignedScene
 MAX_PICTURES = 2  # views of a run whose pictures are stored
 MAX_WIDTH = 640  # pixels of a stored picture
-MAX_TIMED = 4  # views that are rendered for the time
 MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the error maps' scale
 QUALITY = 88  # of the JPEG files
 MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
@@ -61,16 +59,6 @@ def measure(
                 if value is not None and not math.isnan(value):
                     scores[f"{name}_{split}{part}"] = min(value, MAX_DB)
     return scores
-
-
-def time_render(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Milliseconds to render one view: the median over a few views; ``near`` in world units."""
-    seconds = []
-    for view in pick_views(len(cameras), MAX_TIMED):
-        start = time.perf_counter()
-        render(gaussians, cameras[[view]], near=near)
-        seconds.append(time.perf_counter() - start)
-    return 1000 * float(np.median(seconds))
 
 
 def keep_pictures(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -19,21 +21,24 @@ from gsmerge.io import AUTO, HeldOutViews, ReadHints, load_files, read_held_out
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_writer import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
+from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.research.charts.experiment import Experiment, run_settings
-from gsmerge.research.charts.measure import choose_views, keep_pictures, measure, time_render
+from gsmerge.research.charts.measure import choose_views, keep_pictures, measure
 from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
 from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experiment_key, read_runs
 from gsmerge.research.charts.scenes import SceneSource
 from gsmerge.runtime.estimate import work_seconds
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.views import pick_views
 
 Progress = Callable[[str, int, int], None]
 SCORING = ("score", "input")  # stages of a run that only measure
 PACKAGES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
+MAX_TIMED = 4  # views that are rendered for the time
 COST_EVALUATE = 2.5  # seconds per million pixels of all views, to score input and result
 COST_LPIPS = 12.0  # the same for each network
 
@@ -94,14 +99,14 @@ def make_plan(
     done_proxies, more = read_proxies(folder)
     by_path = {source.path: source for source in sources}
     runs: dict[str, tuple[str, Experiment, SceneSource]] = {}
-    too_few: dict[str, int] = {}
+    too_few: Counter[str] = Counter()
     for experiment in experiments:
         source = by_path[experiment.scene]
         if experiment.views is not None and source.num_views is not None and experiment.views > source.num_views:
-            too_few[source.name] = too_few.get(source.name, 0) + 1
-            continue
-        key = options.key_of(experiment, source)
-        runs.setdefault(key, (key, experiment, source))
+            too_few[source.name] += 1
+        else:
+            key = options.key_of(experiment, source)
+            runs.setdefault(key, (key, experiment, source))
     skipped = [f"{name} has fewer views than asked for: {count} run(s) left out" for name, count in too_few.items()]
     pending = {k for k in runs if options.rerun or k not in stored or stored[k].error is not None}
     proxies: dict[str, Mapping[str, tuple[str, float]]] = {}
@@ -138,7 +143,11 @@ def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) 
             loaded = _read(source, options)
             for key, experiment in runs:
                 step(f"{source.name}: {describe(experiment)}")
-                record = _run_recorded(_start_record(key, source, experiment, options), loaded, folder, options, warm)
+                record = _start_record(key, source, experiment, options)
+                try:
+                    record = _run(record, loaded, folder, options, warm)
+                except Exception as error:  # one bad run must not end the grid; Ctrl-C does
+                    record = replace(record, error=error_line(error))
                 append_run(folder, record)
                 done.append(record)
             if proxies and isinstance(loaded, _LoadedScene) and loaded.scene.images is not None:
@@ -183,25 +192,16 @@ def _start_record(key: str, source: SceneSource, experiment: Experiment, options
     )
 
 
-def _run_recorded(
+def _run(
     record: RunRecord, loaded: _LoadedScene | Exception, folder: Path, options: RunOptions, warm: set[tuple[Any, ...]]
 ) -> RunRecord:
-    """The record of a run: merge, score, time, store pictures; or why that failed.
+    """Merge, score, time, store pictures.
 
     ``warm`` has the kinds of runs that this process has done before, and is added to. The first of a kind is tried on
     two views, so that compiling and loading of kernels does not count as its time.
     """
-    try:
-        if isinstance(loaded, Exception):
-            raise loaded
-        return _run(record, loaded, folder, options, warm)
-    except Exception as error:  # one bad run must not end the grid; Ctrl-C does
-        return replace(record, error=error_line(error))
-
-
-def _run(
-    record: RunRecord, loaded: _LoadedScene, folder: Path, options: RunOptions, warm: set[tuple[Any, ...]]
-) -> RunRecord:
+    if isinstance(loaded, Exception):
+        raise loaded
     if record.views_asked is not None and record.views_asked > len(loaded.scene):
         raise ValueError(f"expected at most {len(loaded.scene)} views, got {record.views_asked}")
     scene, targets = choose_views(loaded.scene, loaded.held_out, record.views_asked)
@@ -221,7 +221,8 @@ def _run(
     scores: dict[str, Any] = {**measure(scene, result, targets, evaluation)}
     gaussians = scene.file_gaussians if result is None else result
     count = scene.num_gaussians if result is None else len(result)
-    cameras = scene.cameras if targets is None else targets.cameras
+    cameras, near = scene.cameras if targets is None else targets.cameras, near_plane(scene)
+    views = pick_views(len(cameras), MAX_TIMED)
     return replace(
         record,
         views=len(scene),
@@ -231,7 +232,7 @@ def _run(
         bytes=file_bytes(count, gaussians.sh_degree),
         seconds=sum(value for name, value in seconds.items() if name not in SCORING),
         stages=dict(seconds),
-        render_ms=time_render(gaussians, cameras, near_plane(scene)),
+        render_ms=1000 * median(time_render(gaussians, cameras[[view]], near) for view in views),
         pictures=keep_pictures(folder, record.key, record.scene_sha256, gaussians, loaded.scene, loaded.held_out),
         notes=notes,
         **scores,
@@ -278,19 +279,14 @@ def environment(threads: int | None) -> dict[str, str]:
         "python": platform.python_version(),
     }
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):  # installed under another name
             values[name] = version(name)
-        except PackageNotFoundError:
-            continue  # installed under another name
     return values
 
 
 def _processor() -> str:
     """Its model, and the number of processors."""
     name = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
-    except OSError:
-        pass  # only Linux has it
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
+        name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
     return f"{name}, {os.cpu_count() or 1} processors"

@@ -89,12 +89,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> N
 def trace(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
-    hits = Hits(
-        np.full((h, w), FAR),
-        np.full((h, w), -1, np.int32),
-        np.zeros((h, w, 3), np.float32),
-        np.zeros((h, w, 3), np.float32),
-    )
+    hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()

@@ -55,9 +55,7 @@ def generate_scene(
 ) -> Path:
     """Make scene ``index`` of the series of ``seed`` in a folder, as :func:`generate` does, and return the folder.
 
-    Raises:
-        UsageError: If the folder holds something else.
-        SceneError: If the folder cannot be written.
+    A UsageError if the folder holds something else, a SceneError if it cannot be written.
     """
     options = options or GenerateOptions()
     key = scene_key(seed, index, options)
@@ -128,17 +126,16 @@ def check_replaceable(folder: Path, *, overwrite: bool) -> None:
     if not os.path.lexists(folder):
         return
     if not (folder / RECORD).is_file():
-        raise UsageError(
-            f"{folder}: expected no folder, or a synthetic scene, found something else; choose another OUT"
-        )
-    if not overwrite:
-        raise UsageError(
-            f"{folder}: holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
-        )
+        problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
+    elif not overwrite:
+        problem = "holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
+    else:
+        return
+    raise UsageError(f"{folder}: {problem}")
 
 
-def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a scene, in place of an existing one, and return its record; a SceneError if it cannot be written."""
+def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> None:
+    """Write a scene, in place of an existing one; a SceneError if it cannot be written."""
     record = {
         **key,
         "style": scene.style,
@@ -152,7 +149,6 @@ def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> 
         _write_views(temporary / "targets", scene.targets, scene.target_images)
         write_ply(temporary / "scene.ply", scene.gaussians)
         (temporary / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return record
 
 
 @contextmanager
@@ -177,9 +173,7 @@ def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> Non
     frames = []
     for i, image in enumerate(images):
         name = f"images/view_{i:03d}.png"
-        ok, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
-        if not ok:
-            raise RuntimeError("the image library could not write a PNG")
+        _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
         (folder / name).write_bytes(data.tobytes())
         c2w = np.linalg.inv(cameras.viewmats[i].numpy()) @ FLIP
         frames.append({"file_path": name, "transform_matrix": c2w.tolist()})

@@ -99,12 +99,7 @@ def stress(
 
 
 def _check_case(
-    case: Case,
-    load: SceneLoad,
-    given: StressScene,
-    base: _Result | None,
-    options: CompactOptions,
-    hints: ReadHints,
+    case: Case, load: SceneLoad, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
 ) -> tuple[bool | None, str]:
     """Whether the case's property holds, and the figures."""
     problem = _inapplicable(case, load)
@@ -163,8 +158,9 @@ def _property_text(case: Case, options: CompactOptions) -> str:
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
-    figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
-    both = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
+    count, former = len(result.gaussians), len(base.gaussians)
+    figures = f"{count:,} Gaussians, {result.after:.2f} dB"
+    both = f"{figures}; unchanged {former:,}, {base.after:.2f} dB"
     if case.check == "better":
         if math.isinf(result.before):
             return True, f"{figures} against renders of the input"
@@ -176,8 +172,8 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
         return result.after >= base.after - MAX_NEAR - slack, both
     near = result.after >= base.after - MAX_SAME - slack
     if case.check == "once":
-        return near and len(result.gaussians) <= ONCE_COUNT * len(base.gaussians), both
-    return near and abs(len(result.gaussians) - len(base.gaussians)) <= max(1, SAME_COUNT * len(base.gaussians)), both
+        return near and count <= ONCE_COUNT * former, both
+    return near and abs(count - former) <= max(1, SAME_COUNT * former), both
 
 
 def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
