@@ -40,11 +40,8 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
     """All scenes, each once, and where their results go in the output folder.
 
     ``given`` are folders, which are searched, except for ``out``; patterns; ``.ply`` files; text files with one of
-    these per line. ``own`` has the real paths of results of former runs, which are no scenes.
-
-    Raises:
-        SceneError: If something in ``given`` does not exist or holds no scene.
-        UsageError: If two scenes would be written to one file, or one over another.
+    these per line. ``own`` has the real paths of results of former runs, which are no scenes. A SceneError if something
+    does not exist or holds no scene, a UsageError if two scenes would be written to one file, or one over another.
     """
     jobs: list[Job] = []
     owners: dict[str, str] = {}

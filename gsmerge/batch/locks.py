@@ -52,11 +52,8 @@ class Lock:
 def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
     """A block in which no other process works on a result; the lock's file stays unless :meth:`Lock.finish` is called.
 
-    ``outputs`` are names of the result and of its further levels.
-
-    Raises:
-        BusyError: If another process works on it.
-        SceneError: If the file cannot be made.
+    ``outputs`` are names of the result and of its further levels. A BusyError if another process works on it, a
+    SceneError if the file cannot be made.
     """
     path = folder / LOCKS / f"{hashlib.sha256(outputs[0].encode(errors='surrogateescape')).hexdigest()[:32]}.lock"
     descriptor, abandoned = _acquire(path)
@@ -134,9 +131,7 @@ def _read(descriptor: int) -> dict[str, object]:
 def run_lock(folder: Path, name: str) -> Iterator[None]:
     """A block of a run, which shares the folder only with runs of the same name, see :meth:`BatchOptions.name`.
 
-    Raises:
-        UsageError: If a run of another name uses the folder.
-        SceneError: If the file cannot be made.
+    A UsageError if a run of another name uses the folder, a SceneError if the file cannot be made.
     """
     path = folder / LOCKS / f"{RUN}.lock"
     deadline = time.monotonic() + LOCK_TIMEOUT

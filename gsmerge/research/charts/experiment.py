@@ -84,11 +84,7 @@ class Grid:
 
 
 def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Grid:
-    """A grid from comma-separated lists of the command line; None leaves the base's.
-
-    Raises:
-        UsageError: If a value is impossible.
-    """
+    """A grid from comma-separated lists, None leaves the base's; a UsageError if a value is impossible."""
     values: dict[str, tuple[Any, ...]] = {}
     for name, text in lists.items():
         if text is not None:
@@ -103,8 +99,7 @@ def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Gri
 def read_grid(path: Path) -> Grid:
     """A grid from a small TOML or JSON file whose keys are the fields of :class:`Grid`.
 
-    Raises:
-        SceneError: If the file cannot be read, or holds anything else.
+    A SceneError if the file cannot be read, or holds anything else.
     """
     values, known = read_table(path), {f.name for f in fields(Grid)}
     densities = values.pop("densities", None)  # the name and form of version 0.1.0

@@ -140,18 +140,9 @@ def _typical_runs(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     names, rows = series.names_of(records), dict[str, list[RunRecord]]()
     for record in series.ours_first(chosen):
         rows.setdefault(names[series.line_key(record)], []).append(record)
-    return _over_common(rows)
-
-
-def _over_common(rows: dict[str, list[RunRecord]]) -> dict[str, list[RunRecord]]:
-    """Rows that have at least half of the scenes, over their common scenes; unchanged if there are none."""
-    scenes = {name: {record.scene for record in group} for name, group in rows.items()}
-    fewest = 0.5 * len(set().union(*scenes.values()))
-    kept = {name: own for name, own in scenes.items() if len(own) >= fewest}
-    common = set.intersection(*kept.values()) if kept else set()
-    if not common:
-        return rows
-    return {name: [record for record in rows[name] if record.scene in common] for name in kept}
+    kept = series.keep_common({name: {record.scene for record in group} for name, group in rows.items()}, 0.5)
+    common = {name: [record for record in rows[name] if record.scene in scenes] for name, scenes in kept.items()}
+    return common or rows
 
 
 def _size_words(records: Sequence[RunRecord]) -> str:

@@ -240,14 +240,10 @@ def _run(
 
 
 def estimate_seconds(
-    runs: Sequence[tuple[str, Experiment, SceneSource]],
-    stored: Mapping[str, RunRecord],
-    *,
-    threads: int,
-    lpips: Sequence[str] = (),
-    lpips_views: int | None = None,
+    runs: Sequence[tuple[str, Experiment, SceneSource]], stored: Mapping[str, RunRecord], options: RunOptions
 ) -> float:
     """Wall time of runs, within a factor of about two; from times of the same scene and method in ``stored`` if any."""
+    threads = options.threads or available_threads()
     known: dict[tuple[str, str], list[float]] = {}
     for record in stored.values():
         if record.seconds is not None and record.error is None:
@@ -257,8 +253,8 @@ def estimate_seconds(
         views = source.num_views or 1
         share = min(1.0, (experiment.views or views) / views)
         gaussians = share * source.files.ply.stat().st_size / BYTES_PER_GAUSSIAN
-        lpips_share = min(1.0, (lpips_views or views) / max(share * views, 1.0))
-        total += gaussians / 1e6 * (COST_EVALUATE + lpips_share * COST_LPIPS * len(lpips)) / threads
+        lpips_share = min(1.0, (options.lpips_views or views) / max(share * views, 1.0))
+        total += gaussians / 1e6 * (COST_EVALUATE + lpips_share * COST_LPIPS * len(options.lpips)) / threads
         times = known.get((source.name, experiment.method))
         if times:
             total += share * median(times)

@@ -32,11 +32,8 @@ def find_scenes(
     """The files of all scenes: ``.ply`` files, or the folders that they are in.
 
     ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
-    template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it.
-
-    Raises:
-        SceneError: If a file is missing.
-        UsageError: If a scene is given twice or a template holds another name.
+    template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it. A
+    SceneError if a file is missing, a UsageError if a scene is given twice or a template holds another name.
     """
     named = zip(scenes, scene_names(scenes), strict=True)
     return [_make_source(one, name, filled(targets, one), filled(target_images, one)) for one, name in named]

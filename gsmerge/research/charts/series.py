@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ PART_LABELS = {  # what scores are means over, the most meaningful first
 METRIC_LABELS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS (VGG)", "lpips_alex": "LPIPS (AlexNet)"}
 LineKey = tuple[str, tuple[tuple[str, Any], ...]]  # method, settings without the size
 Getter = Callable[[RunRecord], float | None]
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
@@ -181,40 +182,35 @@ def _lines(
     min_share: float = MIN_SHARE,
 ) -> list[Line]:
     """Lines of points that have at least a share of the scenes, all over the same scenes."""
-    cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]] = {}
+    cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
     for record in sorted(records, key=order):
         at, value = x(record), y(record)
         if at is not None and value is not None:
-            cells.setdefault(line_key(record), {}).setdefault(label(record), {})[record.scene] = (float(at), value)
-    _keep_common(cells, min_share)
-    columns = [points for line in cells.values() for points in line.values()]
-    intervals = dict(zip(map(id, columns), _intervals(columns), strict=True))
-    names = line_names(list(cells))
-    lines = []
-    for key, sizes in sorted(cells.items(), key=lambda cell: (cell[0][0] != OURS, len(cell[0][1]))):
-        points = [
-            Point(name, _mean_cost(by_scene), intervals[id(by_scene)], by_scene) for name, by_scene in sizes.items()
-        ]
-        lines.append(Line(names[key], key[0] == OURS, tuple(points)))
-    return lines
+            cells.setdefault((line_key(record), label(record)), {})[record.scene] = float(at), value
+    kept = keep_common({cell: set(points) for cell, points in cells.items()}, min_share)
+    keys = list(dict.fromkeys(key for key, _ in kept))
+    by_cell = {
+        cell: {scene: xy for scene, xy in cells[cell].items() if scene in kept[cell]}
+        for cell in sorted(kept, key=lambda cell: keys.index(cell[0]))
+    }
+    intervals = dict(zip(by_cell, _intervals(list(by_cell.values())), strict=True))
+    points: dict[LineKey, list[Point]] = {key: [] for key in keys}
+    for (key, name), by_scene in by_cell.items():
+        points[key].append(Point(name, _mean_cost(by_scene), intervals[key, name], by_scene))
+    names = line_names(keys)
+    keys.sort(key=lambda key: (key[0] != OURS, len(key[1])))
+    return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
 
 
-def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]], min_share: float) -> None:
-    """Leave only scenes that every point has, so that all means are over the same scenes; all, if that leaves none.
+def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
+    """The scenes that all have, so that all means are over the same scenes; each its own, if there are none.
 
-    Points that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
+    Those that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
     """
-    num_scenes = len({scene for line in cells.values() for points in line.values() for scene in points})
-    for key in list(cells):
-        cells[key] = {name: points for name, points in cells[key].items() if len(points) >= min_share * num_scenes}
-        if not cells[key]:
-            del cells[key]
-    columns = [points for line in cells.values() for points in line.values()]
-    common = set.intersection(*map(set, columns)) if columns else set()
-    if common:
-        for points in columns:
-            for scene in points.keys() - common:
-                del points[scene]
+    fewest = min_share * len(set().union(*scenes.values()))
+    kept = {name: own for name, own in scenes.items() if len(own) >= fewest}
+    common = set.intersection(*kept.values()) if kept else set()
+    return {name: common or own for name, own in kept.items()}
 
 
 def _mean_cost(points: Mapping[str, tuple[float, float]]) -> float:

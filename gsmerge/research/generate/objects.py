@@ -23,7 +23,7 @@ from gsmerge.research.generate.shapes import (
     quad,
     rod,
 )
-from gsmerge.research.generate.stage import Palette
+from gsmerge.research.generate.textures import Palette
 
 Shapes = list[Shape]
 

@@ -7,9 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from gsmerge.research.generate.photograph import FAR, Hits
+from gsmerge.research.generate.photograph import FAR, Hits, Stage
 from gsmerge.research.generate.shapes import Array
-from gsmerge.research.generate.stage import Stage
 
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
 MAX_TURN = 50  # degrees between neighbouring views

@@ -25,8 +25,8 @@ from gsmerge.research.generate.photograph import (
     trace,
 )
 from gsmerge.research.generate.shapes import Array
-from gsmerge.research.generate.stage import Palette
 from gsmerge.research.generate.styles import STYLES
+from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 

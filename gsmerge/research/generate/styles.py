@@ -9,6 +9,7 @@ import numpy as np
 
 from gsmerge.research.generate import objects
 from gsmerge.research.generate.objects import Shapes
+from gsmerge.research.generate.photograph import Light, Stage
 from gsmerge.research.generate.shapes import (
     LYING,
     Array,
@@ -23,8 +24,7 @@ from gsmerge.research.generate.shapes import (
     rod,
     sheet,
 )
-from gsmerge.research.generate.stage import Light, Palette, Stage
-from gsmerge.research.generate.textures import color
+from gsmerge.research.generate.textures import Palette, color
 
 FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
 

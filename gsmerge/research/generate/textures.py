@@ -6,6 +6,7 @@ Every function of ``KINDS`` is ``(rng, size) -> [size,size,3]`` float32 sRGB in 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.research.generate.patterns import Grey, cells, courses, enlarge, glyphs, grid, noise, text_line, warp
+from gsmerge.research.generate.shapes import Material
 
 Picture: TypeAlias = NDArray[Any]  # float32
 Color: TypeAlias = NDArray[Any]
@@ -271,3 +273,31 @@ def pyramid(texture: Picture) -> list[Picture]:
         half = len(out[-1]) // 2
         out.append(cv2.resize(out[-1], (half, half), interpolation=cv2.INTER_AREA))
     return out
+
+
+MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # in a scene; other kinds 3
+
+
+@dataclass
+class Palette:
+    """The textures of a scene, created on demand."""
+
+    rng: np.random.Generator
+    size: int  # side of the textures, pixels
+    textures: list[Picture] = field(default_factory=list)
+    by_kind: dict[str, list[int]] = field(default_factory=dict)  # their indices
+
+    def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
+        """A material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
+
+        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` is at random if None, mostly none.
+        """
+        kind = kinds[self.rng.integers(len(kinds))]
+        known = self.by_kind.setdefault(kind, [])
+        if len(known) < MAX_TEXTURES.get(kind, 3):
+            known.append(len(self.textures))
+            self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))
+        texture = known[self.rng.integers(len(known))] if len(known) == MAX_TEXTURES.get(kind, 3) else known[-1]
+        shift = self.rng.uniform(0, 1, 2) if repeat else np.zeros(2)
+        gloss = max(0.0, float(self.rng.uniform(-0.5, 0.5))) if gloss is None else gloss
+        return Material(texture, repeat, gloss, (float(shift[0]), float(shift[1])))
