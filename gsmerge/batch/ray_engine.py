@@ -118,10 +118,8 @@ def _join(ray: ModuleType, options: BatchOptions) -> None:
         _check_connection(options.address)
         ray.init(address=options.address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise SceneError(
-            options.address, f"no Ray cluster answers there ({reason})", "start one with ray start --head"
-        ) from error
+        problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"
+        raise SceneError(options.address, problem, "start one with ray start --head") from error
 
 
 def _check_connection(address: str) -> None:

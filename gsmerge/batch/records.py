@@ -102,6 +102,5 @@ def check_folder(folder: Path) -> None:
         with (folder / RECORDS).open("ab"):
             pass
     except OSError as error:
-        raise SceneError(
-            folder, f"cannot be written ({error.strerror})", "name another folder with --output"
-        ) from error
+        problem = f"cannot be written ({error.strerror})"
+        raise SceneError(folder, problem, "name another folder with --output") from error

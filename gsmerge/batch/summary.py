@@ -150,9 +150,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for row in sorted(rows, key=lambda row: str(row["output"])):
         quality = ["" if row[name] is None else f"{row[name]:.2f}" for name in ("psnr_before", "psnr_after")]
         share = f"{100 * row['ratio']:.2f} %"
-        cells.append(
-            (row["output"], f"{row['num_output']:,}", f"{row['num_input']:,}", share, *quality, f"{row['seconds']:.1f}")
-        )
+        counts = f"{row['num_output']:,}", f"{row['num_input']:,}"
+        cells.append((row["output"], *counts, share, *quality, f"{row['seconds']:.1f}"))
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = ([cell.rjust(width) for cell, width in zip(row, widths, strict=True)] for row in cells)
-    return ["  ".join([row[0].ljust(widths[0]), *line[1:]]) for row, line in zip(cells, lines, strict=True)]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]

@@ -98,7 +98,9 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: 
     before, since = task.known, new_records.known.get(job.output)
     for known in (since, None if options.rerun else before):
         if known is not None and known.holds(context.folder, key):
-            return record(SKIPPED, job.scene, job.output, key=key, files=_as_written(context.folder, known))
+            sizes = {name: (context.folder / name).stat().st_size for name, _ in known.files}
+            written = [{"path": name, "sha256": sha256, "bytes": sizes[name]} for name, sha256 in known.files]
+            return record(SKIPPED, job.scene, job.output, key=key, files=written)
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
     for name in result_names(job.output, options):
         if os.path.lexists(context.folder / name) and name not in own and not (lock.fresh or options.overwrite):
@@ -120,10 +122,6 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
     names = [job.output, *(os.path.relpath(level["path"], context.folder) for level in document["levels"])]
     facts = {"key": key, "files": written_files(context.folder, names), "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
-
-
-def _as_written(folder: Path, known: DoneResult) -> list[dict[str, Any]]:
-    return [{"path": name, "sha256": sha, "bytes": (folder / name).stat().st_size} for name, sha in known.files]
 
 
 def _files_of(job: Job, options: BatchOptions) -> SceneFiles:

@@ -138,12 +138,9 @@ def evaluate(
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out ones.
 
-    Args:
-        scene: The input. Without photos, results are compared with its own renders.
-        results: Gaussians by name, in the scene's world.
-        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_held_out`; None: input views alone.
-        options: What is measured.
-        progress: Called with ("evaluate", done, total) after each result.
+    ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
+    ``targets`` are held-out views in that world, see :func:`gsmerge.io.read_held_out`; ``progress`` is called with
+    ("evaluate", done, total) after each result.
 
     Raises:
         UsageError: If the scene has no views, or a result is called "input".
@@ -223,7 +220,10 @@ def _score_result(
             image = _image(gaussians, views.cameras, i, near)
             seconds, count = seconds + time.perf_counter() - start, count + 1
             nets = options.lpips if i in perceptual else ()
-            scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[split][i], nets))
+            photo, seen = views.images[i].numpy(), visible[split][i]
+            full = _quality(image.numpy(), photo, None, nets)
+            masked = full if seen.all() else _quality(image.numpy(), photo, seen, nets) if seen.any() else Quality()
+            scores.append(ViewScore(split, view, float(seen.mean()), full, masked))
     ratio = len(gaussians) / max(num_input, 1)
     return ResultScores(name, len(gaussians), ratio, seconds / max(count, 1), tuple(scores))
 
@@ -231,15 +231,6 @@ def _score_result(
 def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
     """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
     return render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
-
-
-def _score(
-    split: str, view: str, image: np.ndarray, photo: np.ndarray, visible: NDArray[np.bool_], nets: Sequence[str]
-) -> ViewScore:
-    share = float(visible.mean())
-    full = _quality(image, photo, None, nets)
-    masked = full if visible.all() else _quality(image, photo, visible, nets) if visible.any() else Quality()
-    return ViewScore(split, view, share, full, masked)
 
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:

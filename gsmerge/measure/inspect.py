@@ -204,9 +204,8 @@ def _sight(load: SceneLoad) -> CameraCheck | None:
     scene = load.scene
     if len(scene) == 0:
         return None
-    valid = torch.ones(len(scene.gaussians), dtype=torch.bool)
-    if isinstance(scene, PixelScene):
-        valid = scene.stored.reshape(-1)
+    whole = torch.ones(len(scene.gaussians), dtype=torch.bool)
+    valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else whole
     return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 

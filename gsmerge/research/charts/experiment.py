@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
@@ -73,10 +74,9 @@ class Grid:
                 raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
             if name in OWN_OPTIONS:
                 raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
-            try:
+            settings[name] = value
+            with suppress(ValueError):  # a word
                 settings[name] = json.loads(value)
-            except ValueError:
-                settings[name] = value
             plain = settings[name] is None or isinstance(settings[name], str | int | float)
             if not plain or settings[name] != settings[name]:
                 raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")

@@ -52,9 +52,7 @@ def make_page(
     ]
     sections = [section for section in sections if section[2]]
     links = " ".join(f'<a href="#{text(name)}">{text(title)}</a>' for name, title, _ in sections)
-    body = "".join(
-        f'<section id="{text(name)}"><h2>{text(title)}</h2>{content}</section>' for name, title, content in sections
-    )
+    body = "".join(f'<section id="{text(one)}"><h2>{text(title)}</h2>{html}</section>' for one, title, html in sections)
     names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
     words = f"{len(records)} runs on {len(scenes)} scene(s): {names}" + (f"; {len(failed)} failed" if failed else "")
     package = files("gsmerge.research.charts")
@@ -81,14 +79,10 @@ def _results(records: Sequence[RunRecord]) -> str:
     part = series.choose_part(records)
     metrics = series.list_metrics(records, part)
     views = series.typical_views(records)
-    scores = {
-        metric: {
-            (line.name, point.label): point.y
-            for line in series.by_size(records, lambda record: record.ratio, series.score_getter(metric, part))
-            for point in line.points
-        }
-        for metric in metrics
-    }
+    scores: dict[str, dict[tuple[str, str], Interval]] = {metric: {} for metric in metrics}
+    for metric, means in scores.items():
+        for line in series.by_size(records, lambda record: record.ratio, series.score_getter(metric, part)):
+            means |= {(line.name, point.label): point.y for point in line.points}
     names, groups = series.names_of(records), dict[tuple[str, str], list[RunRecord]]()
     lines = list(names)
     for record in sorted(records, key=lambda r: (lines.index(series.line_key(r)), r.ratio or 0.0)):
@@ -145,18 +139,13 @@ def _verdicts(tables: Sequence[VerdictTable]) -> str:
             f" {words.count('undecided')} undecided, {words.count('ours has none so cheap')} cheaper than anything of"
             " ours, so not compared)."
         )
-        rows: list[Row] = [
-            [
-                verdict.baseline,
-                label,
-                f"{verdict.cost:.4g}",
-                f"{verdict.quality:.{digits}f}",
-                "" if verdict.ours is None else f"{verdict.ours:.{digits}f}",
-                "" if verdict.ahead is None else _interval(verdict.ahead, digits),
-                Cell(verdict.words, f"text {KINDS.get(verdict.words, '')}"),
-            ]
-            for label, verdict in compared.rows
-        ]
+        rows: list[Row] = []
+        for label, verdict in compared.rows:
+            ours = "" if verdict.ours is None else f"{verdict.ours:.{digits}f}"
+            ahead = "" if verdict.ahead is None else _interval(verdict.ahead, digits)
+            last = Cell(verdict.words, f"text {KINDS.get(verdict.words, '')}")
+            cells = f"{verdict.cost:.4g}", f"{verdict.quality:.{digits}f}", ours, ahead
+            rows.append([verdict.baseline, label, *cells, last])
         head = ["Baseline", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict"]
         parts.append(f"<p>{text(sentence)}</p>" + details("the points", table(head, rows, texts=(0, 1, 6))))
     if not parts:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,8 @@ from gsmerge.runtime.jsonl import append_line, read_lines
 
 SCHEMA_VERSION = 1
 INPUT = "input"  # the method of a run that merges nothing
-METRICS = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
-SPLITS = ("context", "target")
-SCORES = tuple(f"{metric}_{split}{part}" for metric in METRICS for split in SPLITS for part in ("", "_visible"))
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "lpips_alex": False}
+SCORES = tuple(map("".join, product(HIGHER_IS_BETTER, ("_context", "_target"), ("", "_visible"))))
 
 
 def _holds(container: type | tuple[type, ...], *kinds: type) -> Callable[[Any], bool]:

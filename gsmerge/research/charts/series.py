@@ -68,10 +68,8 @@ def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
     names = {}
     for method, settings in keys:
         others = [dict(other) for name, other in keys if name == method]
-        shared = {
-            name for name, value in settings if all(other.get(name) == value for other in others) and len(others) > 1
-        }
-        labels = [_setting_label(name, value) for name, value in settings if name not in shared]
+        alone = len(others) == 1
+        labels = [_setting_label(n, v) for n, v in settings if alone or any(other.get(n) != v for other in others)]
         names[method, settings] = ", ".join([method, *labels])
     return names
 
@@ -167,9 +165,7 @@ def by_views(records: Sequence[RunRecord], y: Getter, *, with_input: bool = Fals
     """Lines over the number of views, at the typical size; empty where there is only one number."""
     size = typical_size(records)
     chosen = [r for r in records if (r.method == INPUT and with_input) or is_typical(r, size)]
-    lines = _lines(
-        chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, min_share=MIN_SHARE_VIEWS
-    )
+    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, MIN_SHARE_VIEWS)
     return [line for line in lines if len(line.points) > 1]
 
 

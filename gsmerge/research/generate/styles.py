@@ -133,8 +133,8 @@ def desk(pal: Palette) -> Stage:
     shapes += place(top, (0, 0, d / 2 - back))
     focus = np.array([rng.normal(0, 0.1), -height - rng.uniform(0.02, 0.15), d / 2 - back])
     lamp_at = np.array([rng.uniform(-0.6, 0.6), -h + 0.3, d / 2 - back - rng.uniform(0, 0.6)])
-    materials = light(rng, lamp_at)
-    return Stage(tuple(shapes), tuple(pal.textures), materials, focus, (0.6, 1.3), (height + 0.2, height + 0.8), 60)
+    lights = light(rng, lamp_at)
+    return Stage(tuple(shapes), tuple(pal.textures), lights, focus, (0.6, 1.3), (height + 0.2, height + 0.8), 60)
 
 
 def _outside(pal: Palette, kinds: tuple[str, ...], size: float) -> Shapes:
@@ -229,10 +229,9 @@ def single(pal: Palette) -> Stage:
     shapes += place([_scale(s, scale) for s in main], (0, -height, 0), yaw=rng.uniform(0, 6))
     shapes += objects.clutter(pal, int(rng.integers(0, 5)), (0.22, 0.22), height)
     focus = np.array([0, -height - rng.uniform(0.06, 0.16), 0])
-    lamp_at = np.array([0.8, -2.5, -0.8]) if inside else None
-    return Stage(
-        tuple(shapes), tuple(pal.textures), light(rng, lamp_at), focus, (0.55, 1.1), (height + 0.2, height + 0.6), 180
-    )
+    lights = light(rng, np.array([0.8, -2.5, -0.8]) if inside else None)
+    heights = height + 0.2, height + 0.6
+    return Stage(tuple(shapes), tuple(pal.textures), lights, focus, (0.55, 1.1), heights, 180)
 
 
 def _scale(shape: Shape, factor: float) -> Shape:

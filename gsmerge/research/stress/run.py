@@ -83,18 +83,17 @@ def stress(
     if len(load.scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
+    report = progress or (lambda *_: None)
     given = StressScene(load.scene, targets)
     base = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
-        if progress:
-            progress(case.words, i, len(names))
+        report(case.words, i, len(names))
         passed, measured = _check_case(case, load, given, base, options, hints)
         seconds = time.perf_counter() - start
         out.append(StressOutcome(name, case.words, _property_text(case, options), passed, measured, seconds))
-    if progress:
-        progress("done", len(names), len(names))
+    report("done", len(names), len(names))
     return tuple(out)
 
 
