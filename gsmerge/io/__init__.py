@@ -6,8 +6,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
 from gsmerge.io.formats.ply import PlyInfo, PlyScene, kept_comments, ply_notes, read_ply
-from gsmerge.io.formats.ply_writer import write_ply
-from gsmerge.io.formats.writing import OUTPUT_FORMATS, lost_harmonics, output_format, write_gaussians
+from gsmerge.io.formats.writing import OUTPUT_FORMATS, lost_harmonics, output_format, write_gaussians, write_ply
 from gsmerge.io.held_out import HeldOutViews, read_held_out
 from gsmerge.io.hints import AUTO, ReadHints
 from gsmerge.io.photos import read_images

@@ -56,17 +56,8 @@ class Exporter:
     comment: str = ""
     cameras: tuple[str, ...] = ()
 
-    def may_have_written(
-        self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str | None
-    ) -> bool:
-        """Whether a file looks like one of this exporter's.
-
-        Args:
-            info: What the file's header and columns say.
-            layout: Which row is which pixel; None where the rows belong to no pixels.
-            frame: From the frame of the cameras to that of the Gaussians.
-            cameras: Format of the cameras.
-        """
+    def may_have_written(self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
+        """Whether a file looks like one of this exporter's; see :func:`choose_exporters`."""
         header = (
             info.sh_degree in self.degrees
             and self.normals == ("nx" in info.columns)
@@ -156,13 +147,23 @@ def find_exporter(name: str) -> Exporter | None:
     return EXPORTERS.get(name)
 
 
-def recognise(
-    info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str | None
+def choose_exporters(
+    name: str, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
-    """All exporters that may have written a file; see :meth:`Exporter.may_have_written`.
+    """The exporter of that name; for "auto", all that may have written a file.
 
     Those that leave a mark of their own in the header go before those that leave none.
+
+    Args:
+        name: Of an exporter, or "auto".
+        info: What the file's header and columns say.
+        layout: Which row is which pixel; None where the rows belong to no pixels.
+        frame: From the frame of the cameras to that of the Gaussians.
+        cameras: Format of the cameras.
     """
+    exporter = find_exporter(name)
+    if exporter is not None:
+        return (exporter,)
     possible = [e for e in EXPORTERS.values() if e.may_have_written(info, layout, frame, cameras)]
     marked = [e for e in possible if e.elements or e.byte_columns or e.comment]
     return tuple(marked or possible)

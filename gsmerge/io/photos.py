@@ -9,7 +9,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -22,6 +22,7 @@ from torch import Tensor
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
@@ -79,7 +80,7 @@ def as_tensor(images: Photos) -> Tensor:
     return torch.from_numpy(out)
 
 
-def photo_size(photos: Photos | None) -> Size | None:
+def photo_size(photos: Photos | Tensor | None) -> Size | None:
     """(width, height) of the photos; None without any."""
     return None if photos is None else (photos[0].shape[1], photos[0].shape[0])
 
@@ -269,15 +270,8 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class PhotoTransform:
-    """A photo is resized, then cropped: ``u' = scale_x u - left`` and ``v' = scale_y v - top``, pixels.
-
-    Args:
-        width: Of the result, pixels.
-        height: The same.
-        scale_x: Along the width.
-        scale_y: Along the height.
-        left: Columns cut off at the left.
-        top: Rows cut off at the top.
+    """A photo is resized, then cropped to ``width`` x ``height`` pixels: ``u' = scale_x u - left``,
+    ``v' = scale_y v - top``.
     """
 
     width: int
@@ -297,10 +291,11 @@ class PhotoTransform:
         """What is done to a photo."""
         return f"resized{' and centre-cropped' if self.crops else ''} to {self.width} x {self.height}"
 
-    def intrinsics(self, Ks: Tensor) -> Tensor:
-        """``[c,3,3]`` intrinsics of the result, float64."""
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """The cameras of the results; intrinsics in float64."""
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
-        return torch.tensor(matrix, dtype=torch.float64) @ Ks.double()
+        Ks = torch.tensor(matrix, dtype=torch.float64) @ cameras.Ks.double()
+        return replace(cameras, Ks=Ks, width=self.width, height=self.height)
 
     def photos(self, images: Photos) -> list[np.ndarray]:
         """The results for c uint8 photos ``[h,w,3]``."""

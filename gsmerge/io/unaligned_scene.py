@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.alignment.fit_cameras import CameraFit
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
 from gsmerge.io.alignment.mismatch import count_problem, count_remedy, explain_misalignment, misalignment_error
-from gsmerge.io.alignment.poses import choose_poses, poses_note
+from gsmerge.io.alignment.poses import choose_poses
 from gsmerge.io.alignment.recover import recover
 from gsmerge.io.alignment.rotations import from_xyzw
 from gsmerge.io.alignment.score import AlignmentInput, check_alignment
@@ -93,7 +93,7 @@ def _choose_cameras(
         raise SceneError(ply.info.path, f"{problem[0]}; {check.description}", problem[1])
     if poses is None:
         return cameras, camera_file, [said] if said else []
-    note = poses_note(poses, camera_file.convention)
+    note = f"{poses.describe(camera_file.convention)}: read so"
     return with_poses(cameras, poses.viewmats), with_convention(camera_file, poses.convention), [note]
 
 

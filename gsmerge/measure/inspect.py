@@ -26,7 +26,7 @@ from gsmerge.io.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.io.exporters import exporter_names
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
-from gsmerge.io.formats.ply_writer import file_bytes
+from gsmerge.io.formats.writing import file_bytes
 from gsmerge.io.hints import make_hints
 from gsmerge.measure.extents import Coverage, Extents, coverage, extents
 from gsmerge.options import CompactOptions

@@ -10,17 +10,10 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.score import Alignment, PixelSample, check_alignment, check_sample, sample_pixels
-from gsmerge.io.cameras.camera_file import (
-    C2W_OPENGL,
-    CONVENTIONS,
-    CameraFile,
-    Convention,
-    describe,
-    from_viewmats,
-    to_viewmats,
-    with_poses,
-)
+from gsmerge.io.alignment.poses import other_conventions
+from gsmerge.io.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
+from gsmerge.io.alignment.similarity import Correspondences, ray_directions
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, CameraFile, Convention, with_poses
 from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photos import ASPECT_TOLERANCE
 from gsmerge.types import Cameras, Gaussians
@@ -81,9 +74,9 @@ def explain_misalignment(
     Returns:
         What would fit, in words; None if nothing that is known does.
     """
-    sample = sample_pixels(gaussians, cameras, valid)
-    for reason, viewmats in _other_viewmats(sample, cameras, convention):
-        if check_sample(sample, with_poses(cameras, viewmats)).ok:
+    pairs = sample_pixels(gaussians, cameras, valid)
+    for reason, viewmats in _other_viewmats(pairs, cameras, convention):
+        if check_pairs(pairs, with_poses(cameras, viewmats)).ok:
             return reason
     for reason, order in _other_orders(len(cameras), cameras.height, cameras.width):
         if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
@@ -94,15 +87,12 @@ def explain_misalignment(
     return None
 
 
-def _other_viewmats(sample: PixelSample, cameras: Cameras, convention: Convention) -> Iterator[tuple[str, np.ndarray]]:
+def _other_viewmats(
+    pairs: Correspondences, cameras: Cameras, convention: Convention
+) -> Iterator[tuple[str, np.ndarray]]:
     given = cameras.viewmats.double().numpy()
-    stored = from_viewmats(given, convention)
-    for other in CONVENTIONS:
-        if other != convention:
-            words = (
-                f"the poses fit when read as {describe(other)}, where this format has {' with '.join(convention)} axes"
-            )
-            yield words, to_viewmats(stored, other)
+    for poses in other_conventions(given, convention):
+        yield poses.describe(convention), poses.viewmats
     transposed = given.copy()
     transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
     transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres.double().numpy())
@@ -111,27 +101,23 @@ def _other_viewmats(sample: PixelSample, cameras: Cameras, convention: Conventio
         mirrored = given.copy()
         mirrored[:, axis] *= -1
         yield f"the cameras fit with the {words}", mirrored
-    scale = _camera_scale(sample, cameras)
+    scale = _camera_scale(pairs, cameras)
     if scale > 0:
         scaled = given.copy()
         scaled[:, :3, 3] *= scale
         yield f"the cameras fit with their positions scaled by {scale:.4g}", scaled
 
 
-def _camera_scale(sample: PixelSample, cameras: Cameras) -> float:
+def _camera_scale(pairs: Correspondences, cameras: Cameras) -> float:
     """The factor s of the camera positions that brings every mean nearest to its pixel's ray.
 
     With ray direction d, centre c and mean X, (X - s c) x d = 0 for all; so s = sum e·g / sum e·e with
     e = c x d and g = X x d. 0 where the centres do not determine it.
     """
-    ones = torch.ones(len(sample.pixels), 1, dtype=torch.float64)
-    rays = torch.cat([sample.pixels, ones], 1) @ torch.linalg.inv(cameras.Ks.double()).transpose(1, 2)
-    rays = torch.nn.functional.normalize(rays @ cameras.viewmats[:, :3, :3].double(), dim=-1)
-    centres = cameras.centres.double()[:, None].expand_as(rays)
-    e, g = torch.linalg.cross(centres, rays), torch.linalg.cross(sample.points, rays)
-    weight = sample.valid.double()
-    bottom = ((e * e).sum(-1) * weight).sum()
-    return float(((e * g).sum(-1) * weight).sum() / bottom) if bottom > 0 else 0.0
+    rays, centres = ray_directions(pairs, cameras.viewmats.double().numpy(), cameras.Ks.double().numpy())
+    e, g = np.cross(centres, rays), np.cross(pairs.points, rays)
+    bottom = float((e * e).sum())
+    return float((e * g).sum()) / bottom if bottom > 0 else 0.0
 
 
 def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, Tensor]]:

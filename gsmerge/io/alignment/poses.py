@@ -16,7 +16,6 @@ from gsmerge.io.cameras.camera_file import (
     CONVENTIONS,
     CameraFile,
     Convention,
-    describe,
     from_viewmats,
     to_viewmats,
     with_poses,
@@ -29,17 +28,19 @@ _SAME = 1e-6  # of the cameras' distances: no difference
 
 @dataclass(frozen=True)
 class Poses:
-    """One reading of the poses.
+    """One reading of the poses: a convention, and ``viewmats [c,4,4]`` float64 world to camera under it."""
 
-    Args:
-        description: What it takes the poses for.
-        convention: The same, as camera files have it.
-        viewmats: ``[c,4,4]`` float64 world to camera under it.
-    """
-
-    description: str
     convention: Convention
     viewmats: np.ndarray
+
+    @property
+    def description(self) -> str:
+        """What it takes the poses for."""
+        return f"{self.convention[0]} matrices with {self.convention[1]} axes"
+
+    def describe(self, usual: Convention) -> str:
+        """That these fit, not the poses as their format has them."""
+        return f"the poses fit when read as {self.description}, where this format has {usual[0]} with {usual[1]} axes"
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
@@ -49,19 +50,13 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
         viewmats: ``[c,4,4]`` under the usual convention.
         convention: The usual one.
     """
-    stored, known = from_viewmats(viewmats, convention), [viewmats]
-    out = []
+    stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
         read = to_viewmats(stored, other)
+        known = [poses.viewmats for poses in readings]
         if not any(np.allclose(read, one, atol=_SAME * (1 + np.abs(one).max())) for one in known):
-            known.append(read)
-            out.append(Poses(describe(other), other, read))
-    return out
-
-
-def poses_note(poses: Poses, usual: Convention) -> str:
-    """That the poses are read in another way than their format has them."""
-    return f"the poses fit when read as {poses.description}, where this format has {' with '.join(usual)} axes: read so"
+            readings.append(Poses(other, read))
+    return readings[1:]
 
 
 def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple[Poses, Recovery] | None:
@@ -82,24 +77,21 @@ def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple
         if check_cameras(inputs.gaussians, inputs.valid, cameras, None).ok:
             recovery = recover(replace(inputs, cameras=cameras))
             fits += [] if recovery is None else [(poses, recovery)]
-    check_one_fits(camera_file, fits)
-    return min(fits, key=lambda one: one[1].best.worst_px, default=None)
+    return choose_fit(camera_file, fits)
 
 
-def check_one_fits(camera_file: CameraFile, fits: Sequence[tuple[Poses, Recovery]]) -> None:
-    """Refuse poses of which several readings fit, none of them twice as well as the next.
+def choose_fit(camera_file: CameraFile, fits: Sequence[tuple[Poses, Recovery]]) -> tuple[Poses, Recovery] | None:
+    """The reading of the poses that fits best; None without any.
 
     Raises:
-        SceneError: If that is so.
+        SceneError: If several fit, none of them twice as well as the next.
     """
     ranked = sorted(fits, key=lambda one: one[1].best.worst_px)
     if len(ranked) > 1 and ranked[1][1].best.worst_px < MARGIN * max(ranked[0][1].best.worst_px, 1e-3):
-        raise SceneError(
-            camera_file.path,
-            f"expected poses that fit in one reading, found that they fit as {ranked[0][0].description} and as"
-            f" {ranked[1][0].description}",
-            "convert them to the format's own",
-        )
+        both = f"{ranked[0][0].description} and as {ranked[1][0].description}"
+        problem = f"expected poses that fit in one reading, found that they fit as {both}"
+        raise SceneError(camera_file.path, problem, "convert them to the format's own")
+    return ranked[0] if ranked else None
 
 
 def choose_poses(
@@ -130,7 +122,6 @@ def choose_poses(
     scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
     if best.score >= MARGIN * max(scores, default=0.0):
         return poses, best, None
-    if usual.ok and best.score >= _AS_GOOD * usual.score:
-        note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
-        return None, usual, note
-    return None, usual, None
+    as_good = usual.ok and best.score >= _AS_GOOD * usual.score
+    note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
+    return None, usual, note if as_good else None

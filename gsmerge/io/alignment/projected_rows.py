@@ -25,8 +25,7 @@ class ProjectedRows:
         ids: ``[n]`` rows of the file.
         viewmats: ``[c,4,4]`` float64 world to camera, in the frame of the Gaussians.
         Ks: ``[c,3,3]`` float64 intrinsics, pixels.
-        width: Of the grid, pixels.
-        height: The same.
+        width, height: Of the grid, pixels.
     """
 
     points: np.ndarray
@@ -69,15 +68,8 @@ class ProjectedRows:
         missing: int,
         note: str = "",
     ) -> Layout:
-        """The layout of a search's result: for each view some of these rows and their pixels.
-
-        Args:
-            order: Of the rows in the file.
-            views: b views.
-            rows: Of each view.
-            pixels: Of each of its rows.
-            missing: Pixels without a row.
-            note: What else to say about it.
+        """The layout of a search's result: for each view some of these rows and their pixels; how many pixels have
+        none.
         """
         said = "in no order" if order == "unordered" else order
         return Layout(

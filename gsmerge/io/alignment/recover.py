@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.io.alignment.incomplete import score_incomplete
-from gsmerge.io.alignment.layouts import Layout, depth_layout, exact_layouts, subsample
+from gsmerge.io.alignment.layouts import Layout, depth_layouts, exact_layouts, subsample
 from gsmerge.io.alignment.score import (
     QUICK_SAMPLES,
     SAMPLES,
@@ -21,13 +20,7 @@ from gsmerge.io.alignment.score import (
     score_layout,
     shuffled_score,
 )
-from gsmerge.io.alignment.similarity import (
-    IDENTITY,
-    Correspondences,
-    candidate_similarities,
-    fits_all_cameras,
-    pixel_errors,
-)
+from gsmerge.io.alignment.similarity import IDENTITY, candidate_similarities, fits_all_cameras, pixel_errors
 
 MARGIN = 2.0  # by which the best reading must beat the next one
 SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
@@ -89,7 +82,7 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return None
     scores: list[AlignmentScore] = []
-    layouts = list(_exact(inputs))
+    layouts = _exact(inputs)
     for effort in (0,) if exact_frames else (0, 1, 2):
         if not any(score.ok for score in scores):
             scores += [score for layout in layouts for score in _readings(inputs, layout, effort)]
@@ -136,17 +129,15 @@ def _is_confirmed(color: float, shuffled: float) -> bool | None:
     return color <= _UNCONFIRMED * shuffled if shuffled > _VARIES else None
 
 
-def _exact(inputs: AlignmentInput) -> Iterator[Layout]:
+def _exact(inputs: AlignmentInput) -> list[Layout]:
+    """The layouts that the number of rows allows, or the depth maps next to the cameras."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
-    for layout in exact_layouts(count, len(cameras), cameras.width, cameras.height):
-        if inputs.order in ("auto", layout.order):
-            yield layout
+    layouts = list(exact_layouts(count, len(cameras), cameras.width, cameras.height))
     if count < len(cameras) * cameras.width * cameras.height and inputs.order in ("auto", "view-major"):
         depths = inputs.depths()
         if depths is not None and depths.shape == (len(cameras), cameras.height, cameras.width):
-            masked = depth_layout(count, depths)
-            if masked is not None:
-                yield masked
+            layouts += depth_layouts(count, depths)
+    return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
 
 
 def _readings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
@@ -167,9 +158,9 @@ def _readings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Align
 
 
 def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> AlignmentScore:
-    pairs, colors = find_correspondences(inputs, sample_layout(layout, samples))
+    pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout, samples))
     frames = candidate_similarities(pairs, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=effort)
-    scores = [score_layout(inputs, layout, frame, (pairs, colors)) for frame in frames]
+    scores = [score_layout(inputs, layout, frame, pairs) for frame in frames]
     lowest = min(score.worst_px for score in scores)
     best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
     if best.ok and best.frame is not IDENTITY and inputs.scale is None:
@@ -186,22 +177,16 @@ def _refine(inputs: AlignmentInput, score: AlignmentScore) -> AlignmentScore:
 
 def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
     """For each block the camera into whose pixels it projects best; None where two want the same."""
-    small = subsample(layout, 300)
-    pairs, _ = find_correspondences(inputs, replace(small, views=tuple(range(len(small.views)))), colored=False)
-    viewmats, Ks = inputs.viewmats, inputs.Ks
+    pairs = find_correspondences(inputs.gaussians.means, inputs.valid, subsample(layout, 300))
     chosen = []
-    for block in range(len(small.views)):
-        own = pairs.blocks == block
-        if not own.any():
+    for block in range(len(layout.views)):
+        own = pairs.select(pairs.blocks == block)
+        if not len(own.rows):
             return None
-        some = Correspondences(pairs.points[own], pairs.pixels[own], pairs.views[own], pairs.blocks[own])
-        errors = [
-            np.median(pixel_errors(replace(some, views=np.full(int(own.sum()), view)), viewmats, Ks))
-            for view in range(len(viewmats))
-        ]
+        views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
+        errors = [np.median(pixel_errors(replace(own, views=some), inputs.viewmats, inputs.Ks)) for some in views]
         chosen.append(int(np.argmin(errors)))
-    distinct = len(set(chosen)) * layout.per_pixel == len(chosen)
-    return chosen if distinct else None
+    return chosen if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 
 
 def _differs(one: Layout, other: Layout) -> bool:

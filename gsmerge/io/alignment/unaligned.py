@@ -8,9 +8,9 @@ import numpy as np
 from torch import Tensor
 
 from gsmerge.geometry import project_points, sh0_to_rgb
-from gsmerge.io.alignment.layouts import exact_layouts, subsample
-from gsmerge.io.alignment.score import pixel_limit
-from gsmerge.io.alignment.similarity import Correspondences, pixel_errors, solve_pose
+from gsmerge.io.alignment.layouts import plain_layout, subsample
+from gsmerge.io.alignment.score import find_correspondences, pixel_limit
+from gsmerge.io.alignment.similarity import pixel_errors, solve_pose
 from gsmerge.types import Cameras, Gaussians
 
 _SAMPLES = 20_000  # Gaussians that are projected
@@ -83,15 +83,8 @@ def check_cameras(gaussians: Gaussians, valid: Tensor, cameras: Cameras, images:
 
 def looks_like_a_grid(gaussians: Gaussians, valid: Tensor, cameras: Cameras) -> bool:
     """Whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then."""
-    layouts = exact_layouts(len(gaussians), len(cameras), cameras.width, cameras.height)
-    small = subsample(next(layout for layout in layouts if layout.is_plain), 2000)
-    rows, pixels = small.rows[0], small.pixels[0]
-    good = valid.numpy()[rows]
-    y, x = np.divmod(pixels[good], cameras.width)
-    points = gaussians.means.numpy()[rows[good]].astype(np.float64)
-    none = np.zeros(len(points), np.int64)
-    pairs = Correspondences(points, np.stack([x, y], 1) + 0.5, none, none)
-    K = cameras.Ks.double().numpy()[:1]
+    layout = subsample(plain_layout(1, cameras.width, cameras.height), 2000)
+    pairs, K = find_correspondences(gaussians.means, valid, layout), cameras.Ks.double().numpy()[:1]
     pose = solve_pose(pairs, 0, K[0])
     if pose is None:
         return False

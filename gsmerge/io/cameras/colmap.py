@@ -12,7 +12,15 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, Lens, fisheye, make_camera_file, perspective
+from gsmerge.io.cameras.camera_file import (
+    W2C_OPENCV,
+    CameraFile,
+    Lens,
+    View,
+    make_camera_file,
+    make_lens,
+    make_pinhole,
+)
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -56,23 +64,15 @@ def read_colmap(folder: Path) -> CameraFile:
             cameras = _text_cameras(camera_path, read_text(camera_path))
             images = _text_images(read_text(image_path, MAX_MODEL_BYTES))
         poses = [_pose(numbers) for _, _, numbers in images]
+        unknown = next((name for name, camera, _ in images if camera not in cameras), None)
+        if unknown is not None:
+            raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
     except (struct.error, ValueError, IndexError) as error:
         raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
-    unknown = next((name for name, camera, _ in images if camera not in cameras), None)
-    if unknown is not None:
-        raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
-    return make_camera_file(
-        folder,
-        f"COLMAP {'binary' if binary else 'text'}",
-        W2C_OPENCV,
-        poses,
-        [cameras[camera][0] for _, camera, _ in images],
-        [cameras[camera][1] for _, camera, _ in images],
-        [name for name, _, _ in images],
-        lenses=[cameras[camera][2] for _, camera, _ in images],
-    )
+    views = [View(name, pose, *cameras[camera]) for (name, camera, _), pose in zip(images, poses, strict=True)]
+    return make_camera_file(folder, f"COLMAP {'binary' if binary else 'text'}", W2C_OPENCV, views)
 
 
 @contextmanager
@@ -98,16 +98,12 @@ def _pose(numbers: list[float]) -> np.ndarray:
 
 def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> _Camera:
     if model not in _PERSPECTIVE | _FISHEYE:
-        raise SceneError(
-            path,
-            f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}",
-            "undistort the images first",
-        )
+        problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
+        raise SceneError(path, problem, "undistort the images first")
     one = model in _ONE_FOCAL
-    fx, fy, cx, cy = (params[0], params[0], *params[1:3]) if one else params[:4]
+    K = make_pinhole(params[0], *params[:3]) if one else make_pinhole(*params[:4])
     distortion = params[3 if one else 4 : _NUM_PARAMS[model]]
-    lens = fisheye(model, distortion) if model in _FISHEYE else perspective(model, distortion)
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size, lens
+    return K, size, make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
 
 
 def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, _Camera]:
@@ -143,11 +139,13 @@ def _binary_images(data: mmap.mmap) -> list[_Image]:
     return images
 
 
+def _says_something(line: str) -> bool:
+    return line.strip()[:1] not in ("", "#")
+
+
 def _text_cameras(path: Path, text: str) -> dict[int, _Camera]:
     cameras = {}
-    for line in text.splitlines():
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
+    for line in filter(_says_something, text.splitlines()):
         camera_id, model, width, height, *params = line.split()
         if len(params) != _NUM_PARAMS.get(model, len(params)):
             raise ValueError("wrong number of parameters")
@@ -161,7 +159,7 @@ def _text_images(text: str) -> list[_Image]:
     lines = iter(text.splitlines())
     images = []
     for line in lines:
-        if not line.strip() or line.lstrip().startswith("#"):
+        if not _says_something(line):
             continue
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:

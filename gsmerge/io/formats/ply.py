@@ -44,20 +44,17 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """What a PLY file holds.
+    """What the PLY file at ``path`` holds.
 
     Args:
-        path: The file.
         layout: Name of the column layout, as "17-column export" or "INRIA, SH degree 3".
         format: "ascii", "binary little-endian" or "binary big-endian".
         count: Gaussians, the unusable ones included.
-        file_bytes: Size of the file.
         bytes_by_attribute: Bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats,
             extra); of the values' binary types for an ascii file.
-        columns: All columns of the vertex element, in the file's order.
-        extra_columns: Those that are ignored.
+        columns: All columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and
+            ``byte_columns`` stored as bytes.
         extra_elements: Elements besides ``vertex``.
-        byte_columns: Columns stored as bytes.
         comments: Of the header.
         sh_degree: 0 to 4.
         opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
@@ -94,7 +91,6 @@ class PlyScene:
         gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
             fully transparent and grey, and has the position and scales of the finite row before it.
         valid: ``[n]`` bool, False for the rows that were not finite.
-        info: What the file holds.
     """
 
     gaussians: Gaussians
@@ -138,22 +134,32 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
     data = open_ply(path)
-    compressed = "chunk" in data and is_compressed(data)
+    compressed = is_compressed(data)
     stored = unpack(path, data) if compressed else _vertex(path, data).data
     rows = np.asarray(stored)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
-    blocks = _convert_all(stored, out)
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+
+    def convert(start: int) -> _Converted:
+        block = slice(start, min(start + size, len(rows)))
+        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        release_block(stored, block)
+        return converted
+
+    blocks = parallel_map(convert, range(0, len(rows), size))
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     known = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
-    encoding = known or _likely_encoding(blocks)
+    finite = any(block.any_finite_opacity for block in blocks)
+    encoding = known or ("raw" if finite and all(block.unit_opacities for block in blocks) else "logit")
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
     if byte_columns == NORMALS:
         spread_low_degree(out["shN"])
-    extra = _extra_columns(names, num_rest)
+    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    extra = tuple(name for name in names if name not in used)
     info = PlyInfo(
         path=str(path),
         layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
@@ -200,39 +206,17 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     return vertex
 
 
-def _convert_all(stored: np.ndarray, out: dict[str, np.ndarray]) -> list[_Converted]:
-    """Fill the arrays block by block, in parallel."""
-    rows = np.asarray(stored)
-    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
-
-    def convert(start: int) -> _Converted:
-        block = slice(start, min(start + size, len(rows)))
-        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
-        release_block(stored, block)
-        return converted
-
-    return parallel_map(convert, range(0, len(rows), size))
-
-
-def _extra_columns(names: tuple[str, ...], num_rest: int) -> tuple[str, ...]:
-    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
-    return tuple(name for name in names if name not in used)
-
-
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
-    names = [name for name in columns if name.startswith("f_rest_")]
-    if len(names) not in (0, 9, 24, 45, 72) or set(names) != {f"f_rest_{i}" for i in range(len(names))}:
-        raise SceneError(
-            path,
-            "expected columns f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4) or none, "
-            f"found {len(names)} f_rest columns",
-        )
+    names = {name for name in columns if name.startswith("f_rest_")}
+    if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
+        numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
+        raise SceneError(path, f"expected columns {numbers} or none, found {len(names)} f_rest columns")
     return len(names)
 
 
 def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
     n = len(rows)
-    wide = any(rows.dtype[name] in (np.dtype("<f8"), np.dtype(">f8")) for name in MEANS)
+    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
     out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
     return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
@@ -329,11 +313,6 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
         exact[length == 0] = (1, 0, 0, 0)
         out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
     return zero
-
-
-def _likely_encoding(blocks: list[_Converted]) -> str:
-    finite = any(block.any_finite_opacity for block in blocks)
-    return "raw" if finite and all(block.unit_opacities for block in blocks) else "logit"
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:

@@ -17,7 +17,7 @@ from gsmerge import __version__
 from gsmerge.errors import error_line
 from gsmerge.io import AUTO, ReadHints, load_files
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_writer import file_bytes
+from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.pipeline import compact
 from gsmerge.research.charts.experiment import OURS, Experiment, run_settings
