@@ -150,16 +150,10 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(
     name: str, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
-    """The exporter of that name; for "auto", all that may have written a file.
+    """The exporter of that name; for "auto", all that may have written a file with cameras of a format.
 
-    Those that leave a mark of their own in the header go before those that leave none.
-
-    Args:
-        name: Of an exporter, or "auto".
-        info: What the file's header and columns say.
-        layout: Which row is which pixel; None where the rows belong to no pixels.
-        frame: From the frame of the cameras to that of the Gaussians.
-        cameras: Format of the cameras.
+    Those that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame`` say which
+    row is which pixel, and where; None where the rows belong to no pixels.
     """
     exporter = find_exporter(name)
     if exporter is not None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 from gsmerge.io.alignment.layouts import ORDERS, Order
 
@@ -49,19 +49,15 @@ class ReadHints:
 AUTO = ReadHints()
 
 
-def make_hints(values: Mapping[str, Any]) -> ReadHints:
-    """Hints from keyword arguments.
-
-    Raises:
-        ValueError: If one is unknown or none of its possible values.
-    """
+def make_hints(values: dict[str, Any]) -> ReadHints:
+    """Hints from keyword arguments; ValueError if one is unknown or none of its possible values."""
     known = {field.name for field in fields(ReadHints)}
-    unknown = sorted(set(values) - known)
+    unknown = sorted(values.keys() - known)
     if unknown:
         raise ValueError(f"expected {_listed(sorted(known))}, got {unknown[0]!r}")
-    return ReadHints(**cast("dict[str, Any]", dict(values)))
+    return ReadHints(**values)
 
 
-def _listed(names: Any) -> str:
+def _listed(names: Iterable[str]) -> str:
     *first, last = (repr(name) for name in names)
     return f"{', '.join(first)} or {last}"

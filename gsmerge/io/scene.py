@@ -156,14 +156,8 @@ def align_scene(
 ) -> SceneLoad:
     """Put Gaussians, cameras and images together and decide which row belongs to which pixel.
 
-    Raises as :func:`read_scene`.
-
-    Args:
-        ply: The Gaussians.
-        files: Where the cameras and images are.
-        camera_file: The cameras, if they are read already.
-        hints: What the caller says about the files.
-        photos: Whether to look for photos.
+    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none are
+    looked for.
     """
     if camera_file is None and files.cameras is None and hints.order == "none":  # views are placed later
         gaussians, notes = usable_rows(ply, hints)
@@ -295,11 +289,7 @@ def place_cameras_in_scene(
 ) -> CamerasInScene:
     """Views in the frame of the Gaussians, if their pixels or colours show it; otherwise as their file has them.
 
-    Args:
-        ply: The Gaussians.
-        files: Where the cameras and photos are.
-        hints: What the caller says about the files.
-        photos: Whether photos that cannot be read are an error; otherwise they are left out.
+    ``photos`` that cannot be read are an error; with False they are left out.
 
     Raises:
         SceneError: If there are no cameras, or they have no size.

@@ -86,15 +86,15 @@ def _choose_cameras(
     """
     moved = _move_by_dataparser(ply, files, cameras, images)
     if moved is not None:
-        note = f"the cameras are moved into the Gaussians' frame by {DATAPARSER}"
-        return moved, replace(camera_file, viewmats=moved.viewmats), [note]
-    poses, check, said = choose_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
+        notes = [f"the cameras are moved into the Gaussians' frame by {DATAPARSER}"]
+        return moved, replace(camera_file, viewmats=moved.viewmats), notes
+    poses, check, note = choose_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
     if not check.ok:
         raise SceneError(ply.info.path, f"{problem[0]}; {check.description}", problem[1])
     if poses is None:
-        return cameras, camera_file, [said] if said else []
-    note = f"{poses.describe(camera_file.convention)}: read so"
-    return with_poses(cameras, poses.viewmats), with_convention(camera_file, poses.convention), [note]
+        return cameras, camera_file, [note] if note else []
+    notes = [f"{poses.describe(camera_file.convention)}: read so"]
+    return with_poses(cameras, poses.viewmats), with_convention(camera_file, poses.convention), notes
 
 
 def _move_by_dataparser(ply: PlyScene, files: SceneFiles, cameras: Cameras, images: Tensor | None) -> Cameras | None:

@@ -97,13 +97,10 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
 def limit_photo_size(
     photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[Photos | None, list[str]]:
-    """Decoded photos at a size that memory has room for; and a note about it.
+    """Decoded photos at a size that memory has room for, none of what does not fit longer than ``max_side``; and a note.
 
-    Args:
-        photos: c uint8 photos of one size.
-        rows: Gaussians of the file: where they may be the photos' pixels as they are, the photos stay.
-        max_side: Longest side of what does not fit, pixels.
-        unaligned: Whether the Gaussians are known to belong to no pixels: then no photo stays larger than that.
+    Where the file's Gaussians (``rows``) may be the photos' pixels as they are, the photos stay; not where they are known to
+    be unaligned.
     """
     size = photo_size(photos)
     if photos is None or size is None:

@@ -33,17 +33,10 @@ _FLAGS = (
 def estimate_cameras(
     path: Path, gaussians: Gaussians, valid: Tensor, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
-    """Poses and one focal length under which every Gaussian projects into its own pixel.
+    """Poses and one focal length under which every row of a full or trimmed grid projects into its own pixel.
 
-    Args:
-        path: The ``.ply``, for messages.
-        gaussians: Its rows, of a full or a trimmed grid; one per pixel.
-        valid: ``[n]`` bool.
-        names: Of the views, in their order.
-        width, height: Of the views, pixels.
-
-    Returns:
-        None if no order of the rows fits at least twice as well as all others.
+    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for messages. None
+    if no order of the rows fits at least twice as well as all others.
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]

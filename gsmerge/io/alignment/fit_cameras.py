@@ -54,12 +54,7 @@ def fit_cameras(
 ) -> CameraFit:
     """Find the size, the transform of the photos and the convention of the poses under which the rows are pixels.
 
-    Args:
-        ply: The Gaussians.
-        camera_file: The cameras.
-        photos: c uint8 photos of one size, or None.
-        order: Of the rows, where it is known.
-        scale: Of the Gaussians' world in units of the cameras', where it is known.
+    ``photos`` are c uint8 ones of one size; ``order`` and ``scale`` are those of :class:`AlignmentInput`.
 
     Raises:
         SceneError: If sizes do not agree, or several conventions fit.
@@ -122,12 +117,8 @@ def _make_input(source: _Source, camera_file: CameraFile, fit: GridFit, *, photo
 def _other_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> CameraFit | None:
     """The fit at another size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
 
-    Those that only the number of rows speaks for are tried in the frame of the cameras first: there may be many.
-
-    Args:
-        source: All but the cameras.
-        camera_file: The cameras.
-        exact_frames: Try all of them only in that frame.
+    Those that only the number of rows speaks for are tried in the frame of the cameras first, because there may be many;
+    with ``exact_frames`` all are tried in that frame only.
     """
     recovered: list[tuple[GridFit, Recovery]] = []
     guesses: list[GridFit] = []

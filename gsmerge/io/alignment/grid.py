@@ -21,14 +21,10 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 
 @dataclass(frozen=True)
 class GridFit:
-    """One way to bring cameras and photos to the grid.
+    """Cameras at the size of a possible grid, and what is done to the photos (None: nothing); in words in ``notes``.
 
-    Args:
-        cameras: At the grid's size.
-        transform: What is done to the photos; None: nothing.
-        notes: What it is, for people.
-        rank: What speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
-            of rows alone (2); a network's usual sizes (3).
+    ``rank`` is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number of
+    rows alone (2); a network's usual sizes (3).
     """
 
     cameras: Cameras
@@ -73,13 +69,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
 
 
 def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
-    """All other grids that the files and the number of rows allow, the likely ones first.
-
-    Args:
-        ply: What the header of the ``.ply`` says.
-        camera_file: The cameras at the size that their file has.
-        size: (width, height) of the photos; None without any.
-    """
+    """All other grids that the files and the number of rows allow, the likely ones first; ``size`` is the photos'."""
     known = sizes_of(camera_file)
     own = known[0] if len(known) == 1 else None
     if size is not None and own is not None and own != size:

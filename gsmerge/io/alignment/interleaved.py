@@ -21,10 +21,8 @@ def interleaved_layout(rows: ProjectedRows) -> Layout | None:
     """Which pixel of which view every row is, if its mean lies inside its pixel.
 
     Every row lies in some pixel of every view. In the order of the file the true ones can only go forward: pixel by
-    pixel, within a pixel view by view. The path through the views that goes forward in the smallest steps wins.
-
-    Returns:
-        A layout; None if no path goes forward, or hardly any step changes the view.
+    pixel, within a pixel view by view. The path through the views that goes forward in the smallest steps wins; None if
+    none goes forward, or hardly any step changes the view.
     """
     count, views = len(rows), rows.num_views
     if not 1 < views <= MAX_VIEWS or count < MIN_BLOCK * views or count * views > MAX_CELLS:

@@ -140,12 +140,7 @@ def _orders(count: int, box: Box, per_pixel: int, views: tuple[int, ...], width:
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     """The layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
-    Args:
-        count: Rows of the file.
-        depths: ``[v,h,w]``; only their order matters, so any scale will do.
-
-    Returns:
-        One at most; none if no choice of views has that many pixels.
+    Of ``depths [v,h,w]`` only the order matters, so any scale will do. Empty if no choice of views has ``count`` pixels.
     """
     views, height, width = depths.shape
     kept = [depth_mask(depth) for depth in depths]
@@ -190,17 +185,10 @@ def subsample(layout: Layout, per_block: int) -> Layout:
 def to_grid(
     gaussians: Gaussians, valid: Tensor, layout: Layout, cameras: Cameras, images: Tensor | None, names: tuple[str, ...]
 ) -> PixelScene:
-    """The scene on the full grid of the layout.
+    """The scene on the full grid of the layout; pixels without a row get a fully transparent Gaussian.
 
-    Pixels without a row get a fully transparent Gaussian, like rows that are not finite.
-
-    Args:
-        gaussians: The file's rows.
-        valid: ``[n]`` bool.
-        layout: Which row belongs to which pixel.
-        cameras: All c cameras, in the frame of the Gaussians and at the grid's size.
-        images: ``[c,h,w,3]``, or None.
-        names: Of all cameras.
+    ``gaussians`` and ``valid [n]`` are the file's rows; cameras (in their frame and at the grid's size), ``images
+    [c,h,w,3]`` and names are those of all views.
     """
     views = list(layout.views)
     if views != list(range(len(cameras))):
@@ -230,16 +218,10 @@ def to_grid(
 def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     """The scene with a Gaussian for each pixel that the file has no row for.
 
-    It lies on the pixel's ray at the depth of the map, in units that follow from the other pixels (as depth along z or
-    as distance, whichever they agree with). Its colour is the photo's; its opacity, rotation and size in pixels are
-    those of the pixel before it in the same row.
-
-    Args:
-        scene: With photos; on the full grid.
-        depths: ``[v,h,w]`` of its views.
-
-    Returns:
-        The scene as it was if it has no photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
+    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow from
+    the other pixels: as depth along z or as distance, whichever they agree with. Its colour is the photo's; its opacity,
+    rotation and size in pixels are those of the pixel before it in the same row. The scene stays as it is if it has no
+    photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
     if scene.images is None or scene.missing is None:
         return scene

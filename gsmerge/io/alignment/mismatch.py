@@ -63,16 +63,9 @@ def misalignment_error(camera_file: CameraFile, alignment: Alignment, reason: st
 def explain_misalignment(
     gaussians: Gaussians, cameras: Cameras, valid: Tensor, convention: Convention = C2W_OPENGL
 ) -> str | None:
-    """Name the other reading of the cameras or of the row order under which the scene would fit.
+    """The other reading of the cameras or of the row order under which the scene would fit, in words; None without any.
 
-    Args:
-        gaussians: As for :func:`check_alignment`.
-        cameras: The views, read under ``convention``.
-        valid: As for :func:`check_alignment`.
-        convention: How the camera file's format stores poses.
-
-    Returns:
-        What would fit, in words; None if nothing that is known does.
+    Gaussians, cameras (read under ``convention``) and ``valid`` are as for :func:`check_alignment`.
     """
     pairs = sample_pixels(gaussians, cameras, valid)
     for reason, viewmats in _other_viewmats(pairs, cameras, convention):

@@ -44,12 +44,7 @@ class Poses:
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
-    """The same poses under the other conventions; none twice, and none that changes nothing.
-
-    Args:
-        viewmats: ``[c,4,4]`` under the usual convention.
-        convention: The usual one.
-    """
+    """The poses ``viewmats [c,4,4]`` of one convention under the others; none twice, and none that changes nothing."""
     stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
         read = to_viewmats(stored, other)
@@ -61,10 +56,6 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
 
 def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple[Poses, Recovery] | None:
     """The one other reading of the poses under which the rows are pixels; None where there is none.
-
-    Args:
-        inputs: Under the usual reading, which does not fit.
-        camera_file: Where they are from.
 
     Raises:
         SceneError: If several fit, none of them twice as well as the next.
@@ -99,12 +90,7 @@ def choose_poses(
 ) -> tuple[Poses | None, CameraCheck, str | None]:
     """Which reading of the poses sees unaligned Gaussians, judged by how many it sees and by their colours.
 
-    Args:
-        gaussians: n rows.
-        valid: ``[n]`` bool.
-        cameras: Under the usual convention.
-        images: ``[c,h,w,3]``, or None.
-        convention: The usual one.
+    Arguments are as for :func:`check_cameras`, with the cameras under the usual convention.
 
     Returns:
         The reading that is clearly better than the usual one and than all others, or None for the usual one; what it

@@ -72,11 +72,8 @@ class Recovery:
 def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
     """The reading under which every Gaussian projects into its own pixel; None where none stands out.
 
-    Of readings that put the Gaussians about equally near to their pixels, the photos' colours choose one.
-
-    Args:
-        inputs: The scene.
-        exact_frames: Only consider cameras in the frame of their file and files without missing pixels: quick.
+    Of readings that put the Gaussians about equally near to their pixels, the photos' colours choose one. With
+    ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered: quick.
     """
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):

@@ -104,7 +104,8 @@ def candidate_similarities(
     scale: float | None = None,
     effort: int = 2,
 ) -> Iterator[Similarity]:
-    """Similarities from the most to the least plausible: the simplest first.
+    """Similarities from the most to the least plausible, the simplest first: the same frame; a scale; rotated by the first
+    or the middle camera, alone, scaled, or scaled and shifted, as exporters do; any, from the poses that the pixels ask for.
 
     Args:
         pairs: Gaussians with their pixels; None where none is known, and nothing can be solved for.
@@ -112,10 +113,6 @@ def candidate_similarities(
         Ks: ``[c,3,3]``.
         scale: Size of the Gaussians' world in units of the cameras', where it is given.
         effort: 0 solves for nothing, 1 for scale and shift, 2 for the rotation as well.
-
-    Yields:
-        The same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and shifted, as
-        exporters do; any similarity, from the poses that the pixels ask for.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     for rotation, name, kind in _known_rotations(viewmats):

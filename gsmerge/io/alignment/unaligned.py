@@ -49,14 +49,7 @@ class CameraCheck:
 
 
 def check_cameras(gaussians: Gaussians, valid: Tensor, cameras: Cameras, images: Tensor | None) -> CameraCheck:
-    """Project some Gaussians into all views and compare them with what is there.
-
-    Args:
-        gaussians: n rows.
-        valid: ``[n]`` bool; the others are left out.
-        cameras: In the frame of the Gaussians, as far as known.
-        images: ``[c,h,w,3]``, or None.
-    """
+    """Project some valid Gaussians into all views, and compare them with ``images [c,h,w,3]`` where there are any."""
     rows = np.flatnonzero(valid.numpy())
     rows = rows[:: max(1, len(rows) // _SAMPLES)]
     points = gaussians.means.numpy()[rows].astype(np.float64)

@@ -32,12 +32,10 @@ CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens that is no pinhole.
+    """A lens that is no pinhole; ``name`` is what the camera file calls the model.
 
-    Args:
-        name: As the camera file calls the model.
-        model: "perspective": radial and tangential, as ``cv2.undistort``; "fisheye": as ``cv2.fisheye``.
-        coefficients: The first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0.
+    Coefficients are the first of k1, k2, p1, p2, k3, k4, k5, k6 for "perspective" (``cv2.undistort``), of k1, k2, k3, k4 for
+    "fisheye" (``cv2.fisheye``); others are 0.
     """
 
     name: str
@@ -86,12 +84,8 @@ class CameraFile:
 class View(NamedTuple):
     """One camera as its file has it.
 
-    Args:
-        name: Of its image.
-        pose: ``[3,4]`` or ``[4,4]`` in the file's convention.
-        K: ``[3,3]`` intrinsics, pixels, or divided by the image's size in all views of the file.
-        size: (width, height), pixels; 0 where unknown.
-        lens: None for a pinhole.
+    ``pose`` is 3x4 or 4x4 in the file's convention, ``K [3,3]`` in pixels, or divided by the image's size in all views;
+    ``size`` is (width, height) in pixels, 0 where unknown; ``lens`` is None for a pinhole.
     """
 
     name: str
@@ -113,14 +107,7 @@ def make_camera_file(
     views: Sequence[View],
     images: np.ndarray | None = None,
 ) -> CameraFile:
-    """Translate poses to the one convention and check that they are poses.
-
-    Args:
-        path: The file, for messages.
-        source: The format's name.
-        convention: How poses are stored.
-        views: c cameras.
-        images: ``[c,h,w,3]`` uint8, if the file holds them.
+    """Translate poses to the one convention and check that they are poses; ``images [c,h,w,3]`` if the file holds them.
 
     Raises:
         SceneError: If there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is
@@ -230,12 +217,9 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
-    """Cameras of one image size.
+    """Cameras of one image size (width, height) in pixels; None takes the file's.
 
-    Args:
-        camera_file: What was read.
-        size: (width, height), pixels; intrinsics of another size are scaled to it, each axis by itself. None takes
-            the file's size.
+    Intrinsics of another size are scaled to it, each axis by itself.
 
     Raises:
         SceneError: If no size is given and the file's cameras have none, or several; or a lens is no pinhole.

@@ -23,15 +23,11 @@ _MAX_PHOTOS = 1 << 30  # bytes of the decoded photos
 
 
 def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
-    """Cameras and photos of one scene of a chunk.
+    """Cameras and photos of one scene of a chunk, by its key; where there is one scene only, it may be another or None.
 
     A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's size,
     two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes. Nothing in it is
     executed: only tensors and plain containers are read.
-
-    Args:
-        path: The chunk.
-        scene: Key of the scene; may be missing or another one where there is one scene only.
 
     Raises:
         SceneError: If it cannot be read, has no such scene, or an array has another shape than it should.

@@ -85,12 +85,10 @@ class PlyInfo:
 
 @dataclass(frozen=True)
 class PlyScene:
-    """The Gaussians of a PLY file, row by row.
+    """The n Gaussians of a PLY file, row by row; float32, means float64 where the file stores them so.
 
-    Args:
-        gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
-            fully transparent and grey, and has the position and scales of the finite row before it.
-        valid: ``[n]`` bool, False for the rows that were not finite.
+    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of the
+    finite row before it.
     """
 
     gaussians: Gaussians
