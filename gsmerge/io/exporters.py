@@ -152,8 +152,8 @@ def choose_exporters(
 ) -> tuple[Exporter, ...]:
     """The exporter of that name; for "auto", all that may have written a file with cameras of a format.
 
-    Those that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame`` say which
-    row is which pixel, and where; None where the rows belong to no pixels.
+    Those that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame`` say
+    which row is which pixel, and where; None where the rows belong to no pixels.
     """
     exporter = find_exporter(name)
     if exporter is not None:

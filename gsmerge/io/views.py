@@ -97,10 +97,11 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
 def limit_photo_size(
     photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[Photos | None, list[str]]:
-    """Decoded photos at a size that memory has room for, none of what does not fit longer than ``max_side``; and a note.
+    """Decoded photos at a size that memory has room for, none of what does not fit longer than ``max_side``; and a
+    note.
 
-    Where the file's Gaussians (``rows``) may be the photos' pixels as they are, the photos stay; not where they are known to
-    be unaligned.
+    Where the file's Gaussians (``rows``) may be the photos' pixels as they are, the photos stay; not where they are
+    known to be unaligned.
     """
     size = photo_size(photos)
     if photos is None or size is None:

@@ -35,8 +35,8 @@ def estimate_cameras(
 ) -> CameraFile | None:
     """Poses and one focal length under which every row of a full or trimmed grid projects into its own pixel.
 
-    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for messages. None
-    if no order of the rows fits at least twice as well as all others.
+    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for messages.
+    None if no order of the rows fits at least twice as well as all others.
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]

@@ -117,8 +117,8 @@ def _make_input(source: _Source, camera_file: CameraFile, fit: GridFit, *, photo
 def _other_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> CameraFit | None:
     """The fit at another size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
 
-    Those that only the number of rows speaks for are tried in the frame of the cameras first, because there may be many;
-    with ``exact_frames`` all are tried in that frame only.
+    Those that only the number of rows speaks for are tried in the frame of the cameras first, because there may be
+    many; with ``exact_frames`` all are tried in that frame only.
     """
     recovered: list[tuple[GridFit, Recovery]] = []
     guesses: list[GridFit] = []

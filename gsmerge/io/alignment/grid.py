@@ -23,8 +23,8 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 class GridFit:
     """Cameras at the size of a possible grid, and what is done to the photos (None: nothing); in words in ``notes``.
 
-    ``rank`` is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number of
-    rows alone (2); a network's usual sizes (3).
+    ``rank`` is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
+    of rows alone (2); a network's usual sizes (3).
     """
 
     cameras: Cameras

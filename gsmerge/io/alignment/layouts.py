@@ -140,7 +140,8 @@ def _orders(count: int, box: Box, per_pixel: int, views: tuple[int, ...], width:
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     """The layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
-    Of ``depths [v,h,w]`` only the order matters, so any scale will do. Empty if no choice of views has ``count`` pixels.
+    Of ``depths [v,h,w]`` only the order matters, so any scale will do. Empty if no choice of views has ``count``
+    pixels.
     """
     views, height, width = depths.shape
     kept = [depth_mask(depth) for depth in depths]
@@ -218,10 +219,10 @@ def to_grid(
 def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     """The scene with a Gaussian for each pixel that the file has no row for.
 
-    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow from
-    the other pixels: as depth along z or as distance, whichever they agree with. Its colour is the photo's; its opacity,
-    rotation and size in pixels are those of the pixel before it in the same row. The scene stays as it is if it has no
-    photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
+    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow
+    from the other pixels: as depth along z or as distance, whichever they agree with. Its colour is the photo's; its
+    opacity, rotation and size in pixels are those of the pixel before it in the same row. The scene stays as it is if
+    it has no photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
     if scene.images is None or scene.missing is None:
         return scene

@@ -17,9 +17,9 @@ MIN_BLOCK = 500  # rows of a view; fewer cannot be distinguished from noise
 class ProjectedRows:
     """n finite rows of a file (``points [n,3]``, ``ids [n]``) and the c views to which they may belong.
 
-    Cameras are in the frame of the Gaussians: ``viewmats [c,4,4]``, ``Ks [c,3,3]``, for a grid of ``width`` x ``height``
-    pixels. A search (pruned, interleaved, unordered) takes these and returns a layout whose pixels still have to be
-    measured, or None if the rows do not look like what it searches for.
+    Cameras are in the frame of the Gaussians: ``viewmats [c,4,4]``, ``Ks [c,3,3]``, for a grid of ``width`` x
+    ``height`` pixels. A search (pruned, interleaved, unordered) takes these and returns a layout whose pixels still
+    have to be measured, or None if the rows do not look like what it searches for.
     """
 
     points: np.ndarray

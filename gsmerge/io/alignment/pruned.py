@@ -111,9 +111,9 @@ def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
 def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.ndarray:
     """Strictly increasing pixels for the rows of one view, projected to ``u [n]``, ``v [n]``; NaN where unknown.
 
-    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With
-    the row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the
-    jitter over stretches without gaps.
+    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With the
+    row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the jitter over
+    stretches without gaps.
     """
     count, known = len(u), np.isfinite(u) & np.isfinite(v)
     u, v = np.where(known, u, 0.0), np.where(known, v, 0.0)
@@ -170,8 +170,8 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     """The scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
 
     A scale that is wrong by little moves rows by parts of a pixel, which finding their pixels hides: so scales are
-    tried in steps that move most rows by a quarter of a pixel at most. The cameras are in their own frame; the blocks of
-    the layout are right, its pixels need not be.
+    tried in steps that move most rows by a quarter of a pixel at most. The cameras are in their own frame; the blocks
+    of the layout are right, its pixels need not be.
     """
     chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
     starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]

@@ -106,9 +106,9 @@ def _cosines(quats: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
 def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Tensor, normals: Tensor) -> bool:
     """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
 
-    The better of two is better by chance as well: every other reading gets a second rotation as the roots have it, half a
-    turn more about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw next;
-    ``normals`` are rough: a first comparison, which takes little time.
+    The better of two is better by chance as well: every other reading gets a second rotation as the roots have it, half
+    a turn more about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw
+    next; ``normals`` are rough: a first comparison, which takes little time.
     """
     others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
     roots = square_roots(single[1])

@@ -162,8 +162,8 @@ class Alignment:
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Alignment:
     """Project a sample of every view's own Gaussians into that view.
 
-    ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid [V·H·W]`` (or
-    ``[V,H,W]``) are left out. ValueError if the number of rows is another.
+    ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid [V·H·W]``
+    (or ``[V,H,W]``) are left out. ValueError if the number of rows is another.
     """
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
 

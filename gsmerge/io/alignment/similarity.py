@@ -104,8 +104,9 @@ def candidate_similarities(
     scale: float | None = None,
     effort: int = 2,
 ) -> Iterator[Similarity]:
-    """Similarities from the most to the least plausible, the simplest first: the same frame; a scale; rotated by the first
-    or the middle camera, alone, scaled, or scaled and shifted, as exporters do; any, from the poses that the pixels ask for.
+    """Similarities from the most to the least plausible, the simplest first: the same frame; a scale; rotated by the
+    first or the middle camera, alone, scaled, or scaled and shifted, as exporters do; any, from the poses that the
+    pixels ask for.
 
     Args:
         pairs: Gaussians with their pixels; None where none is known, and nothing can be solved for.

@@ -29,8 +29,8 @@ ColorOf = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
 class _Spread:
     """How far rows are from their own pixels.
 
-    ``tolerance``: pixels from a centre within which a view may be a row's own; ``px``: median distance from the centre in
-    the own view; ``color``: median distance of the base colour from the photo there, inf without photos.
+    ``tolerance``: pixels from a centre within which a view may be a row's own; ``px``: median distance from the centre
+    in the own view; ``color``: median distance of the base colour from the photo there, inf without photos.
     """
 
     tolerance: float
@@ -41,8 +41,8 @@ class _Spread:
 def unordered_layout(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
     """Which pixel of which view every row is; None unless nearly all are at centres, and many more than by chance.
 
-    Each row goes to the view in which it is nearest to a pixel's centre; between several that are near, the colours
-    of the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
+    Each row goes to the view in which it is nearest to a pixel's centre; between several that are near, the colours of
+    the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
     """
     count, num_pixels = len(rows), rows.width * rows.height
     spread = _measure_spread(rows, color_of)

@@ -34,8 +34,8 @@ CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 class Lens:
     """A lens that is no pinhole; ``name`` is what the camera file calls the model.
 
-    Coefficients are the first of k1, k2, p1, p2, k3, k4, k5, k6 for "perspective" (``cv2.undistort``), of k1, k2, k3, k4 for
-    "fisheye" (``cv2.fisheye``); others are 0.
+    Coefficients are the first of k1, k2, p1, p2, k3, k4, k5, k6 for "perspective" (``cv2.undistort``), of k1, k2, k3,
+    k4 for "fisheye" (``cv2.fisheye``); others are 0.
     """
 
     name: str

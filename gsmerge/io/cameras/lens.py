@@ -37,7 +37,8 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
 
 
 def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> list[np.ndarray]:
-    """The photos that pinholes with the same intrinsics would have taken; where one shows nothing, its border is repeated.
+    """The photos that pinholes with the same intrinsics would have taken; where one shows nothing, its border is
+    repeated.
 
     ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
     """

@@ -87,8 +87,8 @@ class PlyInfo:
 class PlyScene:
     """The n Gaussians of a PLY file, row by row; float32, means float64 where the file stores them so.
 
-    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of the
-    finite row before it.
+    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of
+    the finite row before it.
     """
 
     gaussians: Gaussians
