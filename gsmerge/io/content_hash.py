@@ -75,9 +75,7 @@ def stem_of(scene: Path) -> str:
 
 def filled(template: str | None, scene: Path) -> Path | None:
     """A path with ``{scene}`` (the scene as given), ``{parent}`` (its folder) and ``{stem}`` (its name) filled in.
-
-    Raises:
-        UsageError: If the template holds another name.
+    UsageError if the template holds another name.
     """
     if template is None:
         return None

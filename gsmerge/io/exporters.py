@@ -137,11 +137,7 @@ EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
 
 
 def find_exporter(name: str) -> Exporter | None:
-    """The exporter of that name; None for "auto".
-
-    Raises:
-        ValueError: If there is none of that name.
-    """
+    """The exporter of that name; None for "auto". ValueError if there is none of that name."""
     if name != "auto" and name not in EXPORTERS:
         raise ValueError(f"exporter: expected 'auto' or one of {', '.join(EXPORTERS)}, got {name!r}")
     return EXPORTERS.get(name)

@@ -152,9 +152,7 @@ def find_image(folder: Path, name: str) -> Path | None:
 
 def image_size(path: Path) -> Size:
     """(width, height) that the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file says; its orientation is ignored.
-
-    Raises:
-        SceneError: If it is no such file, cannot be read, or says a size that no image of Gaussians has.
+    SceneError if it is no such file, cannot be read, or says a size that no image of Gaussians has.
     """
     num_bytes = check_file(path)
     try:
@@ -190,9 +188,7 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
     """Images ``[c,h,w,3]`` uint8 sRGB, stored in the file ``path`` as the bytes of image files (``[b]`` uint8 each).
-
-    Raises:
-        SceneError: If one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
+    SceneError if one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
     """
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
     width, height = sizes[0]

@@ -78,11 +78,7 @@ class SceneLoad:
     problem: str | None = None
 
     def pixel_scene(self) -> PixelScene:
-        """The scene, for those who need one Gaussian per pixel.
-
-        Raises:
-            SceneError: If it is unaligned; says why.
-        """
+        """The scene, for those who need one Gaussian per pixel. SceneError if it is unaligned; says why."""
         if isinstance(self.scene, PixelScene):
             return self.scene
         raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")

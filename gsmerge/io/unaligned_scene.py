@@ -33,9 +33,7 @@ def make_unaligned(
     ply: PlyScene, files: SceneFiles, fit: CameraFit, hints: ReadHints
 ) -> tuple[UnalignedScene, CameraFile, str, list[str]]:
     """The scene, if the cameras see its Gaussians; its cameras as they were read, why it has no pixels, and notes.
-
-    Raises:
-        SceneError: If they do not, or if other cameras or another reading of them would make it one with pixels.
+    SceneError if they do not, or if other cameras or another reading of them would make it one with pixels.
     """
     inputs, camera_file, cameras = fit.inputs, fit.camera_file, fit.inputs.cameras
     problem, remedy = count_problem(ply.info, cameras), count_remedy(ply.info.count, cameras)
@@ -80,9 +78,7 @@ def _choose_cameras(
     problem: tuple[str, str],
 ) -> tuple[Cameras, CameraFile, list[str]]:
     """Cameras that see the Gaussians: as they are, moved as nerfstudio does, or read in another convention; and notes.
-
-    Raises:
-        SceneError: If none of these does; says why there are no pixels.
+    SceneError if none of these does; says why there are no pixels.
     """
     moved = _move_by_dataparser(ply, files, cameras, images)
     if moved is not None:

@@ -38,9 +38,7 @@ _FLOAT_PIXEL = 12  # bytes
 
 def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
     """The cameras: from their file, from the ``.ply`` itself, or estimated for the images where there is nothing else.
-
-    Raises:
-        SceneError: If there are none and they cannot be estimated.
+    SceneError if there are none and they cannot be estimated.
     """
     if files.cameras is not None:
         return read_cameras(files.cameras, scene=files.ply.stem)

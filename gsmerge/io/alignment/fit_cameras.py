@@ -54,10 +54,8 @@ def fit_cameras(
 ) -> CameraFit:
     """Find the size, the transform of the photos and the convention of the poses under which the rows are pixels.
 
-    ``photos`` are c uint8 ones of one size; ``order`` and ``scale`` are those of :class:`AlignmentInput`.
-
-    Raises:
-        SceneError: If sizes do not agree, or several conventions fit.
+    ``photos`` are c uint8 ones of one size; ``order`` and ``scale`` are those of :class:`AlignmentInput`. SceneError if
+    sizes do not agree, or several conventions fit.
     """
     source = _Source(ply, photos, photo_size(photos), order, scale)
     try:
@@ -156,9 +154,7 @@ def _other_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool 
 
 def _other_size_and_poses(source: _Source, camera_file: CameraFile) -> CameraFit | None:
     """The one fit at another size, with the poses read in another way; only where no pixel and no frame is missing.
-
-    Raises:
-        SceneError: If several readings fit alike.
+    SceneError if several readings fit alike.
     """
     fits: dict[Convention, CameraFit] = {}
     readings = []

@@ -49,10 +49,8 @@ class GridFit:
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
-    """The grid has the photos' size, or that of the cameras where there are no photos.
-
-    Raises:
-        SceneError: If the cameras' size is not the photos' or a multiple of it.
+    """The grid has the photos' size, or that of the cameras where there are no photos. SceneError if the cameras' size
+    is not the photos' or a multiple of it.
     """
     if size is None:
         return GridFit(to_cameras(camera_file), None, ())

@@ -55,10 +55,8 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
 
 
 def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple[Poses, Recovery] | None:
-    """The one other reading of the poses under which the rows are pixels; None where there is none.
-
-    Raises:
-        SceneError: If several fit, none of them twice as well as the next.
+    """The one other reading of the poses under which the rows are pixels; None where there is none. SceneError if
+    several fit, none of them twice as well as the next.
     """
     if inputs.order == "none":
         return None
@@ -72,10 +70,8 @@ def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple
 
 
 def choose_fit(camera_file: CameraFile, fits: Sequence[tuple[Poses, Recovery]]) -> tuple[Poses, Recovery] | None:
-    """The reading of the poses that fits best; None without any.
-
-    Raises:
-        SceneError: If several fit, none of them twice as well as the next.
+    """The reading of the poses that fits best; None without any. SceneError if several fit, none of them twice as well
+    as the next.
     """
     ranked = sorted(fits, key=lambda one: one[1].best.worst_px)
     if len(ranked) > 1 and ranked[1][1].best.worst_px < MARGIN * max(ranked[0][1].best.worst_px, 1e-3):

@@ -108,10 +108,8 @@ def make_camera_file(
     images: np.ndarray | None = None,
 ) -> CameraFile:
     """Translate poses to the one convention and check that they are poses; ``images [c,h,w,3]`` if the file holds them.
-
-    Raises:
-        SceneError: If there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is
-            not positive.
+    SceneError if there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is not
+    positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")

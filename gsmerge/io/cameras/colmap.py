@@ -46,10 +46,8 @@ def is_colmap(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> CameraFile:
-    """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes.
-
-    Raises:
-        SceneError: If a file is missing or damaged, or a lens of an unknown kind.
+    """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes. SceneError if a file is
+    missing or damaged, or a lens of an unknown kind.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"

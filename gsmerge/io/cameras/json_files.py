@@ -33,11 +33,7 @@ FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "
 
 
 def read_json_cameras(path: Path) -> CameraFile:
-    """Cameras of any of the known JSON files.
-
-    Raises:
-        SceneError: If it is none of them, or damaged.
-    """
+    """Cameras of any of the known JSON files. SceneError if it is none of them, or damaged."""
     data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
@@ -59,10 +55,8 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
 
     A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
     writes) has camera-to-world poses with OpenCV axes. Intrinsics are global or per frame, in pixels or as field of
-    view. ``applied_transform`` is not applied: poses are as the Gaussians' world has them.
-
-    Raises:
-        SceneError: If a pose or an intrinsic is missing, or a lens of an unknown kind.
+    view. ``applied_transform`` is not applied: poses are as the Gaussians' world has them. SceneError if a pose or an
+    intrinsic is missing, or a lens of an unknown kind.
     """
     source, convention = ("frame list", C2W_OPENCV) if isinstance(data, list) else ("transforms.json", C2W_OPENGL)
     common, frames = ({}, data) if isinstance(data, list) else (data, data["frames"])
@@ -132,9 +126,7 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
 
 def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
     """Cameras of a parsed ``cameras.json``: camera-to-world rotation rows and centre, principal point in the middle.
-
-    Raises:
-        SceneError: If a key is missing or not a number.
+    SceneError if a key is missing or not a number.
     """
     views = []
     for i, entry in enumerate(entries):
@@ -157,12 +149,10 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
 def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Cameras of a parsed ``camera_params.json``.
 
-    ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
-    axes, intrinsics in pixels of the processed size, which only the images have. ``camera_id``
-    is the stem of the image's name, or the image's number, by which the cameras are then sorted.
-
-    Raises:
-        SceneError: If the two lists do not name the same cameras, or a matrix is none.
+    ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV axes,
+    intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the image's
+    name, or the image's number, by which the cameras are then sorted. SceneError if the two lists do not name the same
+    cameras, or a matrix is none.
     """
     poses, Ks = (_matrices(path, data, key, side) for key, side in (("extrinsics", 4), ("intrinsics", 3)))
     if poses.keys() != Ks.keys():
@@ -192,10 +182,8 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
     Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in the
-    cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world.
-
-    Raises:
-        SceneError: If an entry is missing or no number, or a frame is named that is not there.
+    cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world. SceneError if
+    an entry is missing or no number, or a frame is named that is not there.
     """
     frames = []
     for i, frame in enumerate(data["frames"]):

@@ -16,9 +16,7 @@ from gsmerge.runtime.threads import parallel_map
 
 def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
     """Photos without lens distortion and cameras that are pinholes, with the same intrinsics; and a note about it.
-
-    Raises:
-        SceneError: If a lens is no pinhole and there are no photos of the camera's shape.
+    SceneError if a lens is no pinhole and there are no photos of the camera's shape.
     """
     if not camera_file.lenses:
         return camera_file, photos, []

@@ -28,10 +28,7 @@ def read_da3(path: Path) -> CameraFile:
     """Cameras (and images, where stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (they are stored so when a COLMAP export ran in the same
-    call), or normalised ones, are scaled to it.
-
-    Raises:
-        SceneError: If the file cannot be read or lacks an array.
+    call), or normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
     """
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
     arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
@@ -56,10 +53,8 @@ def is_dump(path: Path) -> bool:
 
 
 def read_dump(path: Path) -> CameraFile:
-    """Cameras and images of a ``views.npz``.
-
-    Raises:
-        SceneError: If the file cannot be read, lacks an array, or one has another shape than it should.
+    """Cameras and images of a ``views.npz``. SceneError if the file cannot be read, lacks an array, or one has another
+    shape than it should.
     """
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "K", "images") if name not in arrays]

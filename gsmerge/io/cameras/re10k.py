@@ -27,10 +27,8 @@ def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
 
     A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's size,
     two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes. Nothing in it is
-    executed: only tensors and plain containers are read.
-
-    Raises:
-        SceneError: If it cannot be read, has no such scene, or an array has another shape than it should.
+    executed: only tensors and plain containers are read. SceneError if it cannot be read, has no such scene, or an
+    array has another shape than it should.
     """
     entry = _chosen(path, _load(path), scene)
     rows = _rows(path, entry.get("cameras"))

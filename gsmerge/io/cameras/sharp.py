@@ -19,10 +19,7 @@ LAYERS = 2  # Gaussians per cell: a front and a back layer
 def read_sharp(path: Path) -> CameraFile | None:
     """The camera inside a ``.ply``, at the size of its grid; None where there is none.
 
-    The grid is square whatever the photo's shape: the photo was stretched to it.
-
-    Raises:
-        SceneError: If the numbers are damaged.
+    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are damaged.
     """
     data = open_ply(path)
     if "vertex" not in data or not all(name in data for name in _ELEMENTS):

@@ -16,11 +16,8 @@ INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 def read_trajectory(path: Path) -> CameraFile:
     """Cameras of a text file with 12 or 16 numbers a line: camera-to-world, OpenCV axes, row by row.
 
-    Next to it is ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or
-    one for each. The images have the size.
-
-    Raises:
-        SceneError: If a line has another number of numbers, or there are no intrinsics.
+    Next to it is ``intrinsic.txt`` (or ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one
+    for each. The images have the size. SceneError if a line has another number of numbers, or there are no intrinsics.
     """
     poses = _rows(path, (12, 16))
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)

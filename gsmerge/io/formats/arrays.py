@@ -40,9 +40,7 @@ class Columns:
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
     """Finite Gaussians as arrays, without harmonics above a degree; ``first_row`` is the number of the first one.
-
-    Raises:
-        ValueError: If there is NaN or inf; says in which row.
+    ValueError if there is NaN or inf; says in which row.
     """
 
     def check(values: np.ndarray) -> np.ndarray:

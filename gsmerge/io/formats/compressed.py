@@ -36,10 +36,8 @@ def is_compressed(data: PlyData) -> bool:
 
 
 def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_file`, opacities as logits.
-
-    Raises:
-        SceneError: If chunks are missing or lack a column.
+    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_file`, opacities as logits. SceneError
+    if chunks are missing or lack a column.
     """
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
@@ -116,10 +114,8 @@ def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Content of a ``.compressed.ply``; rows along a space-filling curve, so that chunks are small.
-
-    Raises:
-        ValueError: If there is NaN or inf.
+    """Content of a ``.compressed.ply``; rows along a space-filling curve, so that chunks are small. ValueError if there
+    is NaN or inf.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
     columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))

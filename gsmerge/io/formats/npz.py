@@ -30,11 +30,8 @@ def array_names(path: Path) -> frozenset[str]:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Those of the named arrays that an ``.npz`` has, in its order.
-
-    Raises:
-        SceneError: If it cannot be read, an array holds anything but numbers and text, or one is larger than its
-            bytes in the archive allow.
+    """Those of the named arrays that an ``.npz`` has, in its order. SceneError if it cannot be read, an array holds
+    anything but numbers and text, or one is larger than its bytes in the archive allow.
     """
     check_file(path)
     if not zipfile.is_zipfile(path):

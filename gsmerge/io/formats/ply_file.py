@@ -41,10 +41,8 @@ _SIZES = {
 
 
 def open_ply(path: Path) -> PlyData:
-    """A PLY file, mapped into memory where it is binary.
-
-    Raises:
-        SceneError: If it is no PLY file, is truncated or damaged, or its header asks for more than it holds.
+    """A PLY file, mapped into memory where it is binary. SceneError if it is no PLY file, is truncated or damaged, or
+    its header asks for more than it holds.
     """
     size = check_file(path)
     try:

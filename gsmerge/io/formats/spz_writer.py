@@ -27,11 +27,7 @@ COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 
 
 def spz_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.spz`` file.
-
-    Raises:
-        ValueError: If there is NaN or inf.
-    """
+    """Content of a ``.spz`` file. ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
     fraction = _fraction_bits(columns.means)
