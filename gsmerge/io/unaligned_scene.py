@@ -10,13 +10,18 @@ from torch import Tensor
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.fit_cameras import CameraFit
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
-from gsmerge.io.alignment.mismatch import count_problem, count_remedy, explain_misalignment, misalignment_error
-from gsmerge.io.alignment.poses import choose_poses
+from gsmerge.io.alignment.mismatch import (
+    count_problem,
+    count_remedy,
+    explain_misalignment,
+    looks_like_a_grid,
+    misalignment_error,
+)
+from gsmerge.io.alignment.poses import check_cameras, choose_poses
 from gsmerge.io.alignment.recover import recover
 from gsmerge.io.alignment.rotations import from_xyzw
 from gsmerge.io.alignment.score import AlignmentInput, check_alignment
 from gsmerge.io.alignment.similarity import scale_by
-from gsmerge.io.alignment.unaligned import check_cameras, looks_like_a_grid
 from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.nerfstudio import find_dataparser, read_dataparser

@@ -22,7 +22,7 @@ from gsmerge.io import (
     read_cameras,
     read_ply_with_hints,
 )
-from gsmerge.io.alignment.unaligned import CameraCheck, check_cameras
+from gsmerge.io.alignment.poses import CameraCheck, check_cameras
 from gsmerge.io.exporters import exporter_names
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -63,7 +64,7 @@ def fit_cameras(
     except SceneError as error:
         plain, problem = None, error
     searched = order == "none"
-    if not searched and (plain is None or plain.num_pixels > _LARGE * len(ply.gaussians)):
+    if not searched and (plain is None or len(plain.cameras) * math.prod(plain.size) > _LARGE * len(ply.gaussians)):
         searched, other_size = True, _other_size(source, camera_file)
         if other_size is not None:
             return other_size

@@ -38,11 +38,6 @@ class GridFit:
         return self.cameras.width, self.cameras.height
 
     @property
-    def num_pixels(self) -> int:
-        """Pixels of all views."""
-        return len(self.cameras) * self.cameras.width * self.cameras.height
-
-    @property
     def guessed(self) -> bool:
         """Whether it is one of many that the number of rows allows."""
         return self.rank in (1, 2)

@@ -10,9 +10,17 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
+from gsmerge.io.alignment.layouts import plain_layout, subsample
 from gsmerge.io.alignment.poses import other_conventions
-from gsmerge.io.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
-from gsmerge.io.alignment.similarity import Correspondences, ray_directions
+from gsmerge.io.alignment.score import (
+    Alignment,
+    check_alignment,
+    check_pairs,
+    find_correspondences,
+    pixel_limit,
+    sample_pixels,
+)
+from gsmerge.io.alignment.similarity import Correspondences, pixel_errors, ray_directions, solve_pose
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CameraFile, Convention, with_poses
 from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photos import ASPECT_TOLERANCE
@@ -78,6 +86,18 @@ def explain_misalignment(
     if check_alignment(gaussians, swapped, valid).ok:
         return "the cameras fit with width and height swapped"
     return None
+
+
+def looks_like_a_grid(gaussians: Gaussians, valid: Tensor, cameras: Cameras) -> bool:
+    """Whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then."""
+    layout = subsample(plain_layout(1, cameras.width, cameras.height), 2000)
+    pairs, K = find_correspondences(gaussians.means, valid, layout), cameras.Ks.double().numpy()[:1]
+    pose = solve_pose(pairs, 0, K[0])
+    if pose is None:
+        return False
+    # the intrinsics may be what is wrong: a pose that takes most of it up is enough
+    limit = 4 * pixel_limit(cameras.width, cameras.height)
+    return bool(np.median(pixel_errors(pairs, pose[None], K)) < limit)
 
 
 def _other_viewmats(

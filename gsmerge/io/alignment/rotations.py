@@ -150,10 +150,7 @@ def _smooth_normals(scene: PixelScene) -> Tensor:
 def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
     """Normals ``[t,3]`` of some pixels' surface, their rows and their views."""
     v, h, w = scene.valid.shape
-    if min(h, w) <= 2 * _STEP:
-        empty = torch.zeros(0, dtype=torch.int64)
-        return torch.zeros(0, 3), empty, empty
-    inner = torch.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
+    inner = torch.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].flatten(1)
     step = max(1, inner.shape[1] // _SAMPLES)
     while step > 1 and np.gcd(step, w - 2 * _STEP) > 1:
         step += 1

@@ -97,12 +97,7 @@ def pixel_errors(pairs: Correspondences, viewmats: np.ndarray, Ks: np.ndarray) -
 
 
 def candidate_similarities(
-    pairs: Correspondences | None,
-    viewmats: np.ndarray,
-    Ks: np.ndarray,
-    *,
-    scale: float | None = None,
-    effort: int = 2,
+    pairs: Correspondences | None, viewmats: np.ndarray, Ks: np.ndarray, *, scale: float | None = None, effort: int = 2
 ) -> Iterator[Similarity]:
     """Similarities from the most to the least plausible, the simplest first: the same frame; a scale; rotated by the
     first or the middle camera, alone, scaled, or scaled and shifted, as exporters do; any, from the poses that the

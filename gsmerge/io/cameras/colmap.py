@@ -12,15 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import (
-    W2C_OPENCV,
-    CameraFile,
-    Lens,
-    View,
-    make_camera_file,
-    make_lens,
-    make_pinhole,
-)
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_lens, make_pinhole
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -36,7 +28,6 @@ _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 
 MAX_NAME = 1 << 16  # bytes of an image's name
 
-_Camera = tuple[np.ndarray, tuple[int, int], Lens | None]  # K [3,3], (width, height)
 _Image = tuple[str, int, list[float]]  # name, camera id, quaternion wxyz and translation
 
 
@@ -69,7 +60,9 @@ def read_colmap(folder: Path) -> CameraFile:
         raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
-    views = [View(name, pose, *cameras[camera]) for (name, camera, _), pose in zip(images, poses, strict=True)]
+    views = [
+        cameras[camera]._replace(name=name, pose=pose) for (name, camera, _), pose in zip(images, poses, strict=True)
+    ]
     return make_camera_file(folder, f"COLMAP {'binary' if binary else 'text'}", W2C_OPENCV, views)
 
 
@@ -94,17 +87,18 @@ def _pose(numbers: list[float]) -> np.ndarray:
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 
 
-def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> _Camera:
+def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> View:
     if model not in _PERSPECTIVE | _FISHEYE:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
     one = model in _ONE_FOCAL
     K = make_pinhole(params[0], *params[:3]) if one else make_pinhole(*params[:4])
     distortion = params[3 if one else 4 : _NUM_PARAMS[model]]
-    return K, size, make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
+    lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
+    return View("", np.eye(4), K, size, lens)
 
 
-def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, _Camera]:
+def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, View]:
     (count,) = struct.unpack_from("<Q", data)
     position, cameras = 8, {}
     for _ in range(count):
@@ -141,7 +135,7 @@ def _says_something(line: str) -> bool:
     return line.strip()[:1] not in ("", "#")
 
 
-def _text_cameras(path: Path, text: str) -> dict[int, _Camera]:
+def _text_cameras(path: Path, text: str) -> dict[int, View]:
     cameras = {}
     for line in filter(_says_something, text.splitlines()):
         camera_id, model, width, height, *params = line.split()
