@@ -29,23 +29,14 @@ _SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotatio
 
 @dataclass(frozen=True)
 class HeldOutViews:
-    """t views that were no input, in the frame of the scene's Gaussians.
-
-    Args:
-        cameras: Their cameras.
-        images: ``[t,h,w,3]`` photos, sRGB in [0, 1], float32.
-        names: As their camera file has them.
-        places: Of each along the trajectory: its index in the camera file.
-        context_places: The same of the scene's views; None where they are not all in the file.
-        notes: What was adapted, one sentence each.
-    """
+    """t views that were no input, in the frame of the scene's Gaussians."""
 
     cameras: Cameras
-    images: Tensor
-    names: tuple[str, ...]
-    places: tuple[int, ...]
-    context_places: tuple[int, ...] | None
-    notes: tuple[str, ...] = ()
+    images: Tensor  # ``[t,h,w,3]`` photos, sRGB in [0, 1], float32
+    names: tuple[str, ...]  # as their camera file has them
+    places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
+    context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -51,31 +51,21 @@ class Views:
 
 @dataclass(frozen=True)
 class SceneLoad:
-    """A scene and how it was read.
+    """A scene and how it was read."""
 
-    Args:
-        scene: The scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels.
-        ply: What the ``.ply`` holds.
-        files: The files that were read.
-        cameras: The cameras in the order of the views, as their file has them; None where there are none.
-        views: All views that there are cameras of, also those that the scene does not have.
-        exporters: The exporters that may have written the file, or the one that the caller named.
-        notes: What was adapted or looks odd, one sentence each, without a full stop.
-        alignment: How well every view's Gaussians project into their own pixels; None for an unaligned scene.
-        recovery: Which reading of the rows won, and by how much; None for an unaligned scene.
-        problem: Why the scene is unaligned, in one sentence; None where it is not.
-    """
-
+    # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
     scene: PixelScene | UnalignedScene
     ply: PlyInfo
     files: SceneFiles
+    # the cameras in the order of the views, as their file has them; None where there are none
     cameras: CameraFile | None
-    views: Views
-    exporters: tuple[Exporter, ...]
-    notes: tuple[str, ...]
+    views: Views  # all views that there are cameras of, also those that the scene does not have
+    exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
+    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
+    # how well every view's Gaussians project into their own pixels; None for an unaligned scene
     alignment: Alignment | None = None
-    recovery: Recovery | None = None
-    problem: str | None = None
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None for an unaligned scene
+    problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
 
     def pixel_scene(self) -> PixelScene:
         """The scene, for those who need one Gaussian per pixel. SceneError if it is unaligned; says why."""

@@ -25,28 +25,17 @@ DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anythin
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote.
+    """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote."""
 
-    Args:
-        description: What it is, for people.
-        kind: "full", "trim", "box", "box+depth" or "pruned": which pixels there are.
-        order: In which order the rows are.
-        width, height: Of the grid, pixels.
-        views: The camera of each block.
-        rows: The rows of each block, of any shape: not a copy where a stride will do.
-        pixels: ``[p]`` the pixel ``y·W + x`` of each of these rows.
-        per_pixel: Gaussians per pixel; above 1 each layer is a block.
-    """
-
-    description: str
-    kind: str
-    order: str
-    width: int
-    height: int
-    views: tuple[int, ...]
-    rows: tuple[np.ndarray, ...]
-    pixels: tuple[np.ndarray, ...]
-    per_pixel: int = 1
+    description: str  # what it is, for people
+    kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
+    order: str  # in which order the rows are
+    width: int  # of the grid, pixels
+    height: int  # of the grid, pixels
+    views: tuple[int, ...]  # the camera of each block
+    rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
+    pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
+    per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
 
     @property
     def is_plain(self) -> bool:

@@ -53,18 +53,13 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What the cameras see of some Gaussians.
+    """What the cameras see of some Gaussians."""
 
-    Args:
-        share_seen: Share of the Gaussians inside at least one picture.
-        color_ratio: Distance of their colours from the photos where they are seen, over the distance from the same
-            pixels shuffled; NaN without photos, or where the colours hardly vary.
-        ok: Whether these are likely the cameras of these Gaussians.
-    """
-
-    share_seen: float
+    share_seen: float  # share of the Gaussians inside at least one picture
+    # distance of their colours from the photos where they are seen, over the distance from the same pixels shuffled;
+    # NaN without photos, or where the colours hardly vary
     color_ratio: float
-    ok: bool
+    ok: bool  # whether these are likely the cameras of these Gaussians
 
     @property
     def score(self) -> float:

@@ -35,23 +35,16 @@ _SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 
 @dataclass(frozen=True)
 class Recovery:
-    """The reading that won.
-
-    Args:
-        best: The winner.
-        runner_up: The next best; None where the count allows no other.
-        margin: How many times nearer the winner's Gaussians are to their pixels than the runner-up's, or than
-            to shuffled pixels.
-        color_margin: How many times farther from the photos the runner-up's colours are, where only that decides
-            between the two; None where the pixels do.
-        confirmed: Whether the photos' colours agree with the reading; None where there are no photos, or none that
-            could decide.
-    """
+    """The reading that won."""
 
     best: AlignmentScore
-    runner_up: AlignmentScore | None
+    runner_up: AlignmentScore | None  # the next best; None where the count allows no other
+    # how many times nearer the winner's Gaussians are to their pixels than the runner-up's, or than to shuffled pixels
     margin: float
+    # how many times farther from the photos the runner-up's colours are, where only that decides between the two; None
+    # where the pixels do
     color_margin: float | None = None
+    # whether the photos' colours agree with the reading; None where there are no photos, or none that could decide
     confirmed: bool | None = None
 
     @property

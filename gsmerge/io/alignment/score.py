@@ -21,27 +21,17 @@ MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a li
 
 @dataclass(frozen=True)
 class AlignmentInput:
-    """What the pixels are recovered from.
+    """What the pixels are recovered from."""
 
-    Args:
-        gaussians: The file's n rows.
-        valid: ``[n]`` bool.
-        cameras: All c cameras at the grid's size, in their own world.
-        images: ``[c,h,w,3]``, or None.
-        labellings: Orders that the views may be in: the file's, that of the names.
-        depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
-        order: The order of the rows where it is given, otherwise "auto".
-        scale: Size of the Gaussians' world in units of the cameras', where it is given.
-    """
-
-    gaussians: Gaussians
-    valid: Tensor
-    cameras: Cameras
-    images: Tensor | None
-    labellings: Sequence[Sequence[int]]
+    gaussians: Gaussians  # the file's n rows
+    valid: Tensor  # ``[n]`` bool
+    cameras: Cameras  # all c cameras at the grid's size, in their own world
+    images: Tensor | None  # ``[c,h,w,3]``, or None
+    labellings: Sequence[Sequence[int]]  # orders that the views may be in: the file's, that of the names
+    # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
-    order: str = "auto"
-    scale: float | None = None
+    order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
+    scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
 
     @property
     def viewmats(self) -> np.ndarray:
@@ -56,21 +46,13 @@ class AlignmentInput:
 
 @dataclass(frozen=True)
 class AlignmentScore:
-    """One reading of a file, and how well it fits.
+    """One reading of a file, and how well it fits."""
 
-    Args:
-        layout: Which row belongs to which pixel.
-        frame: From the frame of the cameras to that of the Gaussians.
-        median_px: Median distance of the projected Gaussians from their pixels; inf where most are behind.
-        worst_px: The same of the worst view.
-        ok: Whether it is near enough to be true.
-    """
-
-    layout: Layout
-    frame: Similarity
-    median_px: float
-    worst_px: float
-    ok: bool
+    layout: Layout  # which row belongs to which pixel
+    frame: Similarity  # from the frame of the cameras to that of the Gaussians
+    median_px: float  # median distance of the projected Gaussians from their pixels; inf where most are behind
+    worst_px: float  # the same of the worst view
+    ok: bool  # whether it is near enough to be true
 
     @property
     def description(self) -> str:
@@ -136,22 +118,15 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How well every view's own Gaussians project into their own pixels.
+    """How well every view's own Gaussians project into their own pixels."""
 
-    Args:
-        median_px: Median distance from the pixel centre per view, pixels; inf where most are behind the camera,
-            NaN where a view has no finite Gaussian.
-        share_in_front: Share of all checked Gaussians with positive depth in their own view.
-        share_within_1px: Share of all checked Gaussians at most one pixel from their pixel's centre.
-        limit_px: Largest median that counts as aligned.
-        ok: Whether every view's median is below the limit and most Gaussians are in front.
-    """
-
+    # median distance from the pixel centre per view, pixels; inf where most are behind the camera, NaN where a view has
+    # no finite Gaussian
     median_px: tuple[float, ...]
-    share_in_front: float
-    share_within_1px: float
-    limit_px: float
-    ok: bool
+    share_in_front: float  # share of all checked Gaussians with positive depth in their own view
+    share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
+    limit_px: float  # largest median that counts as aligned
+    ok: bool  # whether every view's median is below the limit and most Gaussians are in front
 
     @property
     def worst_px(self) -> float:

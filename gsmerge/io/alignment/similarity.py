@@ -22,20 +22,13 @@ _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared wi
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_gaussians = scale * rotation @ x_cameras + shift``.
+    """``x_gaussians = scale * rotation @ x_cameras + shift``."""
 
-    Args:
-        rotation: ``[3,3]``.
-        scale: Positive.
-        shift: ``[3]``, units of the Gaussians.
-        description: What it is, for people; empty where both frames are the same.
-        kind: "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other".
-    """
-
-    rotation: np.ndarray
-    scale: float
-    shift: np.ndarray
-    description: str = ""
+    rotation: np.ndarray  # ``[3,3]``
+    scale: float  # positive
+    shift: np.ndarray  # ``[3]``, units of the Gaussians
+    description: str = ""  # what it is, for people; empty where both frames are the same
+    # "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other"
     kind: str = "same"
 
     def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
@@ -56,21 +49,13 @@ def scale_by(scale: float, note: str = "") -> Similarity:
 
 @dataclass(frozen=True)
 class Correspondences:
-    """t Gaussians, each with the pixel and the view to which it is assumed to belong.
+    """t Gaussians, each with the pixel and the view to which it is assumed to belong."""
 
-    Args:
-        points: ``[t,3]`` float64 means.
-        pixels: ``[t,2]`` pixel centres (x, y).
-        views: ``[t]`` rows of the camera arrays.
-        blocks: ``[t]`` what wrote them, in order: a view, or one layer of it.
-        rows: ``[t]`` of the file.
-    """
-
-    points: np.ndarray
-    pixels: np.ndarray
-    views: np.ndarray
-    blocks: np.ndarray
-    rows: np.ndarray
+    points: np.ndarray  # ``[t,3]`` float64 means
+    pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
+    views: np.ndarray  # ``[t]`` rows of the camera arrays
+    blocks: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
+    rows: np.ndarray  # ``[t]`` of the file
 
     def select(self, some: np.ndarray) -> Correspondences:
         """Some of them."""

@@ -50,32 +50,19 @@ def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients:
 
 @dataclass(frozen=True)
 class CameraFile:
-    """c cameras in the order of their file.
+    """c cameras in the order of their file."""
 
-    Args:
-        path: The file or folder.
-        viewmats: ``[c,4,4]`` world to camera, OpenCV axes, float64.
-        Ks: ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5).
-        widths, heights: ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it.
-        names: Image names as the file gives them.
-        source: The format's name.
-        convention: How the format stores poses.
-        images: ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves.
-        order: Order of the Gaussians' rows where the file names it, otherwise "auto".
-        lenses: Of each camera where one of them is no pinhole; empty where all are.
-    """
-
-    path: str
-    viewmats: Tensor
-    Ks: Tensor
-    widths: Tensor
-    heights: Tensor
-    names: tuple[str, ...]
-    source: str
-    convention: Convention = W2C_OPENCV
-    images: np.ndarray | None = None
-    order: str = "auto"
-    lenses: tuple[Lens | None, ...] = ()
+    path: str  # the file or folder
+    viewmats: Tensor  # ``[c,4,4]`` world to camera, OpenCV axes, float64
+    Ks: Tensor  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
+    widths: Tensor  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
+    heights: Tensor  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
+    names: tuple[str, ...]  # image names as the file gives them
+    source: str  # the format's name
+    convention: Convention = W2C_OPENCV  # how the format stores poses
+    images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
+    order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
+    lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
 
     def __len__(self) -> int:
         return len(self.names)
