@@ -33,4 +33,3 @@ from gsmerge.io.scene import read_ply_with_hints as read_ply_with_hints
 from gsmerge.io.scene import read_scene as read_scene
 from gsmerge.io.scene_files import SceneFiles as SceneFiles
 from gsmerge.io.scene_files import find_scene_files as find_scene_files
-from gsmerge.io.views import read_photos as read_photos

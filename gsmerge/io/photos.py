@@ -77,7 +77,7 @@ def as_tensor(images: Photos) -> Tensor:
     return torch.from_numpy(out)
 
 
-def photo_size(photos: Photos | Tensor | None) -> Size | None:
+def photo_size(photos: Photos | None) -> Size | None:
     """(width, height) of the photos; None without any."""
     return None if photos is None else (photos[0].shape[1], photos[0].shape[0])
 

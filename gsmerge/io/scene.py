@@ -24,10 +24,10 @@ from gsmerge.io.cameras.lens import as_pinholes
 from gsmerge.io.exporters import Exporter, choose_exporters, find_exporter
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.hints import AUTO, ReadHints, make_hints
-from gsmerge.io.photos import photo_size
+from gsmerge.io.photos import as_tensor, photo_size
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
-from gsmerge.io.views import limit_photo_size, read_photos, read_scene_cameras, stored_photos
+from gsmerge.io.views import limit_photo_size, read_scene_cameras, stored_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
@@ -38,15 +38,12 @@ _NO_CAMERAS = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 
 
 @dataclass(frozen=True)
 class Views:
-    """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures.
-
-    ``images`` are ``[c,h,w,3]`` photos, or None; ``used`` says which views the scene has, each once, in its order.
-    """
+    """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
 
     cameras: Cameras
-    images: Tensor | None
+    images: Tensor | None  # ``[c,h,w,3]`` photos
     names: tuple[str, ...]
-    used: tuple[int, ...]
+    used: tuple[int, ...]  # which of them the scene has, each once, in its order
 
 
 @dataclass(frozen=True)
@@ -260,14 +257,11 @@ def _correlation(a: Tensor, b: Tensor) -> float:
 
 @dataclass(frozen=True)
 class CamerasInScene:
-    """Gaussians of a file (rotations read as the scene has them) and views of the camera file, in one frame.
+    """Gaussians and views of one frame."""
 
-    ``notes`` say what was adapted or looks odd, one sentence each, without a full stop.
-    """
-
-    gaussians: Gaussians
-    views: Views
-    notes: tuple[str, ...]
+    gaussians: Gaussians  # the file's, with rotations read as the scene has them
+    views: Views  # of the camera file
+    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
 
 
 def place_cameras_in_scene(
@@ -289,8 +283,9 @@ def place_cameras_in_scene(
         aligned = isinstance(load.scene, PixelScene)
         notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
         return CamerasInScene(load.scene.file_gaussians, load.views, notes)
-    images = read_photos(files, camera_file) if photos else None
-    cameras = to_cameras(camera_file, photo_size(images))
+    pictures = stored_photos(files, camera_file) if photos else None
+    images = None if pictures is None else as_tensor(pictures)
+    cameras = to_cameras(camera_file, photo_size(pictures))
     views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"
     return CamerasInScene(ply.gaussians, views, (*ply_notes(ply.info), note))

@@ -21,7 +21,6 @@ from gsmerge.io.photos import (
     Photos,
     PhotoTransform,
     Size,
-    as_tensor,
     decode_images,
     find_image,
     image_size,
@@ -55,19 +54,11 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
     return cameras
 
 
-def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
-    """The images of the cameras: from the folder, an ``.npz`` or ``.torch``, or where the camera file itself says.
-
-    Returns:
-        ``[c,h,w,3]`` float32 in [0, 1], in the order of the cameras; None if there are none. Raises as
-        :func:`gsmerge.io.read_images`.
-    """
-    photos = stored_photos(files, camera_file)
-    return None if photos is None else as_tensor(photos)
-
-
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    """:func:`read_photos` as c arrays ``[h,w,3]`` uint8."""
+    """The photos of the cameras: from the folder, an ``.npz`` or ``.torch``, or where the camera file itself says.
+
+    None if there are none. Raises as :func:`gsmerge.io.read_images`.
+    """
     photos = _stored_photos(files, camera_file)
     old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
     if photos is None or old is None or camera_file.source != SHARP or old == size:

@@ -27,16 +27,12 @@ _MAX_TRIED = 6  # fits that only the number of rows speaks for and that are trie
 
 @dataclass(frozen=True)
 class CameraFit:
-    """Cameras and photos at the size of the grid with the Gaussians (``inputs``), and which row is which pixel.
-
-    ``recovery`` is None where the rows belong to no pixels that could be recovered; ``camera_file`` has the cameras as
-    they were read in the end, ``notes`` what was adapted.
-    """
+    """Cameras and photos at the size of the grid, and which row is which pixel."""
 
     inputs: AlignmentInput
-    recovery: Recovery | None
-    camera_file: CameraFile
-    notes: list[str]
+    recovery: Recovery | None  # None where the rows belong to no pixels that could be recovered
+    camera_file: CameraFile  # as it was read in the end
+    notes: list[str]  # what was adapted
 
 
 @dataclass(frozen=True)

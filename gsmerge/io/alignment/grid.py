@@ -21,15 +21,15 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 
 @dataclass(frozen=True)
 class GridFit:
-    """Cameras at the size of a possible grid, and what is done to the photos (None: nothing); in words in ``notes``.
+    """One way to bring cameras and photos to the grid.
 
-    ``rank`` is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
+    Its rank is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
     of rows alone (2); a network's usual sizes (3).
     """
 
-    cameras: Cameras
-    transform: PhotoTransform | None
-    notes: tuple[str, ...]
+    cameras: Cameras  # at the grid's size
+    transform: PhotoTransform | None  # what is done to the photos, if anything
+    notes: tuple[str, ...]  # what it is, for people
     rank: int = 0
 
     @property

@@ -31,7 +31,7 @@ class Layout:
     kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
     order: str  # in which order the rows are
     width: int  # of the grid, pixels
-    height: int  # of the grid, pixels
+    height: int
     views: tuple[int, ...]  # the camera of each block
     rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
     pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows

@@ -15,18 +15,17 @@ MIN_BLOCK = 500  # rows of a view; fewer cannot be distinguished from noise
 
 @dataclass(frozen=True)
 class ProjectedRows:
-    """n finite rows of a file (``points [n,3]``, ``ids [n]``) and the c views to which they may belong.
+    """n finite rows of a file and the c views to which they may belong.
 
-    Cameras are in the frame of the Gaussians: ``viewmats [c,4,4]``, ``Ks [c,3,3]``, for a grid of ``width`` x
-    ``height`` pixels. A search (pruned, interleaved, unordered) takes these and returns a layout whose pixels still
-    have to be measured, or None if the rows do not look like what it searches for.
+    A search (pruned, interleaved, unordered) takes these and returns a layout whose pixels still have to be measured,
+    or None if the rows do not look like what it searches for.
     """
 
-    points: np.ndarray
-    ids: np.ndarray
-    viewmats: np.ndarray
-    Ks: np.ndarray
-    width: int
+    points: np.ndarray  # ``[n,3]`` float64 means
+    ids: np.ndarray  # ``[n]`` rows of the file
+    viewmats: np.ndarray  # ``[c,4,4]`` float64 world to camera, in the frame of the Gaussians
+    Ks: np.ndarray  # ``[c,3,3]`` float64 intrinsics, pixels
+    width: int  # of the grid, pixels
     height: int
 
     def __len__(self) -> int:

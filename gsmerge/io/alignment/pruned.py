@@ -121,7 +121,7 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     noise = float(np.median(np.abs(du[known[1:] & known[:-1]] - 1))) if (known[1:] & known[:-1]).any() else 0.0
     cut = (du < -max(2.0, 4 * noise + 1)) & known[1:] & known[:-1]
     scanline = np.concatenate([[0], np.cumsum(cut)])
-    row = np.clip(np.floor(_rows_of(scanline, np.where(known, v, np.nan))), 0, height - 1)[scanline]
+    row = np.clip(np.floor(_rows_of(scanline, v, known)), 0, height - 1)[scanline]
     rank = np.arange(count)
     sure = known & (np.abs(v - row - 0.5) < 2 + 4 * noise) & (u > -2 - 4 * noise) & (u < width + 2 + 4 * noise)
     key = row * width + np.clip(u, 0, width) - 0.5 - rank
@@ -129,15 +129,15 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     return np.asarray(np.clip(np.rint(pixels), 0, width * height - count), np.int64) + rank
 
 
-def _rows_of(scanline: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Median of v of every scanline, made never to decrease."""
-    order = np.lexsort((v, scanline))  # NaN comes last
-    sizes = np.bincount(scanline)
-    finite = np.bincount(scanline, np.isfinite(v)).astype(np.int64)
-    first = np.cumsum(sizes) - sizes
-    low, high = (v[order[first + np.maximum(np.maximum(finite, 1) - shift, 0) // 2]] for shift in (1, 0))
-    median = np.where(finite > 0, (low + np.where(np.isfinite(high), high, low)) / 2, 0.0)
-    return _never_falling(median, np.maximum(finite, _SMALL))
+def _rows_of(scanline: np.ndarray, v: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Median of the known v of every scanline, made never to decrease."""
+    from scipy.ndimage import median
+
+    counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
+    medians, some = np.zeros(len(counts)), np.flatnonzero(counts)
+    if len(some):
+        medians[some] = median(v[known], scanline[known], some)
+    return _never_falling(medians, np.maximum(counts, _SMALL))
 
 
 def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

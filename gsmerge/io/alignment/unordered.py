@@ -27,15 +27,11 @@ ColorOf = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class _Spread:
-    """How far rows are from their own pixels.
+    """How far rows are from their own pixels."""
 
-    ``tolerance``: pixels from a centre within which a view may be a row's own; ``px``: median distance from the centre
-    in the own view; ``color``: median distance of the base colour from the photo there, inf without photos.
-    """
-
-    tolerance: float
-    px: float
-    color: float
+    tolerance: float  # pixels from a centre within which a view may be a row's own
+    px: float  # median distance from the centre in the own view, pixels
+    color: float  # median distance of the base colour from the photo in the own view; inf without photos
 
 
 def unordered_layout(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:

@@ -32,14 +32,11 @@ CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens that is no pinhole; ``name`` is what the camera file calls the model.
+    """A lens that is no pinhole."""
 
-    Coefficients are the first of k1, k2, p1, p2, k3, k4, k5, k6 for "perspective" (``cv2.undistort``), of k1, k2, k3,
-    k4 for "fisheye" (``cv2.fisheye``); others are 0.
-    """
-
-    name: str
-    model: Literal["perspective", "fisheye"]
+    name: str  # as the camera file calls the model
+    model: Literal["perspective", "fisheye"]  # radial and tangential, as ``cv2.undistort``; as ``cv2.fisheye``
+    # the first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0
     coefficients: tuple[float, ...]
 
 
@@ -56,7 +53,7 @@ class CameraFile:
     viewmats: Tensor  # ``[c,4,4]`` world to camera, OpenCV axes, float64
     Ks: Tensor  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
     widths: Tensor  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
-    heights: Tensor  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
+    heights: Tensor  # the same
     names: tuple[str, ...]  # image names as the file gives them
     source: str  # the format's name
     convention: Convention = W2C_OPENCV  # how the format stores poses
@@ -69,17 +66,13 @@ class CameraFile:
 
 
 class View(NamedTuple):
-    """One camera as its file has it.
+    """One camera as its file has it."""
 
-    ``pose`` is 3x4 or 4x4 in the file's convention, ``K [3,3]`` in pixels, or divided by the image's size in all views;
-    ``size`` is (width, height) in pixels, 0 where unknown; ``lens`` is None for a pinhole.
-    """
-
-    name: str
-    pose: np.ndarray
-    K: np.ndarray
-    size: tuple[int, int] = (0, 0)
-    lens: Lens | None = None
+    name: str  # of its image
+    pose: np.ndarray  # 3x4 or 4x4, in the file's convention
+    K: np.ndarray  # ``[3,3]`` intrinsics, pixels, or divided by the image's size in all views of the file
+    size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
+    lens: Lens | None = None  # None for a pinhole
 
 
 def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
