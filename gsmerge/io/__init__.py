@@ -5,9 +5,9 @@ from gsmerge.io.alignment.score import Alignment as Alignment
 from gsmerge.io.alignment.score import check_alignment as check_alignment
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.bounds import read_json as read_json
-from gsmerge.io.cameras import CameraFile as CameraFile
-from gsmerge.io.cameras import read_cameras as read_cameras
-from gsmerge.io.cameras import to_cameras as to_cameras
+from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
+from gsmerge.io.cameras.camera_file import to_cameras as to_cameras
+from gsmerge.io.cameras.read import read_cameras as read_cameras
 from gsmerge.io.formats.ply import PlyInfo as PlyInfo
 from gsmerge.io.formats.ply import PlyScene as PlyScene
 from gsmerge.io.formats.ply import kept_comments as kept_comments

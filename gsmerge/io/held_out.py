@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.similarity import IDENTITY, Similarity
-from gsmerge.io.cameras import read_cameras, to_cameras
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, with_convention, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_convention, with_poses
 from gsmerge.io.cameras.lens import as_pinholes
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.hints import AUTO
 from gsmerge.io.photos import as_tensor, find_image, photo_size
 from gsmerge.io.scene import SceneLoad

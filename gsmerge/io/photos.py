@@ -42,9 +42,9 @@ def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
 
     Args:
         source: A folder (with its sub-folders), or the image files themselves.
-        names: One name per view, as camera files give them: with or without folders and extension. If no name
-            matches but there are as many images as names, the images are taken in order (of their names with numbers
-            counted as numbers, or of the list).
+        names: One per view, as camera files give them: with or without folders and extension. If no name matches but
+            there are as many images as names, the images are taken in order (of their names with numbers counted as
+            numbers, or of the list).
 
     Raises:
         SceneError: If an image is missing or cannot be read, or two differ in size.

@@ -43,10 +43,7 @@ def find_scene_files(
     ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
     are those that the model saw.
 
-    Args:
-        path: A ``.ply`` or a folder.
-        cameras: Named by the user: used instead of searching.
-        images: The same.
+    Cameras and images that the user names are used instead of searching.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.

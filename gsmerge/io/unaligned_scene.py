@@ -21,7 +21,7 @@ from gsmerge.io.alignment.poses import check_cameras, choose_poses
 from gsmerge.io.alignment.recover import recover
 from gsmerge.io.alignment.rotations import from_xyzw
 from gsmerge.io.alignment.score import AlignmentInput, check_alignment
-from gsmerge.io.alignment.similarity import scale_by
+from gsmerge.io.alignment.similarity import IDENTITY, scale_by
 from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.nerfstudio import find_dataparser, read_dataparser
@@ -53,9 +53,9 @@ def make_unaligned(
             raise SceneError(ply.info.path, problem, remedy)
     if inputs.scale is not None:
         cameras = with_poses(cameras, scale_by(inputs.scale).move_viewmats(inputs.viewmats))
-    images = inputs.images
-    cameras, camera_file, notes = _choose_cameras(ply, files, camera_file, cameras, images, (problem, remedy))
-    cameras, images, smaller = limit_view_size(cameras, images, hints.max_side)
+    inputs = replace(inputs, cameras=cameras)
+    cameras, camera_file, notes = _choose_cameras(files, camera_file, inputs, SceneError(files.ply, problem, remedy))
+    cameras, images, smaller = limit_view_size(cameras, inputs.images, hints.max_side)
     gaussians, padding = usable_rows(ply, hints)
     text = "the rows belong to no pixels that could be found: unaligned"
     if hints.exporter != "auto":
@@ -75,40 +75,35 @@ def _lacks_cameras(inputs: AlignmentInput) -> bool:
 
 
 def _choose_cameras(
-    ply: PlyScene,
-    files: SceneFiles,
-    camera_file: CameraFile,
-    cameras: Cameras,
-    images: Tensor | None,
-    problem: tuple[str, str],
+    files: SceneFiles, camera_file: CameraFile, inputs: AlignmentInput, why: SceneError
 ) -> tuple[Cameras, CameraFile, list[str]]:
     """Cameras that see the Gaussians: as they are, moved as nerfstudio does, or read in another convention; and notes.
-    SceneError if none of these does; says why there are no pixels.
+    SceneError if none of these does, with the reason why there are no pixels.
     """
-    moved = _move_by_dataparser(ply, files, cameras, images)
+    cameras = inputs.cameras
+    moved = _move_by_dataparser(files, inputs)
     if moved is not None:
         notes = [f"the cameras are moved into the Gaussians' frame by {DATAPARSER}"]
         return moved, replace(camera_file, viewmats=moved.viewmats), notes
-    poses, check, note = choose_poses(ply.gaussians, ply.valid, cameras, images, camera_file.convention)
+    poses, check, note = choose_poses(inputs.gaussians, inputs.valid, cameras, inputs.images, camera_file.convention)
     if not check.ok:
-        raise SceneError(ply.info.path, f"{problem[0]}; {check.description}", problem[1])
+        raise SceneError(why.path, f"{why.problem}; {check.description}", why.remedy)
     if poses is None:
         return cameras, camera_file, [note] if note else []
     notes = [f"{poses.describe(camera_file.convention)}: read so"]
     return with_poses(cameras, poses.viewmats), with_convention(camera_file, poses.convention), notes
 
 
-def _move_by_dataparser(ply: PlyScene, files: SceneFiles, cameras: Cameras, images: Tensor | None) -> Cameras | None:
+def _move_by_dataparser(files: SceneFiles, inputs: AlignmentInput) -> Cameras | None:
     """The cameras in nerfstudio's frame, if there is its file and they see the Gaussians better there."""
     path = find_dataparser(files)
     if path is None:
         return None
-    viewmats = cameras.viewmats.double().numpy()
-    moved = [with_poses(cameras, frame.move_viewmats(viewmats)) for frame in read_dataparser(path, files.cameras)]
-    checks = [check_cameras(ply.gaussians, ply.valid, there, images) for there in moved]
-    best = max(range(len(moved)), key=lambda i: checks[i].score)
-    stay = check_cameras(ply.gaussians, ply.valid, cameras, images)
-    return moved[best] if checks[best].ok and checks[best].score > stay.score else None
+    frames = [IDENTITY, *read_dataparser(path, files.cameras)]
+    moved = [with_poses(inputs.cameras, frame.move_viewmats(inputs.viewmats)) for frame in frames]
+    stay, *checks = (check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images) for cameras in moved)
+    best = max(checks, key=lambda check: check.score)
+    return moved[1 + checks.index(best)] if best.ok and best.score > stay.score else None
 
 
 def usable_rows(ply: PlyScene, hints: ReadHints) -> tuple[Gaussians, list[str]]:

@@ -19,15 +19,8 @@ SOURCE = "estimated from the grid"
 _SAMPLES = 300  # Gaussians per view
 _MARGIN = 2.0  # by which the best order of the rows must beat the next one
 _ROUNDS = 2  # each time without the Gaussians that lie far from their pixels
-_FLAGS = (
-    cv2.CALIB_USE_INTRINSIC_GUESS
-    | cv2.CALIB_FIX_PRINCIPAL_POINT
-    | cv2.CALIB_FIX_ASPECT_RATIO
-    | cv2.CALIB_ZERO_TANGENT_DIST
-    | cv2.CALIB_FIX_K1
-    | cv2.CALIB_FIX_K2
-    | cv2.CALIB_FIX_K3
-)
+_NO_DISTORTION = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+_ONE_FOCAL = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
 
 
 def estimate_cameras(
@@ -66,7 +59,7 @@ def _calibrate(means: Tensor, valid: Tensor, layout: Layout) -> tuple[float, flo
             near = [p[k].astype(np.float32) for p, k in zip(points, kept, strict=True)]
             where = [p[k].astype(np.float32) for p, k in zip(pixels, kept, strict=True)]
             _, K, _, rotations, shifts = cv2.calibrateCamera(
-                near, where, (layout.width, layout.height), K, np.zeros(5), flags=_FLAGS
+                near, where, (layout.width, layout.height), K, np.zeros(5), flags=_ONE_FOCAL | _NO_DISTORTION
             )
             errors = [
                 np.linalg.norm(cv2.projectPoints(p, r, t, K, None)[0][:, 0] - q, axis=1)

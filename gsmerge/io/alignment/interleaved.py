@@ -36,15 +36,15 @@ def interleaved_layout(rows: ProjectedRows) -> Layout | None:
     if not goes_forward:
         return None
     own_pixel = pixels[np.arange(count), chosen]
-    parts, cells = [], []
+    parts = []
     for view in range(views):
         own = np.flatnonzero((chosen == view) & (own_pixel >= 0))
         first = np.unique(own_pixel[own], return_index=True)[1]  # a step back may come to a pixel twice
-        parts.append(own[np.sort(first)].astype(np.int64))
-        cells.append(own_pixel[parts[-1]].astype(np.int64))
-    if min(len(part) for part in parts) < MIN_BLOCK:
+        own = own[np.sort(first)]
+        parts.append((view, own, own_pixel[own].astype(np.int64)))
+    if min(len(own) for _, own, _ in parts) < MIN_BLOCK:
         return None
-    return rows.layout("view-fastest", range(views), parts, cells, missing=views * rows.width * rows.height - count)
+    return rows.layout("view-fastest", parts, missing=views * rows.width * rows.height - count)
 
 
 def _best_path(pixels: np.ndarray) -> tuple[np.ndarray, bool]:

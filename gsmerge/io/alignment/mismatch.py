@@ -10,17 +10,9 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.io.alignment.layouts import plain_layout, subsample
 from gsmerge.io.alignment.poses import other_conventions
-from gsmerge.io.alignment.score import (
-    Alignment,
-    check_alignment,
-    check_pairs,
-    find_correspondences,
-    pixel_limit,
-    sample_pixels,
-)
-from gsmerge.io.alignment.similarity import Correspondences, pixel_errors, ray_directions, solve_pose
+from gsmerge.io.alignment.score import Alignment, check_alignment, check_pairs, pixel_limit, sample_pixels
+from gsmerge.io.alignment.similarity import Correspondences, candidate_similarities, pixel_errors, solve_pose
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CameraFile, Convention, with_poses
 from gsmerge.io.formats.ply import PlyInfo
 from gsmerge.io.photos import ASPECT_TOLERANCE
@@ -90,8 +82,8 @@ def explain_misalignment(
 
 def looks_like_a_grid(gaussians: Gaussians, valid: Tensor, cameras: Cameras) -> bool:
     """Whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then."""
-    layout = subsample(plain_layout(1, cameras.width, cameras.height), 2000)
-    pairs, K = find_correspondences(gaussians.means, valid, layout), cameras.Ks.double().numpy()[:1]
+    pairs, K = sample_pixels(gaussians, cameras, valid), cameras.Ks.double().numpy()[:1]
+    pairs = pairs.select(pairs.views == 0)
     pose = solve_pose(pairs, 0, K[0])
     if pose is None:
         return False
@@ -114,23 +106,10 @@ def _other_viewmats(
         mirrored = given.copy()
         mirrored[:, axis] *= -1
         yield f"the cameras fit with the {words}", mirrored
-    scale = _camera_scale(pairs, cameras)
-    if scale > 0:
-        scaled = given.copy()
-        scaled[:, :3, 3] *= scale
-        yield f"the cameras fit with their positions scaled by {scale:.4g}", scaled
-
-
-def _camera_scale(pairs: Correspondences, cameras: Cameras) -> float:
-    """The factor s of the camera positions that brings every mean nearest to its pixel's ray.
-
-    With ray direction d, centre c and mean X, (X - s c) x d = 0 for all; so s = sum e·g / sum e·e with
-    e = c x d and g = X x d. 0 where the centres do not determine it.
-    """
-    rays, centres = ray_directions(pairs, cameras.viewmats.double().numpy(), cameras.Ks.double().numpy())
-    e, g = np.cross(centres, rays), np.cross(pairs.points, rays)
-    bottom = float((e * e).sum())
-    return float((e * g).sum()) / bottom if bottom > 0 else 0.0
+    frames = candidate_similarities(pairs, given, cameras.Ks.double().numpy(), effort=1)
+    scaled = next((frame for frame in frames if frame.kind == "scaled"), None)
+    if scaled is not None:
+        yield f"the cameras fit with their {scaled.description}", scaled.move_viewmats(given)
 
 
 def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, Tensor]]:

@@ -52,26 +52,17 @@ class ProjectedRows:
         return pixels, u, v
 
     def layout(
-        self,
-        order: str,
-        views: Sequence[int],
-        rows: Sequence[np.ndarray],
-        pixels: Sequence[np.ndarray],
-        *,
-        missing: int,
-        note: str = "",
+        self, order: str, parts: Sequence[tuple[int, np.ndarray, np.ndarray]], *, missing: int, note: str = ""
     ) -> Layout:
-        """The layout of a search's result: for each view some of these rows and their pixels; how many pixels have
-        none.
-        """
-        said = "in no order" if order == "unordered" else order
+        """A search's result: ``parts`` are views, some of these rows, and their pixels; ``missing`` have none."""
+        words = "in no order" if order == "unordered" else order
         return Layout(
-            description=f"{missing:,} pixels of {len(views)} views dropped, {said}{note}",
+            description=f"{missing:,} pixels of {len(parts)} views dropped, {words}{note}",
             kind="pruned",
             order=order,
             width=self.width,
             height=self.height,
-            views=tuple(views),
-            rows=tuple(self.ids[some] for some in rows),
-            pixels=tuple(pixels),
+            views=tuple(view for view, _, _ in parts),
+            rows=tuple(self.ids[rows] for _, rows, _ in parts),
+            pixels=tuple(pixels for _, _, pixels in parts),
         )

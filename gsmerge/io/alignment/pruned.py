@@ -30,9 +30,8 @@ def pruned_layout(rows: ProjectedRows) -> Layout | None:
     blocks = _blocks(rows)
     if blocks is None:
         return None
-    pixels = [assign_pixels(*rows.project(some, view), rows.width, rows.height) for view, some in blocks]
-    missing = len(blocks) * rows.width * rows.height - len(rows)
-    return rows.layout("view-major", [v for v, _ in blocks], [some for _, some in blocks], pixels, missing=missing)
+    parts = [(v, some, assign_pixels(*rows.project(some, v), rows.width, rows.height)) for v, some in blocks]
+    return rows.layout("view-major", parts, missing=len(blocks) * rows.width * rows.height - len(rows))
 
 
 def _blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:

@@ -55,10 +55,8 @@ class Recovery:
         if self.color_margin is None:
             text += f"{min(self.margin, 9999):.0f} times nearer than the next reading ({other})"
         else:
-            text += (
-                f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next reading"
-                f" ({other}), which fits the pixels as well"
-            )
+            text += f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next"
+            text += f" reading ({other}), which fits the pixels as well"
         return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
 
 
@@ -92,7 +90,9 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if not _stands_out(best, shuffled_px):
         return None
     next_px = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px)
-    confirmed = _is_confirmed(color_error(inputs, best.layout), shuffled_color)
+    confirmed = None
+    if shuffled_color > _VARIES:
+        confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
     return Recovery(best, runner_up, next_px / max(best.worst_px, _SMALLEST_PX), None, confirmed)
 
 
@@ -112,11 +112,6 @@ def _by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery 
 def _stands_out(best: AlignmentScore, shuffled_px: float) -> bool:
     """Whether a reading is near enough to its pixels, and shuffled pixels are far from them."""
     return best.ok and shuffled_px >= SHUFFLED_MARGIN * max(best.worst_px, _SMALLEST_PX)
-
-
-def _is_confirmed(color: float, shuffled: float) -> bool | None:
-    """Whether the colours are nearer to the photos than to shuffled pixels; None where neither can be said."""
-    return color <= _UNCONFIRMED * shuffled if shuffled > _VARIES else None
 
 
 def _exact(inputs: AlignmentInput) -> list[Layout]:

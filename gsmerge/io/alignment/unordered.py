@@ -51,17 +51,11 @@ def unordered_layout(rows: ProjectedRows, *, color_of: ColorOf | None = None) ->
     used = np.flatnonzero(owner >= 0)
     if len(used) < MIN_SHARE * count:
         return None
-    parts = np.split(used, np.searchsorted(used, np.arange(1, rows.num_views) * num_pixels))
-    views = [view for view, part in enumerate(parts) if len(part)]
+    slots_of_views = np.split(used, np.searchsorted(used, np.arange(1, rows.num_views) * num_pixels))
+    parts = [(view, owner[own], own - view * num_pixels) for view, own in enumerate(slots_of_views) if len(own)]
     lost = count - len(used)
-    return rows.layout(
-        "unordered",
-        views,
-        [owner[parts[view]] for view in views],
-        [parts[view] - view * num_pixels for view in views],
-        missing=rows.num_views * num_pixels - len(used),
-        note=f", {lost:,} rows without a pixel" if lost else "",
-    )
+    note = f", {lost:,} rows without a pixel" if lost else ""
+    return rows.layout("unordered", parts, missing=rows.num_views * num_pixels - len(used), note=note)
 
 
 def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | None:

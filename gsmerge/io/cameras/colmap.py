@@ -28,7 +28,7 @@ _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 
 MAX_NAME = 1 << 16  # bytes of an image's name
 
-_Image = tuple[str, int, list[float]]  # name, camera id, quaternion wxyz and translation
+_Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
 def is_colmap(folder: Path) -> bool:
@@ -52,7 +52,6 @@ def read_colmap(folder: Path) -> CameraFile:
         else:
             cameras = _text_cameras(camera_path, read_text(camera_path))
             images = _text_images(read_text(image_path, MAX_MODEL_BYTES))
-        poses = [_pose(numbers) for _, _, numbers in images]
         unknown = next((name for name, camera, _ in images if camera not in cameras), None)
         if unknown is not None:
             raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
@@ -60,9 +59,7 @@ def read_colmap(folder: Path) -> CameraFile:
         raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
-    views = [
-        cameras[camera]._replace(name=name, pose=pose) for (name, camera, _), pose in zip(images, poses, strict=True)
-    ]
+    views = [cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images]
     return make_camera_file(folder, f"COLMAP {'binary' if binary else 'text'}", W2C_OPENCV, views)
 
 
@@ -75,6 +72,7 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
 
 
 def _pose(numbers: list[float]) -> np.ndarray:
+    """``[3,4]`` from a quaternion wxyz and a translation."""
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
     quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
@@ -125,7 +123,7 @@ def _binary_images(data: mmap.mmap) -> list[_Image]:
         position = end + 9 + 24 * num_points
         if position > len(data):
             raise ValueError("early end of file")
-        images.append((name, camera, numbers))
+        images.append((name, camera, _pose(numbers)))
         if len(images) > MAX_VIEWS:
             break  # which is refused as too many
     return images
@@ -156,6 +154,6 @@ def _text_images(text: str) -> list[_Image]:
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")
-        images.append((name.strip(), int(camera), [float(x) for x in numbers]))
+        images.append((name.strip(), int(camera), _pose([float(x) for x in numbers])))
         next(lines, None)
     return images
