@@ -18,7 +18,6 @@ from gsmerge.io.formats.writing import lost_harmonics as lost_harmonics
 from gsmerge.io.formats.writing import output_format as output_format
 from gsmerge.io.formats.writing import write_gaussians as write_gaussians
 from gsmerge.io.formats.writing import write_ply as write_ply
-from gsmerge.io.held_out import HeldOutViews as HeldOutViews
 from gsmerge.io.held_out import read_held_out as read_held_out
 from gsmerge.io.hints import AUTO as AUTO
 from gsmerge.io.hints import ReadHints as ReadHints

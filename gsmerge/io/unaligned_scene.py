@@ -1,32 +1,28 @@
-"""Scenes whose Gaussians belong to no pixels: which rows are Gaussians, and which cameras see them."""
+"""Scenes whose Gaussians belong to no pixels: which rows are Gaussians, which cameras see them, and what is wrong."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.fit_cameras import CameraFit
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
-from gsmerge.io.alignment.mismatch import (
-    count_problem,
-    count_remedy,
-    explain_misalignment,
-    looks_like_a_grid,
-    misalignment_error,
-)
-from gsmerge.io.alignment.poses import check_cameras, choose_poses
+from gsmerge.io.alignment.poses import check_cameras, choose_poses, other_conventions
 from gsmerge.io.alignment.recover import recover
 from gsmerge.io.alignment.rotations import from_xyzw
-from gsmerge.io.alignment.score import AlignmentInput, check_alignment
-from gsmerge.io.alignment.similarity import IDENTITY, scale_by
-from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
+from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment, check_pairs, sample_pixels
+from gsmerge.io.alignment.similarity import IDENTITY, candidate_similarities, pixel_errors, scale_by, solve_pose
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention, with_poses
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.nerfstudio import find_dataparser, read_dataparser
-from gsmerge.io.formats.ply import PlyScene
+from gsmerge.io.formats.ply import PlyInfo, PlyScene
 from gsmerge.io.hints import ReadHints
+from gsmerge.io.photos import ASPECT_TOLERANCE
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.io.views import limit_view_size
 from gsmerge.types import Cameras, Gaussians, UnalignedScene
@@ -46,7 +42,7 @@ def make_unaligned(
         if len(ply.gaussians) == len(cameras) * cameras.width * cameras.height:
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
-            if reason or looks_like_a_grid(ply.gaussians, ply.valid, cameras):
+            if reason or looks_like_a_grid(ply.gaussians, ply.valid, cameras, 4 * alignment.limit_px):
                 raise misalignment_error(camera_file, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.info.count} rows that are in no known order"
         if _lacks_cameras(inputs):
@@ -125,3 +121,100 @@ def is_padding(gaussians: Gaussians) -> Tensor:
     shape = torch.cat([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
     padding[rows[(shape == shape.median(0).values).all(1)]] = True
     return padding
+
+
+def count_problem(ply: PlyInfo, cameras: Cameras) -> str:
+    """That the number of rows is not that of the pixels."""
+    views, width, height = len(cameras), cameras.width, cameras.height
+    return (
+        f"expected one Gaussian per pixel, {views} x {height} x {width} = {views * height * width} "
+        f"(views x height x width), found {ply.count}"
+    )
+
+
+def count_remedy(count: int, cameras: Cameras) -> str:
+    """Which simple reading the number of Gaussians has instead."""
+    views, width, height = len(cameras), cameras.width, cameras.height
+    pixels = width * height
+    if count % (views * pixels) == 0:
+        return f"that is {count // (views * pixels)} Gaussians per pixel"
+    if count % pixels == 0:
+        return f"that is {count // pixels} views of this size: give the cameras of just those"
+    if count == views * (width - 16) * (height - 16):
+        return f"that is {height - 16} x {width - 16} per view: 8 pixels were trimmed at every border"
+    each = count / views
+    guess = round((each * width / height) ** 0.5)
+    for w in range(max(1, guess - 14), guess + 15):
+        h = each / w
+        if h == round(h) and h and abs(w * height / (h * width) - 1) < ASPECT_TOLERANCE:
+            return f"that is {round(h)} x {w} per view: give cameras and images of that size"
+    if count < views * pixels:
+        return "pixels were dropped or merged by the exporter, which is not supported"
+    return "give the cameras and images that belong to it"
+
+
+def misalignment_error(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
+    """That the rows would be enough, but do not lie on the rays of their pixels."""
+    problem = (
+        f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
+        f"found a median of up to {alignment.worst_px:.1f} px and "
+        f"{100 * alignment.share_in_front:.0f} % in front of their camera"
+    )
+    unknown = "no other convention fits either: give the cameras that belong to the .ply"
+    return SceneError(camera_file.path, problem, f"{reason}: convert one to the other" if reason else unknown)
+
+
+def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor, convention: Convention) -> str | None:
+    """The other reading of the cameras or of the row order under which the scene would fit, in words; None without any.
+
+    Gaussians, cameras (read under ``convention``) and ``valid`` are as for :func:`check_alignment`.
+    """
+    pairs = sample_pixels(gaussians, cameras, valid)
+    given = cameras.viewmats.double().numpy()
+    frames = candidate_similarities(pairs, given, cameras.Ks.double().numpy(), effort=1)
+    scaled = [f for f in frames if f.kind == "scaled"]
+    others = [(f"the cameras fit with their {f.description}", f.move_viewmats(given)) for f in scaled]
+    for reason, viewmats in [*_other_viewmats(cameras, convention), *others]:
+        if check_pairs(pairs, with_poses(cameras, viewmats)).ok:
+            return reason
+    for reason, order in _other_orders(len(cameras), cameras.height, cameras.width):
+        if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
+            return reason
+    swapped = replace(cameras, width=cameras.height, height=cameras.width)
+    if check_alignment(gaussians, swapped, valid).ok:
+        return "the cameras fit with width and height swapped"
+    return None
+
+
+def looks_like_a_grid(gaussians: Gaussians, valid: Tensor, cameras: Cameras, limit: float) -> bool:
+    """Whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then.
+
+    The intrinsics may be what is wrong: a pose that takes most of it up, to a median of ``limit`` pixels, is enough.
+    """
+    pairs, K = sample_pixels(gaussians, cameras, valid), cameras.Ks.double().numpy()[:1]
+    pairs = pairs.select(pairs.views == 0)
+    pose = solve_pose(pairs, 0, K[0])
+    return pose is not None and bool(np.median(pixel_errors(pairs, pose[None], K)) < limit)
+
+
+def _other_viewmats(cameras: Cameras, convention: Convention) -> Iterator[tuple[str, np.ndarray]]:
+    given = cameras.viewmats.double().numpy()
+    for poses in other_conventions(given, convention):
+        yield poses.describe(convention), poses.viewmats
+    transposed = given.copy()
+    transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
+    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres.double().numpy())
+    yield "the cameras fit with their rotations transposed", transposed
+    for axis, words in ((1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")):
+        mirrored = given.copy()
+        mirrored[:, axis] *= -1
+        yield f"the cameras fit with the {words}", mirrored
+
+
+def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, Tensor]]:
+    """Permutations that bring rows of another order into view-major, row-major order."""
+    rows = torch.arange(views * height * width)
+    by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
+    yield "the rows fit in the order row, column, view (view fastest)", by_pixel.permute(2, 0, 1).reshape(-1)
+    yield "the rows fit in the order view, column, row (column-major)", by_column.permute(0, 2, 1).reshape(-1)
+    yield "the rows fit with the views in reverse order", rows.reshape(views, -1).flip(0).reshape(-1)

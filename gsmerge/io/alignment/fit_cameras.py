@@ -15,7 +15,7 @@ from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
 from gsmerge.io.alignment.poses import choose_fit, find_aligned_poses, other_conventions
 from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput, color_error
-from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photos import Photos, as_tensor, natural_key, photo_size
@@ -153,15 +153,13 @@ def _other_size_and_poses(source: _Source, camera_file: CameraFile) -> CameraFit
     """The one fit at another size, with the poses read in another way; only where no pixel and no frame is missing.
     SceneError if several readings fit alike.
     """
-    fits: dict[Convention, CameraFit] = {}
-    readings = []
+    fits = []
     for poses in other_conventions(camera_file.viewmats.double().numpy(), camera_file.convention):
         fit = _other_size(source, with_convention(camera_file, poses.convention), exact_frames=True)
         if fit is not None and fit.recovery is not None:
-            fits[poses.convention] = fit
-            readings.append((poses, fit.recovery))
-    best = choose_fit(camera_file, readings)
+            fits.append((poses, fit.recovery.best.worst_px, fit))
+    best = choose_fit(camera_file, fits)
     if best is None:
         return None
-    fit = fits[best[0].convention]
-    return replace(fit, notes=[*fit.notes, f"{best[0].describe(camera_file.convention)}: read so"])
+    poses, fit = best
+    return replace(fit, notes=[*fit.notes, f"{poses.describe(camera_file.convention)}: read so"])

@@ -42,18 +42,16 @@ def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
 def _pruned(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
     """In the frame of the cameras or at a given scale; at any other scale, where that does not fit well or at all."""
     same = _search(inputs, rows, pruned_layout, _given_frame(inputs))
-    if same is not None and same.worst_px >= _CERTAIN_PX and _mostly_missing(same.layout):
-        same = replace(same, ok=False)  # with so many pixels to choose from, any row is near to one
+    if same is not None and same.worst_px >= _CERTAIN_PX:
+        num_pixels, num_rows = len(same.layout.views) * rows.width * rows.height, sum(map(len, same.layout.rows))
+        if 2 * num_rows < num_pixels:  # with so many pixels to choose from, any row is near to one
+            same = replace(same, ok=False)
     if inputs.scale is not None or (same is not None and same.worst_px < _CERTAIN_PX):
         return same
     other = _pruned_and_scaled(inputs, rows)
     if other is None or same is None:
         return other or same
     return other if other.ok and (other.worst_px * _BETTER < same.worst_px or not same.ok) else same
-
-
-def _mostly_missing(layout: Layout) -> bool:
-    return 2 * sum(len(rows) for rows in layout.rows) < len(layout.views) * layout.width * layout.height
 
 
 def _pruned_and_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:

@@ -74,12 +74,8 @@ def _step_cost(before, view_before, after, view):
 def cheapest_views(pixels, came_from, views):
     """Viterbi's path through ``pixels [n,v]`` int32, the pixel of each row in each view, -1 outside it.
 
-    Args:
-        came_from: ``[n,v]`` int8, overwritten: the best view of the row before.
-        views: ``[n]`` int64, overwritten: the view of each row.
-
-    Returns:
-        How many steps of the path go back.
+    Returns how many of its steps go back. Overwritten: ``views [n]`` int64, the view of each row; ``came_from [n,v]``
+    int8, the best view of the row before.
     """
     n, num_views = pixels.shape
     cost, fresh = np.zeros(num_views), np.zeros(num_views)

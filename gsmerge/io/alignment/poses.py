@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -14,6 +15,8 @@ from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, Convention, from_viewmats, to_viewmats, with_poses
 from gsmerge.types import Cameras, Gaussians
+
+Fit = TypeVar("Fit")
 
 _AS_GOOD = 0.98  # of the score of what the cameras see: no difference
 _SAME = 1e-6  # of the cameras' distances: no difference
@@ -112,20 +115,20 @@ def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple
         cameras = with_poses(inputs.cameras, poses.viewmats)
         if check_cameras(inputs.gaussians, inputs.valid, cameras, None).ok:
             recovery = recover(replace(inputs, cameras=cameras))
-            fits += [] if recovery is None else [(poses, recovery)]
+            fits += [] if recovery is None else [(poses, recovery.best.worst_px, recovery)]
     return choose_fit(camera_file, fits)
 
 
-def choose_fit(camera_file: CameraFile, fits: Sequence[tuple[Poses, Recovery]]) -> tuple[Poses, Recovery] | None:
-    """The reading of the poses that fits best; None without any. SceneError if several fit, none of them twice as well
-    as the next.
+def choose_fit(camera_file: CameraFile, fits: Sequence[tuple[Poses, float, Fit]]) -> tuple[Poses, Fit] | None:
+    """The fit with the smallest distance in pixels (the second entry); None without any. SceneError if several readings
+    of the poses fit, none of them twice as well as the next.
     """
-    ranked = sorted(fits, key=lambda one: one[1].best.worst_px)
-    if len(ranked) > 1 and ranked[1][1].best.worst_px < MARGIN * max(ranked[0][1].best.worst_px, 1e-3):
+    ranked = sorted(fits, key=lambda one: one[1])
+    if len(ranked) > 1 and ranked[1][1] < MARGIN * max(ranked[0][1], 1e-3):
         both = f"{ranked[0][0].description} and as {ranked[1][0].description}"
         problem = f"expected poses that fit in one reading, found that they fit as {both}"
         raise SceneError(camera_file.path, problem, "convert them to the format's own")
-    return ranked[0] if ranked else None
+    return (ranked[0][0], ranked[0][2]) if ranked else None
 
 
 def choose_poses(

@@ -88,12 +88,9 @@ def candidate_similarities(
     first or the middle camera, alone, scaled, or scaled and shifted, as exporters do; any, from the poses that the
     pixels ask for.
 
-    Args:
-        pairs: Gaussians with their pixels; None where none is known, and nothing can be solved for.
-        viewmats: ``[c,4,4]`` of the cameras' own world.
-        Ks: ``[c,3,3]``.
-        scale: Size of the Gaussians' world in units of the cameras', where it is given.
-        effort: 0 solves for nothing, 1 for scale and shift, 2 for the rotation as well.
+    Cameras ``viewmats [c,4,4]``, ``Ks [c,3,3]`` are in their own world; ``scale`` is the size of the Gaussians' world
+    in its units, where it is given. Effort 0 solves for nothing (then there may be no pairs), 1 for scale and shift, 2
+    for the rotation as well.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     for rotation, name, kind in _known_rotations(viewmats):

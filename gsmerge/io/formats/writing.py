@@ -20,12 +20,7 @@ from gsmerge.types import Gaussians
 SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
-OUTPUT_FORMATS = {
-    ".compressed.ply": compressed.MAX_DEGREE,
-    ".ply": 4,
-    ".spz": spz_writer.MAX_DEGREE,
-    ".splat": 0,
-}
+OUTPUT_FORMATS = {".compressed.ply": compressed.MAX_DEGREE, ".ply": 4, ".spz": spz_writer.MAX_DEGREE, ".splat": 0}
 
 
 def output_format(path: str | os.PathLike[str]) -> str:
