@@ -82,8 +82,7 @@ def every_nth(views: int) -> list[tuple[int, ...]]:
 
 def plain_layout(views: int, width: int, height: int) -> Layout:
     """One Gaussian per pixel, view by view and row by row."""
-    layouts = exact_layouts(views * width * height, views, width, height)
-    return next(layout for layout in layouts if layout.is_plain)
+    return next(one for one in exact_layouts(views * width * height, views, width, height) if one.is_plain)
 
 
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:

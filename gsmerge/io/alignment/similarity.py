@@ -93,21 +93,22 @@ def candidate_similarities(
     for the rotation as well.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
+    rays = None if pairs is None or effort == 0 else ray_directions(pairs, viewmats, Ks)
     for rotation, name, kind in _known_rotations(viewmats):
         if name:
             yield Similarity(rotation, scale or 1.0, np.zeros(3), name, kind)
-        if pairs is None or effort == 0:
+        if pairs is None or rays is None:
             continue
         for shifted in (False, True) if scale is None else (True,):
-            frame = _solve(pairs, viewmats, Ks, rotation, shifted=shifted)
+            frame = _solve(pairs.points, rays, rotation, shifted=shifted)
             if frame is not None:
                 text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
                 text = f"{name}, {text}" if name else text
                 yield replace(frame, description=text, kind=kind or ("shifted" if shifted else "scaled"))
-    if pairs is None or effort < 2:
+    if pairs is None or rays is None or effort < 2:
         return
     free = _mean_rotation(_pose_of_each_view(pairs, Ks), viewmats)
-    frame = None if free is None else _solve(pairs, viewmats, Ks, free, shifted=True)
+    frame = None if free is None else _solve(pairs.points, rays, free, shifted=True)
     if frame is not None:
         angle = np.degrees(np.arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
         if angle < _SMALL_ROTATION and abs(np.log(frame.scale)) < _SMALL_SCALE:
@@ -127,11 +128,10 @@ def _known_rotations(viewmats: np.ndarray) -> Iterator[tuple[np.ndarray, str, st
 
 
 def _solve(
-    pairs: Correspondences, viewmats: np.ndarray, Ks: np.ndarray, rotation: np.ndarray, *, shifted: bool
+    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
     """Scale and shift that, after a rotation, bring every point nearest to its ray, robustly; None if not positive."""
-    rays, centres = (part @ rotation.T for part in ray_directions(pairs, viewmats, Ks))
-    points = pairs.points
+    rays, centres = (part @ rotation.T for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [np.einsum("tij,tj->ti", across, centres)[:, :, None]] + ([across] if shifted else [])
     A, b = np.concatenate(columns, 2), np.einsum("tij,tj->ti", across, points)
