@@ -19,7 +19,7 @@ from gsmerge import __version__
 from gsmerge.errors import error_line
 from gsmerge.io import AUTO, HeldOutViews, ReadHints, load_files, read_held_out
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_writer import file_bytes
+from gsmerge.io.formats.writing import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.speed import time_render
 from gsmerge.options import CompactOptions
