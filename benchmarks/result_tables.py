@@ -167,7 +167,10 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     if not rows:
         return []
     head = ("export", "method", "kept", *QUALITY)
-    words = "The same scenes, written in the way of each exporter; all input views."
+    words = (
+        "One depth network, written as four programs write their files: what differs is order, encoding, frames and what"
+        " is left out or voxelised, not the network. The paper's table compares four networks. All input views."
+    )
     title = "Backbones (the paper's table of novel view synthesis)"
     return [
         _section(title, "ablation da3 depthsplat anysplat", words, _table(head, rows)),
@@ -181,14 +184,31 @@ def _views(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     records = [r for r in parts.get("views", ()) if r.views_asked is not None]
     if not records:
         return []
+    scenes: dict[int, set[str]] = {}
+    for record in records:
+        scenes.setdefault(record.views_asked or 0, set()).add(record.scene)
+    common = set.intersection(*scenes.values())
+    head = ("views", "scenes", "method", "kept", *QUALITY)
+    words = (
+        f"Evenly spread contexts, targets midway between them. Table and figures are of the scenes that have so many"
+        f" views: {', '.join(sorted(common))}."
+    )
+    same = _table(head, _by_count([r for r in records if r.scene in common]))
+    title = "By number of input views"
+    return [
+        _section(title, "views", words, same, "quality-views", "count-views"),
+        "### Each number over all scenes that have as many\n\n" + _table(head, _by_count(records)),
+    ]
+
+
+def _by_count(records: Sequence[RunRecord]) -> list[Row]:
+    """A row for each number of views and method."""
     rows = []
     for count in sorted({r.views_asked for r in records if r.views_asked is not None}):
         at = [r for r in records if r.views_asked == count]
         for some in _grouped(at, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
             rows.append((str(count), str(len(some)), _words(some[0]), _share(some), *_quality(some)))
-    head = ("views", "scenes", "method", "kept", *QUALITY)
-    words = "Evenly spread contexts, targets midway between them; scenes with fewer views are left out of a row."
-    return [_section("By number of input views", "views", words, _table(head, rows), "quality-views", "count-views")]
+    return rows
 
 
 def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -383,5 +403,15 @@ def _without(records: Sequence[RunRecord]) -> str:
 def _missing() -> str:
     return """## Tables of the paper without a counterpart
 
+What the paper shows and this page does not, and where else it is:
+
+- Other backbones, each with its own errors (`tab:nvs`): one depth network stands in for all, see above. Its benchmarks
+  (DL3DV, Mip-NeRF 360, Tanks and Temples) are not here; the scenes are five captures.
+- The learned method of the paper itself, in any table: no networks with absolute outputs ship
+  ([networks](internals/networks.md#the-papers-own-method)).
 - Online reconstruction (`tab:online`, `fig:online`): [views in batches](internals/views-in-batches.md).
-- Depth Anything 3 with and without poses (`tab:da3_posed_unposed`), ReSplat, VolSplat: they need the models."""
+- Superpixel sizes without training again (right of `fig:sp_proxy_pareto`): rows of the ablation, after the fit.
+- K by superpixel (supplement, method extensions): [how many Gaussians](guide/how-many.md).
+- Depth Anything 3 with and without poses (`tab:da3_posed_unposed`), ReSplat, VolSplat: they need the models.
+- Qualitative figures: no photo of the captures enters the project; the README's picture is of a synthetic scene.
+- Training: steps, time and memory of the paper's schedule were not repeated."""
