@@ -1,11 +1,7 @@
-"""Examples in files, streams of them, and runs in several processes."""
+"""Examples in files, and streams of them."""
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -34,8 +30,6 @@ from gsmerge.research.training.examples import make_examples as make_each
 from gsmerge.research.training.shards import read_targets
 from gsmerge.research.training.stream import ExampleStreams, open_streams
 from gsmerge.runtime.threads import use_threads
-
-ROOT = Path(__file__).parents[4]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -230,41 +224,3 @@ def test_shares_of_processes_come_back_in_order() -> None:
     assert Processes().gather(items) == items
     with pytest.raises(ValueError, match="crops: expected a multiple of the 3 processes, got 2"):
         Processes(0, 3).require_even(2)
-
-
-WORKER = """
-import json, sys
-from pathlib import Path
-from gsmerge.research.training import TrainOptions, join_processes, prepare_shards, train
-scenes, cache, out, options = sys.argv[1:]
-options = TrainOptions.from_dict(json.loads(options))
-with join_processes("cpu") as processes:
-    shards = prepare_shards([Path(scene) for scene in scenes.split(":")], options, Path(cache), processes)
-    train(shards, shards[1:], Path(out), options, threads=1, processes=processes)
-"""
-
-
-def test_two_processes_equal_one(scenes: list[Path], tmp_path: Path) -> None:
-    """The same batch, so the same files."""
-    import json
-
-    options = replace(PAPER, steps=4, save_every=2, crops=2)
-    words = [":".join(map(str, scenes)), tmp_path / "cache", tmp_path / "two", json.dumps(options.to_dict())]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    environment = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2",
-                   "LOCAL_WORLD_SIZE": "2", "PYTHONPATH": str(ROOT), "GLOO_SOCKET_IFNAME": "lo"}  # fmt: skip
-    command = [sys.executable, "-c", WORKER, *map(str, words)]
-    started = [
-        subprocess.Popen(command, env={**environment, "RANK": rank, "LOCAL_RANK": rank}, stderr=subprocess.PIPE)
-        for rank in ("0", "1")
-    ]
-    messages = [process.communicate(timeout=300)[1].decode() for process in started]
-    assert [process.returncode for process in started] == [0, 0], "\n".join(messages)
-    shards = prepare_shards(scenes, options, tmp_path / "cache")
-    train(shards, shards[1:], tmp_path / "one", options, threads=1)
-    one, two = files(tmp_path / "one"), files(tmp_path / "two")
-    assert one.keys() == two.keys()
-    assert one["losses.csv"] == two["losses.csv"]
-    assert one == two
