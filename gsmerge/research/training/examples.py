@@ -88,7 +88,7 @@ def make_examples(
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")
     held_out = _read_held_out(load)
-    for ids in view_subsets(len(scene), (0,) if options.random_views else options.views):
+    for ids in view_subsets(len(scene), options.example_views):
         training = make_training_scene(scene, ids, held_out)
         for density in options.densities:
 

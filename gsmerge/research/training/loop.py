@@ -30,7 +30,7 @@ from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import predict
-from gsmerge.research.training.processes import Processes
+from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.shards import Shard, read_targets
 from gsmerge.research.training.stream import ExampleStreams, open_streams
 from gsmerge.research.training.validation import Row, validate
@@ -41,7 +41,6 @@ from gsmerge.views import even_views
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
-ALONE = Processes()
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,7 @@ def _step(state: TrainingState, streams: ExampleStreams, run: Run, step: int) ->
         with torch.enable_grad():
             loss = _loss(state.networks, example, run, step, rng)
             parts = torch.autograd.grad(loss, parameters, materialize_grads=True)
-        return torch.cat([part.flatten() for part in (*parts, loss.detach())])
+        return torch.cat([part.flatten() for part in (*parts, loss.detach().to(parts[0]))])  # which may be on a GPU
 
     rows = run.processes.gather_rows(torch.stack(parallel_map(work, streams.crops)))
     mean = rows.sum(0) / options.crops

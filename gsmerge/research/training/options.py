@@ -189,6 +189,11 @@ class TrainOptions:
         """Whether a loss compares corrections with those of a full fit."""
         return self.regression_weight > 0 or self.photo_start > 0
 
+    @property
+    def example_views(self) -> tuple[int, ...]:
+        """Numbers of views of a scene's examples; random subsets are drawn from all."""
+        return (0,) if self.random_views else self.views
+
     def match_options(self) -> MatchOptions:
         """How Feature Gaussians are matched across views."""
         overlap = self.iou if self.match == "aabb" else self.overlap

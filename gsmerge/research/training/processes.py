@@ -57,11 +57,14 @@ class Processes:
         return torch.stack(parts, 1).flatten(0, 1)
 
 
+ALONE = Processes()
+
+
 @contextmanager
 def join_processes(device: str) -> Iterator[Processes]:
     """Meet the other processes that ``torchrun`` has started, if it has, over gloo or, on ``"cuda"``, NCCL."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        yield Processes()
+        yield ALONE
         return
     if device == "cuda":
         torch.cuda.set_device(local_rank())

@@ -27,7 +27,7 @@ from gsmerge.moments import Members
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.examples import Example, make_examples, scene_name
 from gsmerge.research.training.options import TrainOptions
-from gsmerge.research.training.processes import Processes
+from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.targets import Targets
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
@@ -36,7 +36,7 @@ LAYOUT = 3  # version of the files
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
 # Settings that an example depends on; fit_steps and levels only with a fit.
-SETTINGS = ("views", "random_views", "densities", "segmentation", "photo_scale", "photo_side", "seed")
+SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 FIT_SETTINGS = ("match", "overlap", "iou", "fit_steps", "levels")
 PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
 
@@ -54,7 +54,7 @@ def prepare_shards(
     scenes: Sequence[Path],
     options: TrainOptions,
     folder: Path,
-    processes: Processes = Processes(),  # noqa: B008 - frozen
+    processes: Processes = ALONE,
     report: Report | None = None,
 ) -> list[Shard]:
     """The shards of all scenes, in their order; those that are missing are made, by all processes together.
@@ -106,9 +106,9 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     Raises:
         SceneError: If there is no scene.
     """
-    values = options.to_dict()
     names = (*SETTINGS, *FIT_SETTINGS) if options.uses_fit else SETTINGS
-    head = {"layout": LAYOUT, "gsmerge": __version__, "fit": options.uses_fit, **{n: values[n] for n in names}}
+    head = {"layout": LAYOUT, "gsmerge": __version__, "fit": options.uses_fit, "views": options.example_views}
+    head |= {name: getattr(options, name) for name in names}
     state = hashlib.sha256(json.dumps(head, sort_keys=True).encode("ascii"))
     files = find_scene_files(scene)
     for root in dict.fromkeys((files.ply, files.cameras, files.images, files.ply.parent / "targets")):

@@ -48,10 +48,10 @@ class ExampleStreams:
         return self.examples[self.shard_id(step, crop, slot)].result()
 
     def shard_id(self, step: int, crop: int, slot: int) -> int:
-        """Number of the shard in one of the places of a crop's stream."""
-        place = (step // self.options.refresh + slot) * self.options.crops + crop
-        turn, rest = divmod(place, len(self.shards))
-        return int(_order(self.options.seed, turn, len(self.shards))[rest])
+        """Number of the shard that a crop's stream has in a slot: 0 is the oldest."""
+        position = (step // self.options.refresh + slot) * self.options.crops + crop
+        epoch, rest = divmod(position, len(self.shards))
+        return int(_order(self.options.seed, epoch, len(self.shards))[rest])
 
     def _read(self, number: int) -> Example:
         example = read_shard(self.shards[number], check=number not in self.checked)
@@ -70,6 +70,6 @@ def open_streams(shards: Sequence[Shard], options: TrainOptions, crops: Sequence
 
 
 @lru_cache(maxsize=4)
-def _order(seed: int, turn: int, count: int) -> np.ndarray:
+def _order(seed: int, epoch: int, count: int) -> np.ndarray:
     """``[count]`` the order of all shards in one pass over them."""
-    return np.random.default_rng([seed, ORDER, turn]).permutation(count)
+    return np.random.default_rng([seed, ORDER, epoch]).permutation(count)
