@@ -53,6 +53,15 @@ def test_no_fit_where_no_loss_uses_it(example: Example, monkeypatch: pytest.Monk
         make_example(training, replace(preset_options("default"), fit_steps=2), 0.1, "room")
 
 
+def test_photos_have_the_longer_side_that_is_asked_for() -> None:
+    training = make_training_scene(make_scene(room(), arc(2, 48, 36)), range(2))
+    small = make_example(training, replace(PAPER, photo_side=32), 0.1, "room")
+    assert small.images.shape == (2, 24, 32, 3)
+    assert small.covers.shape == (2, 2, 24, 32)
+    np.testing.assert_allclose(small.photos.Ks[0, :2] * 1.5, training.cameras.Ks[0, :2], rtol=1e-6)
+    assert make_example(training, replace(PAPER, photo_side=476), 0.1, "room").images.shape == (2, 36, 48, 3)
+
+
 def test_every_window_has_views_of_its_own(example: Example) -> None:
     rng = np.random.default_rng(0)
     drawn = [draw_views(example, PAPER, rng) for _ in range(200)]

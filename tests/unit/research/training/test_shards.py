@@ -218,6 +218,15 @@ def test_a_streamed_run_is_repeated_and_resumed_to_the_bit(shards: list[Shard], 
     assert files(tmp_path / "whole")["last.safetensors"] != files(tmp_path / "seed")["last.safetensors"]
 
 
+def test_a_run_names_the_shard_that_is_damaged(shards: list[Shard], tmp_path: Path) -> None:
+    data = bytearray(shards[0].path.read_bytes())
+    data[-1] ^= 1
+    damaged = replace(shards[0], path=tmp_path / "damaged.safetensors")
+    damaged.path.write_bytes(bytes(data))
+    with pytest.raises(SceneError, match=r"damaged\.safetensors: expected .* remove it"):
+        train([damaged], shards[:1], tmp_path / "run", PAPER, threads=1)
+
+
 def test_shares_of_processes_come_back_in_order() -> None:
     items = list(range(7))
     assert [list(Processes(rank, 3).share(items)) for rank in range(3)] == [[0, 3, 6], [1, 4], [2, 5]]
