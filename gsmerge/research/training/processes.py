@@ -63,7 +63,7 @@ ALONE = Processes()
 @contextmanager
 def join_processes(device: str) -> Iterator[Processes]:
     """Meet the other processes that ``torchrun`` has started, if it has, over gloo or, on ``"cuda"``, NCCL."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+    if not {"RANK", "WORLD_SIZE", "MASTER_ADDR"} <= os.environ.keys() or os.environ["WORLD_SIZE"] == "1":
         yield ALONE
         return
     if device == "cuda":
