@@ -60,6 +60,9 @@ ABLATION = (
     Condition("without the refiner", {**ONE, **PLAIN}, silent="refiner", learned=(True,)),
     Condition("without the merger", {**ONE, **PLAIN}, silent="merger", learned=(True,)),
     Condition("without both", {**ONE, **PLAIN}, silent="refiner,merger", learned=(True,)),
+    Condition("the encoder's latent zero", {**ONE, **PLAIN}, silent="latent", learned=(True,)),
+    Condition("all latents zero", {**ONE, **PLAIN}, silent="latents", learned=(True,)),
+    Condition("without the heads", {**ONE, **PLAIN}, silent="heads", learned=(True,)),
     Condition("no merging across views", {**ONE, **PLAIN, "match": "none"}),
     Condition("matching by the K = 1 head", {**ONE, **PLAIN, "geometry": "decoded"}, learned=(True,)),
     Condition("larger superpixels", {"budget": "2%", **PLAIN}),
@@ -92,8 +95,18 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
     """The checkpoint with the last layers of some networks at zero: they change nothing."""
     out = folder / f"without-{names.replace(',', '-')}.safetensors"
     networks = load_checkpoint(checkpoint).networks
+    latent, width = networks.encoder.latent, networks.options.latent
     for name in names.split(","):
-        for parameter in getattr(networks, name).out.parameters():
+        if name in ("latent", "latents"):
+            silence = [*latent.parameters()]
+            silence += [p[-width:] for part in (networks.merger, networks.refiner) for p in part.out.parameters()] * (
+                name == "latents"
+            )
+        elif name == "heads":
+            silence = [parameter for head in networks.heads.values() for parameter in head.out.parameters()]
+        else:
+            silence = [*getattr(networks, name).out.parameters()]
+        for parameter in silence:
             torch.nn.init.zeros_(parameter)
     save_checkpoint(out, networks, {})
     return out

@@ -44,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", help="train, eval, or names with commas between")
     parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
-    parser.add_argument("--paper", action="store_true", help="also the paper's moment matching")
+    parser.add_argument("--moment-matching", action="store_true", help="also the paper's moment matching")
     parser.add_argument("--ply", help="also a .ply of another tool; {scene} stands for the scene's name")
     parser.add_argument("--unmerged-fit", action="store_true", help="also the input after the same fit")
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, invisible pixels taken from the photo")
@@ -57,8 +57,10 @@ def main() -> None:
     for folder in scene_folders(args.scenes):
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_held_out(folder)
         row = {"scene": folder.name, "unmerged": score(scene.gaussians, targets, args.lpips)}
-        if args.paper:
-            row["paper"] = score(gsmerge.compact(scene, method="paper").gaussians, targets, args.lpips)
+        if args.moment_matching:
+            row["moment-matching"] = score(
+                gsmerge.compact(scene, method="moment-matching").gaussians, targets, args.lpips
+            )
         if args.ply:
             row["other"] = score(gsmerge.read_ply(args.ply.format(scene=folder.name)).gaussians, targets, args.lpips)
         start = time.perf_counter()
@@ -81,7 +83,7 @@ def main() -> None:
         row["stages"] = {k: round(v, 2) for k, v in report.seconds.items()}
         print(json.dumps({k: _short(v) for k, v in row.items()}), flush=True)
         rows.append(row)
-    names = ("unmerged", "unmerged, equal steps", "unmerged, equal time", "paper", "other", own_name)
+    names = ("unmerged", "unmerged, equal steps", "unmerged, equal time", "moment-matching", "other", own_name)
     for name in dict.fromkeys(names):
         if name in rows[0]:
             print(f"mean {name:21s} {np.mean([r[name] for r in rows], 0).round(3)}")

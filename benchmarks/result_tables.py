@@ -117,7 +117,7 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     ]  # fmt: skip
     head = ("method", "kept", "PSNR (dB)", *QUALITY[1:], "seconds", "ms a frame")
     figures = ("quality-seconds", "quality-ratio", "stages", "break-even")
-    words = "`unmerged-fit` is the input after the same fit with fast effort, `paper` the paper's moment matching."
+    words = "`unmerged-fit` is the input after the same fit with fast effort."
     return [_section("gsmerge and the baselines", "sizes", words, _table(head, rows), *figures)]
 
 
@@ -153,7 +153,11 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
             records = [r for r in parts.get("ablation", ()) if set(r.settings) <= {"k"}]
             records = [
                 *records,
-                *(r for r in parts.get("sizes", ()) if r.method == "paper" and r.settings.get("budget") == "4.4%"),
+                *(
+                    r
+                    for r in parts.get("sizes", ())
+                    if r.method == "moment-matching" and r.settings.get("budget") == "4.4%"
+                ),
             ]
         for some in _grouped(records, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
             label = (name, _words(some[0]), _share(some))

@@ -24,7 +24,7 @@ from gsmerge.cli import main as gsmerge
 from gsmerge.research.charts.record import CHARTS, RunRecord, read_runs
 
 ROOT = Path(__file__).parents[1]
-FAST_BASELINES = "random,opacity,contribution,blocks,voxel,paper"
+FAST_BASELINES = "random,opacity,contribution,blocks,voxel,moment-matching"
 NO_PROXIES = ("--proxy-views", "0")
 LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
 
@@ -66,7 +66,7 @@ PARTS = (
         ),
         ("quality-seconds", "quality-ratio", "stages", "proxy", "break-even"),
     ),
-    Part("views", "plain", (("--methods", "gsmerge,paper", *VIEWS),), ("quality-views", "count-views")),
+    Part("views", "plain", (("--methods", "gsmerge,moment-matching", *VIEWS),), ("quality-views", "count-views")),
     Part(
         "ablation",
         "plain",
@@ -82,7 +82,7 @@ PARTS = (
         ),
     ),
     *(
-        Part(style, style, (("--methods", "gsmerge,paper", "--k", "1,2,4", *NO_PROXIES),))
+        Part(style, style, (("--methods", "gsmerge,moment-matching", "--k", "1,2,4", *NO_PROXIES),))
         for style in ("da3", "depthsplat", "anysplat")
     ),
 )

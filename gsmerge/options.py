@@ -10,7 +10,7 @@ from gsmerge.budget import BudgetOptions, new_settings
 from gsmerge.stages.assign import ContributionOptions
 from gsmerge.stages.backing import BackingOptions
 from gsmerge.stages.choose_merge import RobustOptions, photos_choose
-from gsmerge.stages.decode import DecodeOptions
+from gsmerge.stages.decode import MIXED, DecodeOptions
 from gsmerge.stages.encode import EncodeOptions
 from gsmerge.stages.fit import FitOptions
 from gsmerge.stages.match import MatchOptions
@@ -18,11 +18,19 @@ from gsmerge.stages.region_tree import AllocateOptions
 from gsmerge.stages.segment import SegmentOptions
 
 METHODS = (
-    "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "paper", "voxel", "opacity", "contribution", "random",
-    "blocks", "greedy", "splat-transform",
+    "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "moment-matching", "voxel", "opacity", "contribution",
+    "random", "blocks", "greedy", "splat-transform",
 )  # fmt: skip
 
 CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
+# Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: BASS from
+# saliency seeds, networks whose outputs are absolute, matching by latents and boxes of the decoded geometry, no fit.
+RECIPES: Mapping[str, Mapping[str, Any]] = {
+    "paper": {
+        "segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "robust": False, "fit": "none",
+        "k_low": 100 / 3, "k_high": 200 / 3, "require_checkpoint": True,
+    },
+}  # fmt: skip
 AUTO_STEPS = 2  # times the usual ones
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 
@@ -47,6 +55,8 @@ class CompactOptions:
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
             come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
             analytic start shows the views better, see :meth:`networks`.
+        recipe: Name of settings that belong together, which :meth:`with_settings` sets: ``"paper"``, the paper's own
+            method, with networks of absolute outputs from the checkpoint; None: none.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         seed: Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
@@ -68,6 +78,7 @@ class CompactOptions:
     budget: BudgetOptions = field(default_factory=BudgetOptions)
     method: str = "gsmerge"
     checkpoint: str = "auto"
+    recipe: str | None = None
     require_checkpoint: bool = False
     seed: int = 0
     threads: int | None = None
@@ -75,6 +86,13 @@ class CompactOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
+        if self.recipe not in (None, *RECIPES):
+            raise ValueError(f"recipe: expected {', '.join(RECIPES)}, got {self.recipe!r}")
+        if self.recipe == "paper" and self.checkpoint in CHECKPOINTS:
+            raise ValueError(
+                f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"; gsmerge train'
+                " --preset paper makes one"
+            )
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":
@@ -123,10 +141,10 @@ class CompactOptions:
 
     @property
     def whole_only(self) -> list[str]:
-        """What is asked for that only a whole scene, compacted at once, can have: rivals, searches, levels."""
+        """What is asked for that only a whole scene, compacted at once, can have."""
         budget = self.budget
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
-        asked |= {f"quality {budget.quality}": budget.quality is not None}
+        asked |= {f"quality {budget.quality}": budget.quality is not None, "k mixed": self.decode.k == MIXED}
         return [name for name, wanted in asked.items() if wanted]
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,12 +158,14 @@ class CompactOptions:
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
         """The options with some settings changed, by flat name (``k=2, superpixels="1%"``).
 
-        A name that several stages share, such as ``effort``, is changed in all of them.
+        A name that several stages share, such as ``effort``, is changed in all of them. A recipe changes all that
+        belongs to it, but for what is set here besides.
 
         Raises:
             ValueError: If a name is unknown.
         """
         changes: dict[str, Any] = {}
+        settings = {**RECIPES.get(str(settings.get("recipe")), {}), **settings}
         for f in fields(self):
             value = getattr(self, f.name)
             if is_dataclass(value) and not isinstance(value, type):

@@ -24,13 +24,14 @@ from gsmerge.search import choose_count, level_counts, search_quality
 from gsmerge.stages.assign import assign_members
 from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
-from gsmerge.stages.decode import decode_merged
+from gsmerge.stages.decode import MIXED, decode_merged
 from gsmerge.stages.encode import encode
 from gsmerge.stages.fit import fit
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import PreparedScene, prepare
+from gsmerge.stages.segment import scene_saliency
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import scored_views
 
@@ -144,7 +145,8 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
             with log.stage("close"):
                 closed = close_holes(merged, robust, options.robust)
                 merged, choices = closed.features, choices | closed.choices
-        starts.append(MergedViews(merged, members, segmentation, networks, choices))
+        saliency = scene_saliency(prepared.pictures) if options.decode.k == MIXED else None
+        starts.append(MergedViews(merged, members, segmentation, networks, choices, saliency=saliency))
     start = starts[0]
     if len(starts) > 1:
         with log.stage("choose"):

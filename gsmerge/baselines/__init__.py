@@ -2,38 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
+from gsmerge.baselines import greedy, simple, splat_transform, voxel
 from gsmerge.baselines.baseline import Baseline
-from gsmerge.baselines.greedy import GREEDY
-from gsmerge.baselines.paper import PAPER
-from gsmerge.baselines.simple import (
-    BLOCKS,
-    CONTRIBUTION,
-    OPACITY,
-    RANDOM,
-    UNMERGED,
-    UNMERGED_COLOR,
-    UNMERGED_FIT,
-)
-from gsmerge.baselines.splat_transform import SPLAT_TRANSFORM, find_program
-from gsmerge.baselines.voxel import VOXEL
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions
+from gsmerge.stages.fit import FitOptions
 from gsmerge.types import PixelScene, UnalignedScene
 
+COLOR_FIT_SETTINGS = ("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout")
+FULL_FIT_SETTINGS = tuple(f.name for f in fields(FitOptions) if f.name != "fit")
 _ALL = (
-    UNMERGED, UNMERGED_COLOR, UNMERGED_FIT, PAPER, VOXEL, OPACITY, CONTRIBUTION, RANDOM, BLOCKS, GREEDY,
-    SPLAT_TRANSFORM,
-)  # fmt: skip
+    Baseline("unmerged", simple.unmerged, uses=()),
+    Baseline("unmerged-color", simple.unmerged_color, needs=("photos",), uses=COLOR_FIT_SETTINGS),
+    Baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS),
+    Baseline("moment-matching", simple.match_moments),
+    Baseline("voxel", voxel.run),
+    Baseline("opacity", simple.prune_by_opacity),
+    Baseline("contribution", simple.prune_by_contribution),
+    Baseline("random", simple.prune_at_random),
+    Baseline("blocks", simple.merge_blocks, needs=("pixels",)),
+    Baseline("greedy", greedy.run),
+    Baseline("splat-transform", splat_transform.run, needs=("node",)),
+)
 BASELINES = {baseline.name: baseline for baseline in _ALL}
 COMMON_SETTINGS = {"method", "seed", "threads"}  # that every method uses
 
 
 def find_baseline(name: str) -> Baseline | None:
-    """The baseline of that name; None for our own method, "gsmerge".
-
-    Raises:
-        ValueError: If there is none of that name.
-    """
+    """The baseline of that name, None for our own method, "gsmerge"; a ValueError if there is none of that name."""
     if name == "gsmerge":
         return None
     if name not in BASELINES:
@@ -44,8 +42,7 @@ def find_baseline(name: str) -> Baseline | None:
 def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene) -> tuple[Baseline | None, list[str]]:
     """The baseline of the options, fit for the scene, and a note on changed settings that it does not use.
 
-    Raises:
-        UsageError: If the scene does not have what it needs, or a program is missing.
+    A UsageError if the scene does not have what it needs, or a program is missing.
     """
     baseline = find_baseline(options.method)
     if baseline is None:
@@ -62,10 +59,6 @@ def choose_baseline(options: CompactOptions, scene: PixelScene | UnalignedScene)
 
 
 def check_program(baseline: Baseline) -> None:
-    """Refuse a method whose program is missing.
-
-    Raises:
-        UsageError: If it is.
-    """
+    """Raise a UsageError if a method's program is missing."""
     if "node" in baseline.needs:
-        find_program()
+        splat_transform.find_program()

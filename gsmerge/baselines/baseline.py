@@ -25,22 +25,15 @@ COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
 
 @dataclass(frozen=True)
 class Baseline:
-    """One other method.
+    """One other method."""
 
-    Args:
-        name: As on the command line.
-        title: What it does, in a few words.
-        run: Prepared scene, number of Gaussians, log -> canonical Gaussians, at most that many unless the method keeps
-            the input's. It times itself, by stages of the log.
-        needs: ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js.
-        uses: Settings that it uses, by flat name, besides those that all methods use.
-    """
-
-    name: str
-    title: str
+    name: str  # as on the command line
+    # prepared scene, number of Gaussians, log -> canonical Gaussians, at most that many unless the method keeps the
+    # input's. It times itself, by stages of the log.
     run: Run
+    # ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js
     needs: tuple[Need, ...] = ()
-    uses: tuple[str, ...] = COUNTS
+    uses: tuple[str, ...] = COUNTS  # settings that it uses, by flat name, besides those that all methods use
 
     def build(self, prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
         """Canonical Gaussians: ``count``, or None for as many as ``superpixels`` and K give."""
@@ -60,14 +53,9 @@ def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
 
 
 def most_important(importance: Tensor | np.ndarray, count: int) -> Tensor:
-    """Indices, rising, of the ``count`` most important Gaussians; of equal ones the first are kept.
+    """Indices, rising, of the ``count`` most important Gaussians, or all; of equal ones the first are kept.
 
-    Args:
-        importance: ``[n]``, for instance the summed blending weight over all photos.
-        count: How many to keep; all if there are fewer.
-
-    Raises:
-        ValueError: If ``count`` is negative.
+    ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
     """
     if count < 0:
         raise ValueError(f"count: expected at least 0, got {count}")

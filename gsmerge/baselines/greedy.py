@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.runtime.run_log import RunLog
@@ -37,21 +37,13 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """n Gaussians in the form that is merged.
+    """n Gaussians in the form that is merged."""
 
-    Args:
-        means: ``[n,3]``.
-        covars: ``[n,6]`` upper triangles: xx, xy, xz, yy, yz, zz.
-        logdets: ``[n]`` logarithms of their determinants.
-        masses: ``[n]`` opacity times area; what merging adds.
-        sh: ``[n,3k]`` harmonics.
-    """
-
-    means: Floats
-    covars: Floats
-    logdets: Floats
-    masses: Floats
-    sh: NDArray[np.float32]
+    means: Floats  # ``[n,3]``
+    covars: Floats  # ``[n,6]`` upper triangles: xx, xy, xz, yy, yz, zz
+    logdets: Floats  # ``[n]`` logarithms of their determinants
+    masses: Floats  # ``[n]`` opacity times area; what merging adds
+    sh: NDArray[np.float32]  # ``[n,3k]`` harmonics
 
     def __len__(self) -> int:
         return len(self.means)
@@ -139,19 +131,11 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 
 
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
-    """At most ``limit`` pairs without a common member, as taken one by one in the order of their costs.
+    """At most ``limit`` pairs without a common member, as taken one by one in the order of their costs ``[m]``.
 
     A pair that is the cheapest of both of its members is taken sooner or later, whatever comes before it; so all of
-    those are taken at once, and again among the rest. Of equal costs the first pair counts as cheaper.
-
-    Args:
-        left: ``[m]`` one member of each pair.
-        right: ``[m]`` the other.
-        costs: ``[m]``.
-        limit: The largest number of pairs.
-
-    Returns:
-        Indices of the pairs, by rising cost.
+    those are taken at once, and again among the rest. Of equal costs the first pair counts as cheaper. The result is
+    indices of pairs, by rising cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -204,6 +188,3 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         return gaussians
     with log.stage("reduce"):
         return gaussians_of(reduce_to(cloud_of(gaussians), count))
-
-
-GREEDY = Baseline("greedy", "pairwise greedy merging, as NanoGS", run)

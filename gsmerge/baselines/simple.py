@@ -1,23 +1,23 @@
-"""Baselines of a few lines: the input as it is or fitted, pruned, or merged over blocks of pixels."""
+"""Baselines of a few lines: the input as it is or fitted, pruned, or merged over blocks of pixels or superpixels."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from gsmerge.baselines.baseline import Baseline, merge_groups, most_important, own_gaussians, view_shares
+from gsmerge.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit import FitOptions, fit
 from gsmerge.stages.prepare import PreparedScene
-from gsmerge.stages.segment import grid_labels
+from gsmerge.stages.segment import grid_labels, superpixels
 from gsmerge.types import Cameras, Gaussians, Groups
 
+PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
 MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
 
 
@@ -32,7 +32,7 @@ def unmerged_color(prepared: PreparedScene, count: int, log: RunLog) -> Gaussian
 
 
 def unmerged_fit(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
-    """The full fit, with as many steps or as much time as ours; whatever the count.
+    """The full fit, with as many steps or as much time as ours: what merging has to beat; whatever the count.
 
     Gaussians that no photo shows are replaced by others, so the number stays.
     """
@@ -93,26 +93,20 @@ def merge_blocks(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     height, width = scene.cameras.height, scene.cameras.width
     with log.stage("segment"):
         counts = view_shares(count, len(scene), height * width)
-        labels: Tensor = torch.from_numpy(np.stack([grid_labels(height, width, own) for own in counts]))
+        labels = torch.from_numpy(np.stack([grid_labels(height, width, own) for own in counts]))
     return merge_groups(prepared, Groups(labels, tuple(counts)), log)
 
 
-UNMERGED = Baseline("unmerged", "the input as it is", unmerged, uses=())
-UNMERGED_COLOR = Baseline(
-    "unmerged-color",
-    "the input with colours solved on the photos",
-    unmerged_color,
-    needs=("photos",),
-    uses=("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout"),
-)
-UNMERGED_FIT = Baseline(  # what merging has to be better than
-    "unmerged-fit",
-    "the input after the same full fit",
-    unmerged_fit,
-    needs=("photos",),
-    uses=tuple(f.name for f in fields(FitOptions) if f.name != "fit"),
-)
-OPACITY = Baseline("opacity", "keep the most opaque", prune_by_opacity)
-CONTRIBUTION = Baseline("contribution", "keep those with the largest summed blending weight", prune_by_contribution)
-RANDOM = Baseline("random", "keep a random choice", prune_at_random)
-BLOCKS = Baseline("blocks", "uniform pixel blocks, our moment rule", merge_blocks, needs=("pixels",))
+def match_moments(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+    """The superpixel merging paper's moment matching: its baseline without a network ("Mom. Match.").
+
+    One Gaussian for each superpixel: opacity-weighted mean and the spread of the members' means (eq. teacher_mean,
+    teacher_cov). The paper states no opacity; the members' mean is taken. Superpixels are the paper's, as many as
+    Gaussians, the same number in every view; those that hold nothing are left out.
+    """
+    scene = prepared.scene
+    counts = view_shares(count, len(scene), scene.pixels_per_view)
+    with log.stage("segment"):
+        views = range(len(scene))
+        labels = parallel_map(lambda view: superpixels(prepared.pictures[view], counts[view], PAPER_SUPERPIXELS), views)
+    return merge_groups(prepared, Groups(torch.stack(labels), tuple(counts)), log, rule="paper")

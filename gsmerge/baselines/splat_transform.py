@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.io import read_ply, write_ply
 from gsmerge.runtime.run_log import RunLog
@@ -25,28 +25,18 @@ MAX_OUTPUT = 300  # characters of the program's own output in an error
 
 
 def find_program() -> str:
-    """Path of the program.
-
-    Raises:
-        UsageError: If there is none.
-    """
+    """Path of the program; a UsageError if there is none."""
     named = os.environ.get(VARIABLE)
     program = shutil.which(named or PROGRAM)
     if program is None:
         place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
-        raise UsageError(
-            f"method splat-transform: expected the program {place}, found none; install it with: {INSTALL}"
-        )
+        problem = f"expected the program {place}, found none; install it with: {INSTALL}"
+        raise UsageError(f"method splat-transform: {problem}")
     return program
 
 
 def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
-    """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that.
-
-    Raises:
-        UsageError: If the program is not installed.
-        GsmergeError: If it fails.
-    """
+    """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that."""
     gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:
         return gaussians
@@ -57,14 +47,7 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         with log.stage("reduce"):
             done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
         if done.returncode != 0 or not after.exists():
-            raise GsmergeError(_failure(program, done))
+            output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
+            problem = f"expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
+            raise GsmergeError(f"{program}: {problem}")
         return read_ply(after, opacity="logit").gaussians
-
-
-def _failure(program: str, done: subprocess.CompletedProcess[bytes]) -> str:
-    """One line: the exit code and the end of the program's output."""
-    output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
-    return f"{program}: expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
-
-
-SPLAT_TRANSFORM = Baseline("splat-transform", "PlayCanvas' splat-transform, if installed", run, needs=("node",))

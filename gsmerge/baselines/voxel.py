@@ -12,7 +12,7 @@ import math
 import numpy as np
 import torch
 
-from gsmerge.baselines.baseline import Baseline, own_gaussians
+from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
@@ -85,6 +85,3 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         size = voxel_size(means, count)
         log.choices["voxel_size"] = size
         return fuse(gaussians, voxel_keys(means, size))
-
-
-VOXEL = Baseline("voxel", "one Gaussian per voxel, AnySplat's rule", run)

@@ -22,21 +22,13 @@ SCENE_PARTS = {Path(place).parts[0] for place in PLY_PLACES} | {"point_cloud", *
 
 @dataclass(frozen=True)
 class Job:
-    """One scene of a batch.
+    """One scene of a batch."""
 
-    Args:
-        index: Its place in the list.
-        scene: A ``.ply``, or the folder of one.
-        output: Name of the result in the output folder.
-        num_gaussians: By the header of its file; 0 where it cannot be read.
-        num_rest: Columns of higher harmonics, likewise.
-    """
-
-    index: int
-    scene: str
-    output: str
-    num_gaussians: int
-    num_rest: int = 0
+    index: int  # its place in the list
+    scene: str  # a ``.ply``, or the folder of one
+    output: str  # name of the result in the output folder
+    num_gaussians: int  # by the header of its file; 0 where it cannot be read
+    num_rest: int = 0  # columns of higher harmonics, likewise
 
     @property
     def memory(self) -> int:
@@ -45,17 +37,11 @@ class Job:
 
 
 def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Collection[str] = ()) -> list[Job]:
-    """All scenes, each once, and where their results go.
+    """All scenes, each once, and where their results go in the output folder.
 
-    Args:
-        given: Folders, which are searched; patterns; ``.ply`` files; text files with one of these per line.
-        out: The output folder, which is not searched.
-        options: For the names of the results.
-        own: Real paths of results of former runs, which are no scenes.
-
-    Raises:
-        SceneError: If something in ``given`` does not exist or holds no scene.
-        UsageError: If two scenes would be written to one file, or one over another.
+    ``given`` are folders, which are searched, except for ``out``; patterns; ``.ply`` files; text files with one of
+    these per line. ``own`` has the real paths of results of former runs, which are no scenes. A SceneError if something
+    does not exist or holds no scene, a UsageError if two scenes would be written to one file, or one over another.
     """
     jobs: list[Job] = []
     owners: dict[str, str] = {}
@@ -67,7 +53,7 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
             continue
         inputs.add(real)
         job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
-        for name in (job.output, *further_outputs(job.output, options.settings.budget.levels)):
+        for name in result_names(job.output, options):
             if name in owners:
                 raise UsageError(
                     f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
@@ -81,9 +67,9 @@ def find_jobs(given: Sequence[str], out: Path, options: BatchOptions, own: Colle
     return jobs
 
 
-def further_outputs(output: str, levels: int) -> list[str]:
-    """Names of the further levels of detail of a result."""
-    return [str(level_output(Path(output), level)) for level in range(1, levels)]
+def result_names(output: str, options: BatchOptions) -> list[str]:
+    """Names of a result and of its further levels of detail."""
+    return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
 
 
 def _ply_of(scene: Path) -> Path:
@@ -108,9 +94,7 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
 def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
     """The scenes of the arguments, in their order and sorted within each; some may come twice.
 
-    Raises:
-        SceneError: If an argument does not exist or holds no scene.
-        UsageError: If the output folder is searched for scenes.
+    A SceneError if an argument does not exist or holds no scene, a UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in given:

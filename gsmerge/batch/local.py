@@ -22,11 +22,7 @@ LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Worker:
-    """A process and its scene.
-
-    Args:
-        context: What all tasks share.
-    """
+    """A process and its scene."""
 
     def __init__(self, context: BatchContext) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -58,12 +54,7 @@ class Worker:
 
 
 class LocalPool:
-    """Up to ``jobs`` processes.
-
-    Args:
-        context: What all tasks share.
-        jobs: Processes at once.
-    """
+    """Up to ``jobs`` processes."""
 
     def __init__(self, context: BatchContext, jobs: int) -> None:
         self.context, self.jobs, self.workers = context, jobs, list[Worker]()
@@ -107,18 +98,15 @@ class LocalPool:
                 if message != STARTED:
                     return message
                 worker.since = time.monotonic()
+            is_lost = not worker.process.is_alive() and not worker.pipe.poll()
         except (EOFError, OSError):
             worker.process.join(10)
-            return self._lost(worker, _describe_exit(worker.process))
-        if not worker.process.is_alive() and not worker.pipe.poll():
-            return self._lost(worker, _describe_exit(worker.process))
+            is_lost = True
         limit = self.context.options.timeout
-        if limit is not None and worker.since is not None and time.monotonic() > worker.since + limit:
-            return self._lost(worker, f"took longer than {limit:g} s (--timeout)")
-        return None
-
-    def _lost(self, worker: Worker, reason: str) -> dict[str, Any]:
-        assert worker.task is not None
+        is_late = limit is not None and worker.since is not None and time.monotonic() > worker.since + limit
+        if worker.task is None or not (is_lost or is_late):
+            return None
+        reason = _describe_exit(worker.process) if is_lost else f"took longer than {limit:g} s (--timeout)"
         return record(LOST, worker.task.job.scene, worker.task.job.output, error=reason)
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.errors import SceneError, UsageError
@@ -32,17 +33,13 @@ class BusyError(Exception):
     """Another process holds the lock."""
 
 
+@dataclass(frozen=True)
 class Lock:
-    """A lock that this process holds.
+    """A lock that this process holds."""
 
-    Args:
-        path: Its file.
-        abandoned: Whether a process was killed while it held it.
-        fresh: Whether there was no result before the first process that held it.
-    """
-
-    def __init__(self, path: Path, *, abandoned: bool, fresh: bool) -> None:
-        self.path, self.abandoned, self.fresh = path, abandoned, fresh
+    path: Path  # its file
+    abandoned: bool  # whether a process was killed while it held it
+    fresh: bool  # whether there was no result before the first process that held it
 
     def finish(self) -> None:
         """Remove the file: nothing is left unfinished."""
@@ -55,13 +52,8 @@ class Lock:
 def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
     """A block in which no other process works on a result; the lock's file stays unless :meth:`Lock.finish` is called.
 
-    Args:
-        folder: The output folder.
-        outputs: Names of the result and of its further levels.
-
-    Raises:
-        BusyError: If another process works on it.
-        SceneError: If the file cannot be made.
+    ``outputs`` are names of the result and of its further levels. A BusyError if another process works on it, a
+    SceneError if the file cannot be made.
     """
     path = folder / LOCKS / f"{hashlib.sha256(outputs[0].encode(errors='surrogateescape')).hexdigest()[:32]}.lock"
     descriptor, abandoned = _acquire(path)
@@ -70,7 +62,7 @@ def scene_lock(folder: Path, outputs: Sequence[str]) -> Iterator[Lock]:
         if abandoned:
             fresh = _read(descriptor).get("fresh") is True
         _write(descriptor, outputs[0], fresh=fresh)
-        yield Lock(path, abandoned=abandoned, fresh=fresh)
+        yield Lock(path, abandoned, fresh)
     finally:
         os.close(descriptor)
 
@@ -96,18 +88,12 @@ def _open(path: Path) -> int:
         except OSError as error:
             if isinstance(error, FileNotFoundError) and path.parent.parent.is_dir():
                 continue  # another run ended and removed the folder of locks
-            raise SceneError(
-                path, f"cannot be written ({error.strerror})", "name another folder with --output"
-            ) from error
+            problem = f"cannot be written ({error.strerror})"
+            raise SceneError(path, problem, "name another folder with --output") from error
 
 
 def _lock(descriptor: int, path: Path, *, shared: bool) -> bool:
-    """Take the lock.
-
-    Raises:
-        BusyError: If another process holds it.
-        SceneError: If the file system knows no locks.
-    """
+    """Take the lock: a BusyError if another process holds it, a SceneError if the file system knows no locks."""
     if fcntl is None:
         raise SceneError(path, "expected a system with file locks, found none", "run batches on Linux or macOS")
     try:
@@ -143,15 +129,9 @@ def _read(descriptor: int) -> dict[str, object]:
 
 @contextmanager
 def run_lock(folder: Path, name: str) -> Iterator[None]:
-    """A block of a run, which shares the folder only with runs of the same name.
+    """A block of a run, which shares the folder only with runs of the same name, see :meth:`BatchOptions.name`.
 
-    Args:
-        folder: The output folder.
-        name: See :meth:`gsmerge.batch.options.BatchOptions.name`.
-
-    Raises:
-        UsageError: If a run of another name uses the folder.
-        SceneError: If the file cannot be made.
+    A UsageError if a run of another name uses the folder, a SceneError if the file cannot be made.
     """
     path = folder / LOCKS / f"{RUN}.lock"
     deadline = time.monotonic() + LOCK_TIMEOUT
@@ -178,13 +158,11 @@ def _join_run(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
         _write(descriptor, name)
     except BusyError:
         descriptor = _open(path)
-    try:
+    with suppress(BusyError):
         _lock(descriptor, path, shared=True)  # between the two locks another run may have had it
         holder = _read(descriptor)
         if _is_same_file(descriptor, path) and {"what", "pid", "host"} <= holder.keys():
             return descriptor, holder
-    except BusyError:
-        pass
     os.close(descriptor)
     return None
 
@@ -192,10 +170,9 @@ def _join_run(path: Path, name: str) -> tuple[int, dict[str, object]] | None:
 def _leave(descriptor: int, path: Path) -> None:
     """Unlock; the last run removes the lock's file, and the folder of locks if no scene was left unfinished."""
     try:
-        _lock(descriptor, path, shared=False)
-        path.unlink(missing_ok=True)
-        path.parent.rmdir()
-    except (BusyError, OSError, SceneError):
-        pass  # other runs use the folder, or unfinished scenes are left in it
+        with suppress(BusyError, OSError, SceneError):  # other runs use the folder, or unfinished scenes are left in it
+            _lock(descriptor, path, shared=False)
+            path.unlink(missing_ok=True)
+            path.parent.rmdir()
     finally:
         os.close(descriptor)

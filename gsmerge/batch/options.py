@@ -17,64 +17,44 @@ ENGINES = ("local", "ray")
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Settings of :func:`gsmerge.batch.run_batch`.
+    """Settings of :func:`gsmerge.batch.run_batch`; a ValueError if one is out of range."""
 
-    Args:
-        settings: Of every scene. ``threads``: those of one scene; None: processors by jobs.
-        opacity: How all files store opacity.
-        hints: What is known of all files and need not be recognised.
-        cameras: Cameras of a scene: one path for all, or with ``{scene}``, ``{parent}`` and ``{stem}`` in it; None:
-            next to each scene.
-        images: The same for the folder of photos.
-        output: Name of a result in the output folder, made of ``{stem}`` (the scene's name), ``{parent}`` (name of
-            the folder it is in), ``{index}`` (its place in the list, from 0) and ``{k}``; its ending says the format.
-        jobs: Scenes at once; None: as many as processors and memory allow.
-        max_memory: Bytes that they may take together; None: what is free. Ray knows the memory of its nodes.
-        timeout: Seconds that a scene may take; None: any.
-        retries: How often a scene is tried again if its process died or took too long.
-        rerun: Compact scenes again that are done.
-        overwrite: Replace files in the output folder that no batch wrote.
-        engine: ``"local"``: processes on this machine; ``"ray"``: a Ray cluster.
-        address: Of the Ray cluster; None: one of this machine alone, started for the run.
-
-    Raises:
-        ValueError: If a setting is out of range.
-    """
-
-    settings: CompactOptions = field(default_factory=CompactOptions)
-    opacity: OpacityChoice = "auto"
-    hints: ReadHints = AUTO
+    settings: CompactOptions = field(default_factory=CompactOptions)  # of a scene; no threads: processors by jobs
+    opacity: OpacityChoice = "auto"  # how all files store opacity
+    hints: ReadHints = AUTO  # what is known of all files and need not be recognised
+    # Cameras, and folder of photos, of a scene: one path for all, or with ``{scene}``, ``{parent}`` and ``{stem}`` in
+    # it; None: next to each scene.
     cameras: str | None = None
     images: str | None = None
+    # Name of a result in the output folder, made of ``{stem}`` (the scene's name), ``{parent}`` (name of the folder it
+    # is in), ``{index}`` (its place in the list, from 0) and ``{k}``; its ending says the format.
     output: str = "{stem}.ply"
-    jobs: int | None = None
-    max_memory: int | None = None
-    timeout: float | None = None
-    retries: int = 1
-    rerun: bool = False
-    overwrite: bool = False
-    engine: str = "local"
-    address: str | None = None
+    jobs: int | None = None  # scenes at once; None: as many as processors and memory allow
+    max_memory: int | None = None  # bytes that they may take together; None: what is free, on the nodes of Ray always
+    timeout: float | None = None  # seconds that a scene may take; None: any
+    retries: int = 1  # how often a scene is tried again if its process died or took too long
+    rerun: bool = False  # compact scenes again that are done
+    overwrite: bool = False  # replace files in the output folder that no batch wrote
+    engine: str = "local"  # "local": processes on this machine; "ray": a Ray cluster
+    address: str | None = None  # of the Ray cluster; None: one of this machine alone, started for the run
 
     def __post_init__(self) -> None:
         check_template(self.output)
         budget = self.settings.budget
         if budget.in_bytes and output_format(self.output) != ".ply":
             raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
-        if self.jobs is not None and self.jobs < 1:
-            raise ValueError(f"jobs: expected at least 1, got {self.jobs}")
-        if self.max_memory is not None and self.max_memory < 1:
-            raise ValueError(f"max memory: expected at least 1 byte, got {self.max_memory}")
-        if self.timeout is not None and not self.timeout > 0:
-            raise ValueError(f"timeout: expected more than 0 s, got {self.timeout}")
-        if self.retries < 0:
-            raise ValueError(f"retries: expected at least 0, got {self.retries}")
-        if self.engine not in ENGINES:
-            raise ValueError(f"engine: expected one of {', '.join(ENGINES)}, got {self.engine!r}")
-        if self.address is not None and self.engine != "ray":
-            raise ValueError(f"address: expected engine ray, got {self.engine}")
-        if self.max_memory is not None and self.engine == "ray":
-            raise ValueError("max memory: expected engine local; Ray knows the memory of its nodes")
+        is_ray, memory = self.engine == "ray", self.max_memory
+        for is_possible, problem in (
+            (self.jobs is None or self.jobs >= 1, f"jobs: expected at least 1, got {self.jobs}"),
+            (memory is None or memory >= 1, f"max memory: expected at least 1 byte, got {memory}"),
+            (self.timeout is None or self.timeout > 0, f"timeout: expected more than 0 s, got {self.timeout}"),
+            (self.retries >= 0, f"retries: expected at least 0, got {self.retries}"),
+            (self.engine in ENGINES, f"engine: expected one of {', '.join(ENGINES)}, got {self.engine!r}"),
+            (self.address is None or is_ray, f"address: expected engine ray, got {self.engine}"),
+            (memory is None or not is_ray, "max memory: expected engine local; Ray knows the memory of its nodes"),
+        ):
+            if not is_possible:
+                raise ValueError(problem)
 
     def result_settings(self) -> dict[str, Any]:
         """Everything that a result depends on besides the scene's files, as plain values."""
@@ -88,11 +68,9 @@ class BatchOptions:
 
 
 def check_template(template: str) -> None:
-    """Refuse a template that gives no valid names for results.
+    """A ValueError if a template gives no valid names for results.
 
-    Raises:
-        ValueError: If it holds another field than those in ``FIELDS``, does not end as one of the formats that
-            can be written, or leaves the folder.
+    It may hold the fields in ``FIELDS``, ends as one of the formats that can be written, and stays in the folder.
     """
     try:
         names = [name for _, name, _, _ in Formatter().parse(template) if name is not None]

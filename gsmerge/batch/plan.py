@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from heapq import nlargest
 from itertools import accumulate
@@ -14,8 +14,8 @@ from gsmerge.batch.options import BatchOptions
 from gsmerge.errors import SceneError
 from gsmerge.io import find_scene_files
 from gsmerge.io.content_hash import cameras_of
-from gsmerge.report import human_bytes
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
+from gsmerge.runtime.memory import human_bytes, machine_memory
 from gsmerge.runtime.threads import available_threads
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
@@ -23,28 +23,18 @@ FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 
 @dataclass(frozen=True)
 class Schedule:
-    """How many scenes are compacted at once.
+    """How many scenes are compacted at once."""
 
-    Args:
-        jobs: Scenes at once; 0: as many as the cluster has processors for.
-        threads: Of each.
-        memory: Bytes that the largest of them may take together.
-        notes: Where it differs from the options.
-    """
-
-    jobs: int
-    threads: int
-    memory: int
-    notes: tuple[str, ...] = ()
+    jobs: int  # scenes at once; 0: as many as the cluster has processors for
+    threads: int  # of each
+    memory: int  # bytes that the largest of them may take together
+    notes: tuple[str, ...] = ()  # where it differs from the options
 
 
 def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int | None = None) -> Schedule:
     """Distribute scenes over processors: one thread each where there are enough scenes and memory allows.
 
-    Args:
-        jobs: All scenes, of which the largest may come together.
-        options: Of the batch.
-        processors: To use; None: all.
+    Memory must do for the largest scenes, which may come together; ``processors`` are all without a number.
     """
     processors = available_threads() if processors is None else processors
     threads = options.settings.threads
@@ -65,16 +55,11 @@ def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int
 
 def free_memory() -> int | None:
     """Bytes that a run may take by default: most of the free memory; None where the system does not report it."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            values = dict(line.split(":", 1) for line in file)
+    with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
+        values = dict(line.split(":", 1) for line in file)
         return int(FREE_MEMORY_SHARE * int(values["MemAvailable"].split()[0]) * 1024)
-    except (OSError, KeyError, ValueError):
-        pass
-    try:
-        return int(FREE_MEMORY_SHARE * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, OSError, ValueError):
-        return None
+    machine = machine_memory()
+    return None if machine is None else int(FREE_MEMORY_SHARE * machine)
 
 
 def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Schedule) -> float:

@@ -32,11 +32,7 @@ CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
 
 
 def require_ray() -> ModuleType:
-    """The module of Ray.
-
-    Raises:
-        UsageError: If it is not installed.
-    """
+    """The module of Ray; a UsageError if it is not installed."""
     try:
         import ray
     except ImportError as error:
@@ -45,15 +41,9 @@ def require_ray() -> ModuleType:
 
 
 class RayPool:
-    """Scenes as tasks of a Ray cluster.
+    """Scenes as tasks of a Ray cluster: ``jobs`` at once; 0: as many as it has processors for.
 
-    Args:
-        context: What all tasks share.
-        jobs: Scenes at once; 0: as many as the cluster has processors for.
-
-    Raises:
-        UsageError: If Ray is not installed.
-        SceneError: If there is no cluster at the address.
+    A UsageError if Ray is not installed, a SceneError if there is no cluster at the address.
     """
 
     def __init__(self, context: BatchContext, jobs: int) -> None:
@@ -128,18 +118,12 @@ def _join(ray: ModuleType, options: BatchOptions) -> None:
         _check_connection(options.address)
         ray.init(address=options.address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise SceneError(
-            options.address, f"no Ray cluster answers there ({reason})", "start one with ray start --head"
-        ) from error
+        problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"
+        raise SceneError(options.address, problem, "start one with ray start --head") from error
 
 
 def _check_connection(address: str) -> None:
-    """Check that something listens at the address; Ray itself would wait for minutes.
-
-    Raises:
-        OSError: If nothing does.
-    """
+    """An OSError if nothing listens at the address; Ray itself would wait for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT).close()

@@ -21,17 +21,11 @@ BUSY, LOST, STUCK = "busy", "lost", "stuck"
 
 @dataclass(frozen=True)
 class DoneResult:
-    """A result that is done.
+    """A result that is done."""
 
-    Args:
-        key: Of the scene's content, the settings and the version.
-        files: Name in the output folder and SHA-256 of each file.
-        failed_since: Whether the scene failed when it was compacted again.
-    """
-
-    key: str
-    files: tuple[tuple[str, str], ...]
-    failed_since: bool = False
+    key: str  # of the scene's content, the settings and the version
+    files: tuple[tuple[str, str], ...]  # name in the output folder and SHA-256 of each file
+    failed_since: bool = False  # whether the scene failed when it was compacted again
 
     def holds(self, folder: Path, key: str) -> bool:
         """Whether it was made from the same content and settings, and every file is unchanged since."""
@@ -43,19 +37,12 @@ class DoneResult:
 
 @dataclass
 class RecordIndex:
-    """The results in a folder, updated by reading the lines that any process has added.
+    """The results in a folder, updated by reading the lines that any process has added."""
 
-    Args:
-        folder: The output folder.
-        end: Byte up to which its records are read.
-        known: What is done, by name of the result.
-        damaged: Lines that could not be read.
-    """
-
-    folder: Path
-    end: int = 0
-    known: dict[str, DoneResult] = field(default_factory=dict)
-    damaged: int = 0
+    folder: Path  # the output folder
+    end: int = 0  # byte up to which its records are read
+    known: dict[str, DoneResult] = field(default_factory=dict)  # what is done, by name of the result
+    damaged: int = 0  # lines that could not be read
 
     def read_on(self) -> None:
         """Read the lines that were added since."""
@@ -109,16 +96,11 @@ def each_record(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def check_folder(folder: Path) -> None:
-    """Make the output folder, and check that records can be written to it.
-
-    Raises:
-        SceneError: If they cannot.
-    """
+    """Make the output folder, and raise a SceneError if records cannot be written to it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / RECORDS).open("ab"):
             pass
     except OSError as error:
-        raise SceneError(
-            folder, f"cannot be written ({error.strerror})", "name another folder with --output"
-        ) from error
+        problem = f"cannot be written ({error.strerror})"
+        raise SceneError(folder, problem, "name another folder with --output") from error

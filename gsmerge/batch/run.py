@@ -16,7 +16,7 @@ from gsmerge.batch.locks import run_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.plan import Schedule, make_schedule
 from gsmerge.batch.records import BUSY, LOST, RECORDS, STUCK, RecordIndex, check_folder
-from gsmerge.batch.task import BatchContext, Task, record_failure, with_threads
+from gsmerge.batch.task import BatchContext, Task, record_failure
 from gsmerge.errors import SceneError
 
 POLL_SECONDS = 0.5  # between two queries of the pool
@@ -50,18 +50,9 @@ def run_batch(
 ) -> Generator[dict[str, Any], None, None]:
     """Compact scenes, each on its own; those that are done are skipped.
 
-    Each is recorded in ``folder/batch.jsonl`` before it is yielded, so that a run that ends at any moment can be
-    continued. Runs with the same settings may share a folder: each scene is compacted by one of them.
-
-    Args:
-        jobs: See :func:`find_jobs`.
-        folder: For the results; made where it does not exist.
-        options: Of the batch.
-        index: The folder's records, if they are read already.
-        schedule: Of :func:`make_schedule`, if it is made already.
-
-    Yields:
-        One record for each scene as it ends, in any order: ``status`` done, failed or skipped.
+    Each is recorded in ``folder/batch.jsonl`` before its record is yielded, in any order, so that a run that ends at
+    any moment can be continued. Runs with the same settings may share a folder: each scene is compacted by one of them.
+    ``index``, the folder's records, and ``schedule`` are made if they are not given.
 
     Raises:
         SceneError: If the folder cannot be written.
@@ -81,7 +72,7 @@ def run_batch(
 
 def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -> tuple[Pool, BatchContext]:
     """Where the scenes are compacted, and what they share."""
-    options = with_threads(options, schedule.threads)
+    options = replace(options, settings=replace(options.settings, threads=schedule.threads))
     if options.engine == "ray":
         from gsmerge.batch.ray_engine import RayPool, with_whole_paths
 
@@ -92,11 +83,7 @@ def _pool(folder: Path, options: BatchOptions, schedule: Schedule, start: int) -
 
 
 def dispatch(tasks: Iterator[Task], pool: Pool, context: BatchContext) -> Iterator[dict[str, Any]]:
-    """Keep a pool busy until every scene has ended; see :func:`run_batch`.
-
-    Raises:
-        SceneError: If nothing can be recorded any more.
-    """
+    """Keep a pool busy until every scene has ended; a SceneError if nothing can be recorded any more."""
     retried: deque[Task] = deque()  # their process died
     busy: deque[tuple[float, Task]] = deque()  # another run works on them; when to try again, and the task
     active = 0

@@ -25,29 +25,17 @@ MAX_LISTED = 20  # scenes in the table, and failures below it
 
 @dataclass
 class Totals:
-    """A run so far, in a size that does not grow with the number of scenes.
+    """A run so far, in a size that does not grow with the number of scenes."""
 
-    Args:
-        total: Scenes.
-        counts: Of them by status.
-        num_input: Gaussians in the scenes that were done.
-        num_output: Gaussians in their results.
-        bytes_input: Bytes of the same.
-        bytes_output: Bytes of the same.
-        unmet: Results that miss their target.
-        rows: The first ones done, as in the CSV file.
-        failures: The first scenes that failed, and why.
-    """
-
-    total: int
-    counts: dict[str, int] = field(default_factory=lambda: {DONE: 0, SKIPPED: 0, FAILED: 0})
-    num_input: int = 0
-    num_output: int = 0
-    bytes_input: int = 0
-    bytes_output: int = 0
-    unmet: int = 0
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    failures: list[tuple[str, str]] = field(default_factory=list)
+    total: int  # scenes
+    counts: dict[str, int] = field(default_factory=lambda: {DONE: 0, SKIPPED: 0, FAILED: 0})  # of them by status
+    num_input: int = 0  # Gaussians in the scenes that were done
+    num_output: int = 0  # Gaussians in their results
+    bytes_input: int = 0  # bytes of the same
+    bytes_output: int = 0  # bytes of the same
+    unmet: int = 0  # results that miss their target
+    rows: list[dict[str, Any]] = field(default_factory=list)  # the first ones done, as in the CSV file
+    failures: list[tuple[str, str]] = field(default_factory=list)  # the first scenes that failed, and why
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count a scene."""
@@ -95,8 +83,7 @@ def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
 def write_summary(folder: Path) -> Path:
     """Write the newest state of every scene in the folder, after other runs that are writing it.
 
-    Raises:
-        SceneError: If the file cannot be written.
+    A SceneError if the file cannot be written.
     """
     path = folder / SUMMARY
     deadline = time.monotonic() + LOCK_TIMEOUT
@@ -163,13 +150,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for row in sorted(rows, key=lambda row: str(row["output"])):
         quality = ["" if row[name] is None else f"{row[name]:.2f}" for name in ("psnr_before", "psnr_after")]
         share = f"{100 * row['ratio']:.2f} %"
-        cells.append(
-            (row["output"], f"{row['num_output']:,}", f"{row['num_input']:,}", share, *quality, f"{row['seconds']:.1f}")
-        )
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    return [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in cells
-    ]
+        counts = f"{row['num_output']:,}", f"{row['num_input']:,}"
+        cells.append((row["output"], *counts, share, *quality, f"{row['seconds']:.1f}"))
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]

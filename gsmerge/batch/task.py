@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gsmerge import __version__
-from gsmerge.batch.find import Job, further_outputs
+from gsmerge.batch.find import Job, result_names
 from gsmerge.batch.locks import BusyError, Lock, scene_lock
 from gsmerge.batch.options import BatchOptions
 from gsmerge.batch.records import (
@@ -36,59 +38,50 @@ from gsmerge.runtime.jsonl import append_line
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to be compacted.
+    """A scene to be compacted."""
 
-    Args:
-        job: The scene.
-        known: Its result of former runs; None without one.
-        attempt: From 1.
-    """
-
-    job: Job
-    known: DoneResult | None
-    attempt: int = 1
+    job: Job  # the scene
+    known: DoneResult | None  # its result of former runs; None without one
+    attempt: int = 1  # from 1
 
 
 @dataclass(frozen=True)
 class BatchContext:
-    """What all tasks of a run share.
+    """What all tasks of a run share."""
 
-    Args:
-        folder: The output folder.
-        options: Of the run, with the threads of a scene.
-        start: Byte of the records up to which ``Task.known`` was read.
-    """
-
-    folder: Path
-    options: BatchOptions
-    start: int
+    folder: Path  # the output folder
+    options: BatchOptions  # of the run, with the threads of a scene
+    start: int  # byte of the records up to which ``Task.known`` was read
 
 
 def run_task(task: Task, context: BatchContext, new_records: RecordIndex) -> dict[str, Any]:
-    """Compact a scene, unless it is done.
+    """Compact a scene, unless it is done, and return its record.
 
-    Args:
-        task: The scene.
-        context: What all tasks share.
-        new_records: Records since the run began, shared by the tasks of a process.
-
-    Returns:
-        Its record; one that is not written has the ``status`` skipped, busy (another process has the scene), or
-        stuck (records cannot be written).
+    One that is not written has the ``status`` skipped, busy (another process has the scene), or stuck (records cannot
+    be written). ``new_records``, since the run began, are shared by the tasks of a process.
     """
     job = task.job
+
+    def work(lock: Lock) -> dict[str, Any]:
+        try:
+            new_records.read_on()
+            outcome = _process(task, context, new_records, lock)
+        except Exception as error:  # a bad scene must not end the batch
+            outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
+        known = new_records.known.get(job.output, task.known)
+        if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
+            append_line(context.folder / RECORDS, outcome)
+        lock.finish()
+        return outcome
+
+    return _locked(job, context, work)
+
+
+def _locked(job: Job, context: BatchContext, work: Callable[[Lock], dict[str, Any]]) -> dict[str, Any]:
+    """What ``work`` returns under the scene's lock, or that another process has it, or that nothing can be written."""
     try:
-        with scene_lock(context.folder, _output_names(job, context.options)) as lock:
-            try:
-                new_records.read_on()
-                outcome = _process(task, context, new_records, lock)
-            except Exception as error:  # a bad scene must not end the batch
-                outcome = record(FAILED, job.scene, job.output, error=error_line(error), attempt=task.attempt)
-            known = new_records.known.get(job.output, task.known)
-            if outcome["status"] != SKIPPED or (known is not None and known.failed_since):
-                append_line(context.folder / RECORDS, outcome)
-            lock.finish()
-            return outcome
+        with scene_lock(context.folder, result_names(job.output, context.options)) as lock:
+            return work(lock)
     except BusyError:
         return record(BUSY, job.scene, job.output)
     except SceneError as error:  # locks or records cannot be written, whatever the scene
@@ -105,9 +98,11 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, lock: 
     before, since = task.known, new_records.known.get(job.output)
     for known in (since, None if options.rerun else before):
         if known is not None and known.holds(context.folder, key):
-            return record(SKIPPED, job.scene, job.output, key=key, files=_as_written(context.folder, known))
+            sizes = {name: (context.folder / name).stat().st_size for name, _ in known.files}
+            written = [{"path": name, "sha256": sha256, "bytes": sizes[name]} for name, sha256 in known.files]
+            return record(SKIPPED, job.scene, job.output, key=key, files=written)
     own = {name for known in (before, since) if known is not None for name, _ in known.files}
-    for name in _output_names(job, options):
+    for name in result_names(job.output, options):
         if os.path.lexists(context.folder / name) and name not in own and not (lock.fresh or options.overwrite):
             problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
             raise UsageError(f"{context.folder / name}: {problem}")
@@ -127,15 +122,6 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
     names = [job.output, *(os.path.relpath(level["path"], context.folder) for level in document["levels"])]
     facts = {"key": key, "files": written_files(context.folder, names), "report": finite(document)}
     return record(DONE, job.scene, job.output, attempt=task.attempt, **facts)
-
-
-def _output_names(job: Job, options: BatchOptions) -> list[str]:
-    """Names of the result and of its further levels."""
-    return [job.output, *further_outputs(job.output, options.settings.budget.levels)]
-
-
-def _as_written(folder: Path, known: DoneResult) -> list[dict[str, Any]]:
-    return [{"path": name, "sha256": sha, "bytes": (folder / name).stat().st_size} for name, sha in known.files]
 
 
 def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
@@ -162,35 +148,30 @@ def is_done(job: Job, known: DoneResult, context: BatchContext) -> bool:
 
 def _clean(job: Job, context: BatchContext) -> None:
     """Remove what a killed process left next to a result and its further levels."""
-    for path in (context.folder / name for name in _output_names(job, context.options)):
-        if path.parent.is_dir():
-            remove_leftovers(path)
+    for name in result_names(job.output, context.options):
+        if (context.folder / name).parent.is_dir():
+            remove_leftovers(context.folder / name)
 
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
     """The record of a scene whose process died or took too long, after all retries."""
-    job = task.job
-    failed = record(FAILED, job.scene, job.output, error=error, attempt=task.attempt)
-    try:
-        with scene_lock(context.folder, _output_names(job, context.options)) as lock:
-            _clean(job, context)
-            append_line(context.folder / RECORDS, failed)
-            _finish(lock, task, context)
-    except BusyError:
-        return record(BUSY, job.scene, job.output)
-    except SceneError as stuck:
-        return record(STUCK, job.scene, job.output, error=str(stuck))
-    return failed
+    failed = record(FAILED, task.job.scene, task.job.output, error=error, attempt=task.attempt)
+
+    def work(lock: Lock) -> dict[str, Any]:
+        _clean(task.job, context)
+        append_line(context.folder / RECORDS, failed)
+        _finish(lock, task, context)
+        return failed
+
+    return _locked(task.job, context, work)
 
 
 def clean_up(task: Task, context: BatchContext) -> None:
-    """Remove unfinished files of a scene whose process was ended on purpose."""
-    try:
-        with scene_lock(context.folder, _output_names(task.job, context.options)) as lock:
-            _clean(task.job, context)
-            _finish(lock, task, context)
-    except (BusyError, SceneError):
-        return  # another process removes them, or the next run does
+    """Remove unfinished files of a scene whose process was ended on purpose; another process or the next run may."""
+    names = result_names(task.job.output, context.options)
+    with suppress(BusyError, SceneError), scene_lock(context.folder, names) as lock:
+        _clean(task.job, context)
+        _finish(lock, task, context)
 
 
 def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
@@ -200,8 +181,3 @@ def _finish(lock: Lock, task: Task, context: BatchContext) -> None:
     recorded = task.known is not None or task.job.output in new_records.known
     if recorded or not os.path.lexists(context.folder / task.job.output):
         lock.finish()
-
-
-def with_threads(options: BatchOptions, threads: int) -> BatchOptions:
-    """The options with the threads of a scene."""
-    return replace(options, settings=replace(options.settings, threads=threads))

@@ -152,12 +152,9 @@ def _print_plan(
 ) -> None:
     from gsmerge.report import document_head
     from gsmerge.research.charts.run import describe, estimate_seconds
-    from gsmerge.runtime.threads import available_threads
 
     out, runs = args.output, [run for run in plan.runs if run[0] in plan.pending]
-    threads = options.threads or available_threads()
-    nets, most = options.lpips, options.lpips_views
-    seconds = estimate_seconds(runs, stored, threads=threads, lpips=nets, lpips_views=most)
+    seconds = estimate_seconds(runs, stored, options)
     proxies = sum(map(len, plan.proxies.values()))
     document = {
         **document_head(),

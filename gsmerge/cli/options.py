@@ -205,12 +205,14 @@ def _show_all(context: typer.Context, value: bool) -> None:
         raise typer.Exit
 
 
-def parse_k(text: str) -> int:
-    """``--k``: a number from 1 to 8."""
+def parse_k(text: str) -> int | str:
+    """``--k``: a number from 1 to 8, or mixed."""
     if text == "auto":
         raise UsageError(str(renamed("--k auto")))
+    if text == "mixed":
+        return text
     if not text.isdigit() or not 1 <= int(text) <= 8:
-        raise typer.BadParameter(f"expected 1 to 8, got {text!r}")
+        raise typer.BadParameter(f"expected 1 to 8 or mixed, got {text!r}")
     return int(text)
 
 
@@ -225,10 +227,10 @@ SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and
 HINTS = "opacity exporter quats order scene_scale max_side"
 READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
-COUNTS = "k superpixels budget quality levels"
-MERGE = "segmentation robust match geometry unseen"
+COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
+MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
 FIT = "fit effort device fit_steps time_budget"
-NETWORKS = "checkpoint require_checkpoint"
+NETWORKS = "recipe checkpoint require_checkpoint"
 RUN = "seed threads"
 
 _TABLE = (
@@ -255,7 +257,12 @@ _TABLE = (
     ),
     panel(
         COUNT,
-        option("k", str, "Gaussians per superpixel: finer with more.", shown="1", parser=parse_k, metavar="1-8"),
+        option("k", str, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by its saliency.", shown="1",
+               parser=parse_k, metavar="1-8|mixed"),
+        option("k_low", float, "Percentile of saliency up to which a mixed k is 1.", shown="50.0", rare=True),
+        option("k_high", float, "Percentile of saliency above which a mixed k is 4.", shown="85.0", rare=True),
+        option("k_rule", ("saliency", "distortion"), "What a mixed k goes by: the corner response of the photos, or "
+               "as many Gaussians where they lower distortion most.", shown="saliency", rare=True),
         option("superpixels", str, "Superpixels per view: a number such as 3000, or a share of its pixels.",
                shown="4.4%", parser=parse_superpixels, metavar="NUMBER|SHARE"),
         option("budget", str, "Gaussians in the result: a number, a share such as 2% of the input, or a size such as "
@@ -278,12 +285,22 @@ _TABLE = (
                shown="overlap, none for a draft", rare=True),
         option("geometry", ("analytic", "decoded"), "What is matched where networks are loaded: moments, or the "
                "output of the K = 1 head.", shown="analytic", rare=True),
+        option("neighbors", int, "Nearest neighbours in other views that are compared.", shown="16", rare=True, min=1),
+        option("overlap", float, "Least overlap of Gaussians that --match overlap merges.", shown="0.7", rare=True),
+        option("iou", float, "Least intersection over union of boxes that --match aabb merges.", shown="0.2",
+               rare=True),
+        option("similarity", float, "Least cosine of the networks' latents that --match aabb merges.", shown="0.8",
+               rare=True),
+        option("max_color", float, "Largest difference of colours that are merged.", shown="0.12", rare=True),
+        option("min_opacity", float, "Gaussians below this opacity are left out.", shown="1/255", rare=True),
         option("unseen", ("drop", "keep"), "Gaussians that no view sees, where they are not one per pixel: drop (the "
                "default), or keep, merged.", rare=True),
         option("method", (
-            "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "paper", "voxel", "opacity", "contribution",
-            "random", "blocks", "greedy", "splat-transform",
+            "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "moment-matching", "voxel", "opacity",
+            "contribution", "random", "blocks", "greedy", "splat-transform",
         ), "gsmerge, or a baseline to compare it with.", shown="gsmerge", rare=True),
+        option("recipe", ("paper",), "Settings that belong together. paper: the superpixel merging paper's own method, "
+               "with networks from --checkpoint FILE.", rare=True),
         option("checkpoint", str, "Trained networks that correct the analytic stages: a file, shipped, none, or auto: "
                "the shipped ones where they improve the result.", shown="auto", rare=True, metavar="FILE|NAME"),
         option("require_checkpoint", bool, "A checkpoint that cannot be used is an error instead of a note.",

@@ -55,7 +55,7 @@ def encode_scene(
     options = _without_fit((options or CompactOptions()).with_settings(settings), settings)
     if max_k is not None and not 1 <= max_k <= MAX_CHILDREN:
         raise UsageError(f"max k: expected 1 to {MAX_CHILDREN}, got {max_k}")
-    if max_k is not None and max_k < options.decode.k:
+    if max_k is not None and max_k < options.decode.max_k:
         raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
@@ -85,7 +85,9 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
     features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
     options, scene = prepared.options, prepared.scene
     count = merged_count(merged, options.decode, grows=options.fit.grows)
-    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.k <= DEFAULT_MAX_K else MAX_CHILDREN)
+    max_k = max_k or (DEFAULT_MAX_K if count is None and options.decode.max_k <= DEFAULT_MAX_K else MAX_CHILDREN)
+    if networks is not None:
+        max_k = min(max_k, networks.networks.max_children)
     prunes = scene.images is not None and options.fit.effort != "draft"
     settings = StoredSettings(
         num_input=prepared.given.num_gaussians,
@@ -94,7 +96,7 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
         min_opacity=options.decode.min_opacity,
         min_contribution=options.fit.min_contribution if prunes else 0.0,
         target_count=count if exact else None,
-        num_slots=None if exact or count is None else count // options.decode.k,
+        num_slots=None if exact or count is None else count // options.decode.max_k,
         knee_count=knee_count(prepared),
     )
     heads = None

@@ -1,62 +1,35 @@
 """Files: the only place that knows their formats."""
 
-from gsmerge.io.alignment.recover import Recovery
-from gsmerge.io.alignment.score import Alignment, check_alignment
-from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import read_json
-from gsmerge.io.cameras import CameraFile, read_cameras, to_cameras
-from gsmerge.io.formats.ply import PlyInfo, PlyScene, kept_comments, ply_notes, read_ply
-from gsmerge.io.formats.ply_writer import write_ply
-from gsmerge.io.formats.writing import OUTPUT_FORMATS, lost_harmonics, output_format, write_gaussians
-from gsmerge.io.held_out import HeldOutViews, read_held_out
-from gsmerge.io.hints import AUTO, ReadHints
-from gsmerge.io.photos import read_images
-from gsmerge.io.scene import (
-    CamerasInScene,
-    SceneLoad,
-    align_scene,
-    load_files,
-    load_scene,
-    place_cameras_in_scene,
-    read_ply_with_hints,
-    read_scene,
-)
-from gsmerge.io.scene_files import SceneFiles, find_scene_files
-from gsmerge.io.views import read_photos
-
-__all__ = [
-    "AUTO",
-    "OUTPUT_FORMATS",
-    "Alignment",
-    "CameraFile",
-    "CamerasInScene",
-    "HeldOutViews",
-    "PlyInfo",
-    "PlyScene",
-    "ReadHints",
-    "Recovery",
-    "SceneFiles",
-    "SceneLoad",
-    "align_scene",
-    "atomic_output",
-    "check_alignment",
-    "find_scene_files",
-    "kept_comments",
-    "load_files",
-    "load_scene",
-    "lost_harmonics",
-    "output_format",
-    "place_cameras_in_scene",
-    "ply_notes",
-    "read_cameras",
-    "read_held_out",
-    "read_images",
-    "read_json",
-    "read_photos",
-    "read_ply",
-    "read_ply_with_hints",
-    "read_scene",
-    "to_cameras",
-    "write_gaussians",
-    "write_ply",
-]
+from gsmerge.io.alignment.recover import Recovery as Recovery
+from gsmerge.io.alignment.score import Alignment as Alignment
+from gsmerge.io.alignment.score import check_alignment as check_alignment
+from gsmerge.io.atomic import atomic_output as atomic_output
+from gsmerge.io.bounds import read_json as read_json
+from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
+from gsmerge.io.cameras.camera_file import to_cameras as to_cameras
+from gsmerge.io.cameras.read import read_cameras as read_cameras
+from gsmerge.io.formats.ply import PlyInfo as PlyInfo
+from gsmerge.io.formats.ply import PlyScene as PlyScene
+from gsmerge.io.formats.ply import kept_comments as kept_comments
+from gsmerge.io.formats.ply import ply_notes as ply_notes
+from gsmerge.io.formats.ply import read_ply as read_ply
+from gsmerge.io.formats.writing import OUTPUT_FORMATS as OUTPUT_FORMATS
+from gsmerge.io.formats.writing import lost_harmonics as lost_harmonics
+from gsmerge.io.formats.writing import output_format as output_format
+from gsmerge.io.formats.writing import write_gaussians as write_gaussians
+from gsmerge.io.formats.writing import write_ply as write_ply
+from gsmerge.io.held_out import HeldOutViews as HeldOutViews
+from gsmerge.io.held_out import read_held_out as read_held_out
+from gsmerge.io.hints import AUTO as AUTO
+from gsmerge.io.hints import ReadHints as ReadHints
+from gsmerge.io.photos import read_images as read_images
+from gsmerge.io.scene import CamerasInScene as CamerasInScene
+from gsmerge.io.scene import SceneLoad as SceneLoad
+from gsmerge.io.scene import align_scene as align_scene
+from gsmerge.io.scene import load_files as load_files
+from gsmerge.io.scene import load_scene as load_scene
+from gsmerge.io.scene import place_cameras_in_scene as place_cameras_in_scene
+from gsmerge.io.scene import read_ply_with_hints as read_ply_with_hints
+from gsmerge.io.scene import read_scene as read_scene
+from gsmerge.io.scene_files import SceneFiles as SceneFiles
+from gsmerge.io.scene_files import find_scene_files as find_scene_files

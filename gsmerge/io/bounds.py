@@ -18,10 +18,8 @@ MAX_PIXELS = 1 << 26  # of one image
 
 
 def check_file(path: Path) -> int:
-    """The size of a file, bytes.
-
-    Raises:
-        SceneError: If there is none, or it is a folder, a pipe or a device, which could block or never end.
+    """The size of a file, bytes. SceneError if there is none, or it is a folder, a pipe or a device, which could block
+    or never end.
     """
     try:
         status = os.stat(path)
@@ -38,9 +36,7 @@ def check_file(path: Path) -> int:
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
     """The text of a small file in UTF-8.
-
-    Raises:
-        SceneError: If it cannot be read, is no text, or has more than ``limit`` bytes.
+    SceneError if it cannot be read, is no text, or has more than ``limit`` bytes.
     """
     size = check_file(path)
     if size > limit:
@@ -67,10 +63,8 @@ def read_json(path: Path) -> Any:
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """The table of a ``.json`` file, or of any other as TOML.
-
-    Raises:
-        SceneError: If the file cannot be read or holds no table, or TOML is read on Python 3.10.
+    """The table of a ``.json`` file, or of any other as TOML. SceneError if the file cannot be read or holds no table,
+    or TOML is read on Python 3.10.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -94,11 +88,7 @@ def _toml(path: Path, text: str) -> Any:
 
 
 def check_pixels(path: str | os.PathLike[str], width: int, height: int) -> None:
-    """Refuse an image size that no image of Gaussians has.
-
-    Raises:
-        SceneError: If it is not positive, or has too many pixels.
-    """
+    """Refuse an image size that no image of Gaussians has. SceneError if it is not positive, or has too many pixels."""
     if width < 1 or height < 1:
         raise SceneError(path, f"expected a positive image size, found {width} x {height}")
     if width * height > MAX_PIXELS:

@@ -15,13 +15,7 @@ from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.trajectory import INTRINSICS
 from gsmerge.io.scene_files import IMAGE_PLACES
 
-EXTRA_FILES = (
-    DATAPARSER,
-    *INTRINSICS,
-    FRAMES_FILE,
-    POSE_FILE,
-    SCALE_FILE,
-)  # small files that are read with some camera files
+EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
 
 
 def digest(value: Mapping[str, Any]) -> str:
@@ -61,7 +55,8 @@ def photos_of(cameras: Path) -> list[Path]:
     """Where the photos of a camera file may be, by its names or next to it."""
     camera_file = cameras_of(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
-    named = [root / name for name in (() if camera_file is None else camera_file.names) if (root / name).is_file()]
+    names = () if camera_file is None else camera_file.names
+    named = [root / name for name in names if (root / name).is_file()]
     return named or [root / place for place in IMAGE_PLACES if (root / place).is_dir()]
 
 
@@ -80,9 +75,7 @@ def stem_of(scene: Path) -> str:
 
 def filled(template: str | None, scene: Path) -> Path | None:
     """A path with ``{scene}`` (the scene as given), ``{parent}`` (its folder) and ``{stem}`` (its name) filled in.
-
-    Raises:
-        UsageError: If the template holds another name.
+    UsageError if the template holds another name.
     """
     if template is None:
         return None

@@ -19,54 +19,27 @@ FrameKind = Literal["same", "scaled", "shifted", "first", "middle", "upright", "
 
 @dataclass(frozen=True)
 class Exporter:
-    """One exporter.
+    """One exporter."""
 
-    Args:
-        name: As on the command line.
-        title: As people call it.
-        opacity: How it stores opacities.
-        order: Order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels.
-        kinds: Which pixels it keeps; see :class:`gsmerge.io.alignment.layouts.Layout`.
-        frames: Where its Gaussians may lie in the frame of the cameras; see
-            :class:`gsmerge.io.alignment.similarity.Similarity`.
-        per_pixel: Gaussians per pixel.
-        degrees: SH degrees that it writes.
-        normals: Whether it writes the columns nx, ny, nz.
-        quats: How it stores rotations.
-        check_rotations: Whether another reading of the rotations may be tried.
-        elements: Elements besides ``vertex`` that it always writes.
-        byte_columns: Columns that it writes as bytes.
-        comment: Part of a comment in the header that it always writes.
-        cameras: Formats of cameras that it writes; empty: none, any may be given.
-    """
-
-    name: str
-    title: str
-    opacity: Literal["logit", "raw"]
-    order: str
-    kinds: tuple[str, ...] = ("full",)
+    name: str  # as on the command line
+    title: str  # as people call it
+    opacity: Literal["logit", "raw"]  # how it stores opacities
+    order: str  # order of its rows; "unordered": none, but each is made of a pixel; "none": they belong to no pixels
+    kinds: tuple[str, ...] = ("full",)  # which pixels it keeps; see :class:`gsmerge.io.alignment.layouts.Layout`
+    # where its Gaussians may lie in the frame of the cameras; see :class:`gsmerge.io.alignment.similarity.Similarity`
     frames: tuple[FrameKind, ...] = ("same",)
-    per_pixel: tuple[int, ...] = (1,)
-    degrees: tuple[int, ...] = (0,)
-    normals: bool = True
-    quats: QuatChoice = "wxyz"
-    check_rotations: bool = True
-    elements: tuple[str, ...] = ()
-    byte_columns: tuple[str, ...] = ()
-    comment: str = ""
-    cameras: tuple[str, ...] = ()
+    per_pixel: tuple[int, ...] = (1,)  # Gaussians per pixel
+    degrees: tuple[int, ...] = (0,)  # SH degrees that it writes
+    normals: bool = True  # whether it writes the columns nx, ny, nz
+    quats: QuatChoice = "wxyz"  # how it stores rotations
+    check_rotations: bool = True  # whether another reading of the rotations may be tried
+    elements: tuple[str, ...] = ()  # elements besides ``vertex`` that it always writes
+    byte_columns: tuple[str, ...] = ()  # columns that it writes as bytes
+    comment: str = ""  # part of a comment in the header that it always writes
+    cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: none, any may be given
 
-    def may_have_written(
-        self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str | None
-    ) -> bool:
-        """Whether a file looks like one of this exporter's.
-
-        Args:
-            info: What the file's header and columns say.
-            layout: Which row is which pixel; None where the rows belong to no pixels.
-            frame: From the frame of the cameras to that of the Gaussians.
-            cameras: Format of the cameras.
-        """
+    def may_have_written(self, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
+        """Whether a file looks like one of this exporter's; see :func:`choose_exporters`."""
         header = (
             info.sh_degree in self.degrees
             and self.normals == ("nx" in info.columns)
@@ -146,23 +119,23 @@ EXPORTERS = {exporter.name: exporter for exporter in _EXPORTERS}
 
 
 def find_exporter(name: str) -> Exporter | None:
-    """The exporter of that name; None for "auto".
-
-    Raises:
-        ValueError: If there is none of that name.
-    """
+    """The exporter of that name; None for "auto". ValueError if there is none of that name."""
     if name != "auto" and name not in EXPORTERS:
         raise ValueError(f"exporter: expected 'auto' or one of {', '.join(EXPORTERS)}, got {name!r}")
     return EXPORTERS.get(name)
 
 
-def recognise(
-    info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str | None
+def choose_exporters(
+    name: str, info: PlyInfo, layout: Layout | None, frame: Similarity | None, cameras: str
 ) -> tuple[Exporter, ...]:
-    """All exporters that may have written a file; see :meth:`Exporter.may_have_written`.
+    """The exporter of that name; for "auto", all that may have written a file with cameras of a format.
 
-    Those that leave a mark of their own in the header go before those that leave none.
+    Those that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame`` say
+    which row is which pixel, and where; None where the rows belong to no pixels.
     """
+    exporter = find_exporter(name)
+    if exporter is not None:
+        return (exporter,)
     possible = [e for e in EXPORTERS.values() if e.may_have_written(info, layout, frame, cameras)]
     marked = [e for e in possible if e.elements or e.byte_columns or e.comment]
     return tuple(marked or possible)

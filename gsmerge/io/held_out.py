@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.similarity import IDENTITY, Similarity
-from gsmerge.io.cameras import read_cameras, to_cameras
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, with_convention, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_convention, with_poses
 from gsmerge.io.cameras.lens import as_pinholes
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.hints import AUTO
 from gsmerge.io.photos import as_tensor, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
@@ -29,23 +29,14 @@ _SAME_POSE = 1e-4  # of the distance to the scene, and in entries of the rotatio
 
 @dataclass(frozen=True)
 class HeldOutViews:
-    """t views that were no input.
-
-    Args:
-        cameras: Their cameras, in the frame of the scene's Gaussians.
-        images: ``[t,h,w,3]`` photos, sRGB in [0, 1], float32.
-        names: As their camera file has them.
-        places: Of each along the trajectory: its index in the camera file.
-        context_places: The same of the scene's views; None where they are not all in the file.
-        notes: What was adapted, one sentence each.
-    """
+    """t views that were no input, in the frame of the scene's Gaussians."""
 
     cameras: Cameras
-    images: Tensor
-    names: tuple[str, ...]
-    places: tuple[int, ...]
-    context_places: tuple[int, ...] | None
-    notes: tuple[str, ...] = ()
+    images: Tensor  # ``[t,h,w,3]`` photos, sRGB in [0, 1], float32
+    names: tuple[str, ...]  # as their camera file has them
+    places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
+    context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -54,16 +45,13 @@ class HeldOutViews:
 def read_held_out(
     load: SceneLoad, cameras: str | os.PathLike[str], images: str | os.PathLike[str] | None = None
 ) -> HeldOutViews:
-    """Read held-out photos and their cameras.
+    """Read held-out photos and their cameras, in any of the forms that scenes may have.
 
     Views that the scene was made of are left out. Where the file has those too, under the same names, their poses
     determine how its world lies to that of the Gaussians; otherwise it is assumed to be the world of the scene's own
     cameras. If the poses of the scene's cameras had to be read in another convention than their format's, so are these.
 
-    Args:
-        load: The scene.
-        cameras: Any camera file or folder that scenes may have.
-        images: Folder of the photos; None: where the camera file says.
+    ``images`` is the folder of the photos; None: where the camera file says.
 
     Raises:
         SceneError: If a file is missing or damaged, or no view is left.
@@ -71,11 +59,9 @@ def read_held_out(
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    camera_file = read_cameras(path, scene=load.files.ply.stem)
-    readings = [
-        (one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in _readings(camera_file, load)
-    ]
-    camera_file, world, shared = next((reading for reading in readings if reading[2]), readings[0])
+    readings = _readings(read_cameras(path, scene=load.files.ply.stem), load)
+    worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
+    camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
     moved = world.move_viewmats(camera_file.viewmats.numpy())
     shared |= _repeated(moved, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
@@ -88,15 +74,15 @@ def read_held_out(
     pinholes, photos, _ = as_pinholes(chosen, photos)
     photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
     assert photos is not None
-    at_size = to_cameras(pinholes, photo_size(photos))
     inverse = {view: place for place, view in shared.items()}
+    complete = 0 < len(inverse) == len(load.scene)
     return HeldOutViews(
-        with_poses(at_size, moved[places]),
-        as_tensor(photos),
-        chosen.names,
-        tuple(places),
-        tuple(inverse[view] for view in range(len(load.scene))) if 0 < len(inverse) == len(load.scene) else None,
-        tuple(notes),
+        cameras=with_poses(to_cameras(pinholes, photo_size(photos)), moved[places]),
+        images=as_tensor(photos),
+        names=chosen.names,
+        places=tuple(places),
+        context_places=tuple(inverse[view] for view in range(len(load.scene))) if complete else None,
+        notes=tuple(notes),
     )
 
 
@@ -123,19 +109,19 @@ def _folder(path: Path, cameras: CameraFile, images: str | os.PathLike[str] | No
     if cameras.images is not None:
         return path
     root = path if path.is_dir() else path.parent
-    if any((root / name).is_file() for name in cameras.names):
-        return None
-    return next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
+    says = any((root / name).is_file() for name in cameras.names)
+    return None if says else next((root / place for place in IMAGE_PLACES if (root / place).is_dir()), None)
 
 
 def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
     """Index in the file -> view of the scene, for views that both name; empty if stems are not unique."""
-    stems = [PurePosixPath(name.replace("\\", "/")).stem for name in camera_file.names]
-    own = [PurePosixPath(name.replace("\\", "/")).stem for name in names]
-    if len(set(stems)) < len(stems) or len(set(own)) < len(own):
+    place, own = (
+        {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(some)}
+        for some in (camera_file.names, names)
+    )
+    if len(place) < len(camera_file) or len(own) < len(names):
         return {}
-    place = {stem: i for i, stem in enumerate(stems)}
-    return {place[stem]: view for view, stem in enumerate(own) if stem in place}
+    return {place[stem]: view for stem, view in own.items() if stem in place}
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad) -> tuple[Similarity, dict[int, int]]:
@@ -154,12 +140,8 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
 
 
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
-    """The similarity that moves cameras onto their poses in another world, least squares.
-
-    Args:
-        theirs: ``[c,4,4]`` world to camera.
-        ours: The same cameras in the other world.
-        scale: Of the worlds, for cameras that all stand in one place and do not determine it.
+    """The similarity that moves cameras ``theirs [c,4,4]`` (world to camera) onto their poses ``ours`` in another
+    world, least squares; with the given scale where all stand in one place and do not determine it.
     """
     rotations = np.einsum("nji,njk->ik", ours[:, :3, :3], theirs[:, :3, :3])
     u, _, vt = np.linalg.svd(rotations)
@@ -177,16 +159,12 @@ def _centres(viewmats: np.ndarray) -> np.ndarray:
 
 
 def _disagreement(moved: np.ndarray, ours: np.ndarray) -> tuple[float, float]:
-    """Largest angle (degrees) and largest distance (of the spread of the views) between two sets of poses."""
+    """Largest angle (degrees) and largest distance (over that of the outermost views) between two sets of poses."""
     cosines = (np.einsum("nij,nij->n", moved[:, :3, :3], ours[:, :3, :3]) - 1) / 2
-    distance = np.linalg.norm(_centres(moved) - _centres(ours), axis=1).max()
-    return float(np.degrees(np.arccos(cosines.clip(-1, 1))).max()), float(distance / _spread(ours))
-
-
-def _spread(viewmats: np.ndarray) -> float:
-    """Distance of the outermost centres; 1 where there is none."""
-    centres = _centres(viewmats)
-    return float(np.linalg.norm(centres.max(0) - centres.min(0))) or 1.0
+    centres = _centres(ours)
+    distance = np.linalg.norm(_centres(moved) - centres, axis=1).max()
+    spread = float(np.linalg.norm(np.ptp(centres, axis=0))) or 1.0
+    return float(np.degrees(np.arccos(cosines.clip(-1, 1))).max()), float(distance / spread)
 
 
 def _repeated(moved: np.ndarray, scene: PixelScene | UnalignedScene) -> dict[int, int]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 from gsmerge.io.alignment.layouts import ORDERS, Order
 
@@ -14,27 +14,16 @@ QUATS: tuple[str, ...] = get_args(QuatChoice)
 
 @dataclass(frozen=True)
 class ReadHints:
-    """How to read a file where its values do not show it, or mislead.
+    """How to read a file where its values do not show it, or mislead; ValueError if a value is no possible one."""
 
-    Args:
-        exporter: Which exporter wrote it, a name of :data:`gsmerge.io.exporters.EXPORTERS`; "auto": recognised.
-        quats: How rotations are stored: "wxyz", "xyzw", "xyzw-root" (xyzw, each applied twice: the roots are
-            used, where the pixels are known), or "camera" (wxyz, relative to the own view's camera);
-            "auto": as the exporter says, and checked against the surface where the pixels are known.
-        order: Order of the rows; "unordered": none, but each may be made of a pixel; "none": they belong to no
-            pixels.
-        scene_scale: Size of the Gaussians' world in units of the cameras'; None: solved for.
-        max_side: Longest side of the views of unaligned Gaussians, pixels; larger ones are resized.
-
-    Raises:
-        ValueError: If a value is none of the possible ones.
-    """
-
-    exporter: str = "auto"
+    exporter: str = "auto"  # which one wrote it, of :data:`gsmerge.io.exporters.EXPORTERS`; "auto": recognised
+    # How rotations are stored: "wxyz"; "xyzw"; "xyzw-root": xyzw, each applied twice, so the roots are used where the
+    # pixels are known; "camera": wxyz, relative to the own view's camera; "auto": as the exporter says, and checked
+    # against the surface where the pixels are known.
     quats: QuatChoice = "auto"
-    order: Order = "auto"
-    scene_scale: float | None = None
-    max_side: int = 1200
+    order: Order = "auto"  # of the rows; "unordered": each may be made of a pixel; "none": they belong to no pixels
+    scene_scale: float | None = None  # size of the Gaussians' world in units of the cameras'; None: solved for
+    max_side: int = 1200  # longest side of the views of unaligned Gaussians, pixels; larger ones are resized
 
     def __post_init__(self) -> None:
         for name, known in (("quats", QUATS), ("order", ORDERS)):
@@ -49,19 +38,15 @@ class ReadHints:
 AUTO = ReadHints()
 
 
-def make_hints(values: Mapping[str, Any]) -> ReadHints:
-    """Hints from keyword arguments.
-
-    Raises:
-        ValueError: If one is unknown or none of its possible values.
-    """
+def make_hints(values: dict[str, Any]) -> ReadHints:
+    """Hints from keyword arguments; ValueError if one is unknown or none of its possible values."""
     known = {field.name for field in fields(ReadHints)}
-    unknown = sorted(set(values) - known)
+    unknown = sorted(values.keys() - known)
     if unknown:
         raise ValueError(f"expected {_listed(sorted(known))}, got {unknown[0]!r}")
-    return ReadHints(**cast("dict[str, Any]", dict(values)))
+    return ReadHints(**values)
 
 
-def _listed(names: Any) -> str:
+def _listed(names: Iterable[str]) -> str:
     *first, last = (repr(name) for name in names)
     return f"{', '.join(first)} or {last}"

@@ -9,8 +9,8 @@ import struct
 import warnings
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath, PurePosixPath
 from typing import BinaryIO
 
 import cv2
@@ -22,6 +22,7 @@ from torch import Tensor
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
@@ -37,16 +38,13 @@ Size = tuple[int, int]  # width, height, pixels
 
 
 def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
-    """Read the image of every view.
+    """Read the image of every view: ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
 
     Args:
         source: A folder (with its sub-folders), or the image files themselves.
-        names: One name per view, as camera files give them: with or without folders and extension. If no name
-            matches but there are as many images as names, the images are taken in order (of their names with numbers
-            counted as numbers, or of the list).
-
-    Returns:
-        ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
+        names: One per view, as camera files give them: with or without folders and extension. If no name matches but
+            there are as many images as names, the images are taken in order (of their names with numbers counted as
+            numbers, or of the list).
 
     Raises:
         SceneError: If an image is missing or cannot be read, or two differ in size.
@@ -63,13 +61,13 @@ def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]
             w0, h0 = sizes[0]
             raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
 
-    def read(item: tuple[Path, Size]) -> np.ndarray:
+    def read(path: Path) -> np.ndarray:
         try:
-            return _decode(item[0], np.fromfile(item[0], np.uint8), item[1])
+            return _decode(path, np.fromfile(path, np.uint8), sizes[0])
         except OSError as error:
-            raise SceneError(item[0], f"cannot be read ({error.strerror})") from error
+            raise SceneError(path, f"cannot be read ({error.strerror})") from error
 
-    return parallel_map(read, list(zip(paths, sizes, strict=True)))
+    return parallel_map(read, paths)
 
 
 def as_tensor(images: Photos) -> Tensor:
@@ -100,22 +98,36 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
     else:
         files = [Path(p) for p in source]
         root = files[0].parent if files else Path()
-    keys = _index([f.relative_to(root) if f.is_relative_to(root) else f for f in files], files)
-    matched = [_lookup(root, keys, name) for name in names]
+    by_ending: dict[str, list[Path]] = {}
+    for file in files:
+        for ending in _endings(file.relative_to(root) if file.is_relative_to(root) else file):
+            by_ending.setdefault(ending, []).append(file)
+    matched = [_lookup(root, by_ending, name) for name in names]
     paths = [path for path in matched if path is not None]
     if not paths and len(files) == len(names):
         return files
     if len(paths) < len(names):
         missing = names[matched.index(None)]
-        raise SceneError(
-            root,
-            f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}",
-            "add what is missing, or name the right folder with --images",
-        )
+        problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
+        raise SceneError(root, problem, "add what is missing, or name the right folder with --images")
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
     return paths
+
+
+def _endings(path: PurePath) -> list[str]:
+    """Every ending of a path, the longest first, with and without its extension."""
+    endings = [PurePosixPath(*path.parts[i:]) for i in range(len(path.parts))]
+    return list(dict.fromkeys(str(some) for ending in endings for some in (ending, ending.with_suffix(""))))
+
+
+def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | None:
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
+    matches = next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
+    if len(matches) > 1:
+        raise SceneError(root, f"expected one image named {name}, found {matches[0].name} and {matches[1].name}")
+    return matches[0] if matches else None
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -138,35 +150,9 @@ def find_image(folder: Path, name: str) -> Path | None:
     return next((Path(c) for c in candidates if os.path.isfile(c)), None)
 
 
-def _index(relative: Sequence[Path], files: Sequence[Path]) -> dict[str, list[Path]]:
-    """Files by every ending of their path, with and without extension."""
-    keys: dict[str, list[Path]] = {}
-    for short, file in zip(relative, files, strict=True):
-        for i in range(len(short.parts)):
-            ending = PurePosixPath(*short.parts[i:])
-            for key in {str(ending), str(ending.with_suffix(""))}:
-                keys.setdefault(key, []).append(file)
-    return keys
-
-
-def _lookup(root: Path, keys: dict[str, list[Path]], name: str) -> Path | None:
-    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
-    for i in range(len(parts)):
-        ending = PurePosixPath(*parts[i:])
-        for key in (str(ending), str(ending.with_suffix(""))):
-            hits = keys.get(key, [])
-            if len(hits) > 1:
-                raise SceneError(root, f"expected one image named {name}, found {hits[0].name} and {hits[1].name}")
-            if hits:
-                return hits[0]
-    return None
-
-
 def image_size(path: Path) -> Size:
     """(width, height) that the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file says; its orientation is ignored.
-
-    Raises:
-        SceneError: If it is no such file, cannot be read, or says a size that no image of Gaussians has.
+    SceneError if it is no such file, cannot be read, or says a size that no image of Gaussians has.
     """
     num_bytes = check_file(path)
     try:
@@ -201,19 +187,8 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 
 def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
-    """Images that are stored in another file.
-
-    Args:
-        path: That file, for messages.
-        names: What to call each image.
-        files: ``[b]`` uint8 each: the bytes of an image file.
-        limit: Bytes that they may have when decoded.
-
-    Returns:
-        ``[c,h,w,3]`` uint8 sRGB.
-
-    Raises:
-        SceneError: If one cannot be decoded, two differ in size, or they are too many.
+    """Images ``[c,h,w,3]`` uint8 sRGB, stored in the file ``path`` as the bytes of image files (``[b]`` uint8 each).
+    SceneError if one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
     """
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
     width, height = sizes[0]
@@ -221,9 +196,8 @@ def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
     if 3 * width * height * len(files) > limit:
-        raise SceneError(
-            path, f"expected images of at most {limit >> 20} MiB, found {len(files)} of {width} x {height}"
-        )
+        problem = f"expected images of at most {limit >> 20} MiB, found {len(files)} of {width} x {height}"
+        raise SceneError(path, problem)
     out = np.empty((len(files), height, width, 3), np.uint8)
     parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
     return out
@@ -269,15 +243,8 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class PhotoTransform:
-    """A photo is resized, then cropped: ``u' = scale_x u - left`` and ``v' = scale_y v - top``, pixels.
-
-    Args:
-        width: Of the result, pixels.
-        height: The same.
-        scale_x: Along the width.
-        scale_y: Along the height.
-        left: Columns cut off at the left.
-        top: Rows cut off at the top.
+    """A photo is resized, then cropped to ``width`` x ``height`` pixels: ``u' = scale_x u - left``,
+    ``v' = scale_y v - top``.
     """
 
     width: int
@@ -297,10 +264,11 @@ class PhotoTransform:
         """What is done to a photo."""
         return f"resized{' and centre-cropped' if self.crops else ''} to {self.width} x {self.height}"
 
-    def intrinsics(self, Ks: Tensor) -> Tensor:
-        """``[c,3,3]`` intrinsics of the result, float64."""
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """The cameras of the results; intrinsics in float64."""
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
-        return torch.tensor(matrix, dtype=torch.float64) @ Ks.double()
+        Ks = torch.tensor(matrix, dtype=torch.float64) @ cameras.Ks.double()
+        return replace(cameras, Ks=Ks, width=self.width, height=self.height)
 
     def photos(self, images: Photos) -> list[np.ndarray]:
         """The results for c uint8 photos ``[h,w,3]``."""

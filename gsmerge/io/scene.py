@@ -21,70 +21,51 @@ from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignmen
 from gsmerge.io.alignment.similarity import IDENTITY
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_poses
 from gsmerge.io.cameras.lens import as_pinholes
-from gsmerge.io.exporters import Exporter, find_exporter, recognise
+from gsmerge.io.exporters import Exporter, choose_exporters, find_exporter
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.hints import AUTO, ReadHints, make_hints
+from gsmerge.io.photos import as_tensor, photo_size
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
-from gsmerge.io.views import limit_photo_size, read_photos, read_scene_cameras, stored_photos
+from gsmerge.io.views import limit_photo_size, read_scene_cameras, stored_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
+_NO_CAMERAS = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
 
 
 @dataclass(frozen=True)
 class Views:
-    """All views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures.
-
-    Args:
-        cameras: The c cameras.
-        images: ``[c,h,w,3]`` photos, or None.
-        names: Names of the c views.
-        used: Which of them the scene has, each once, in its order.
-    """
+    """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
 
     cameras: Cameras
-    images: Tensor | None
+    images: Tensor | None  # ``[c,h,w,3]`` photos
     names: tuple[str, ...]
-    used: tuple[int, ...]
+    used: tuple[int, ...]  # which of them the scene has, each once, in its order
 
 
 @dataclass(frozen=True)
 class SceneLoad:
-    """A scene and how it was read.
+    """A scene and how it was read."""
 
-    Args:
-        scene: The scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels.
-        ply: What the ``.ply`` holds.
-        files: The files that were read.
-        cameras: The cameras in the order of the views, as their file has them; None where there are none.
-        alignment: How well every view's Gaussians project into their own pixels; None for an unaligned scene.
-        recovery: Which reading of the rows won, and by how much; None for an unaligned scene.
-        problem: Why the scene is unaligned, in one sentence; None where it is not.
-        exporters: The exporters that may have written the file, or the one that the caller named.
-        notes: What was adapted or looks odd, one sentence each, without a full stop.
-        views: All views that there are cameras of, also those that the scene does not have.
-    """
-
+    # the scene: one Gaussian per pixel, or an unaligned one where the rows belong to no pixels
     scene: PixelScene | UnalignedScene
     ply: PlyInfo
     files: SceneFiles
+    # the cameras in the order of the views, as their file has them; None where there are none
     cameras: CameraFile | None
-    alignment: Alignment | None
-    recovery: Recovery | None
-    problem: str | None
-    exporters: tuple[Exporter, ...]
-    notes: tuple[str, ...]
-    views: Views
+    views: Views  # all views that there are cameras of, also those that the scene does not have
+    exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
+    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
+    # how well every view's Gaussians project into their own pixels; None for an unaligned scene
+    alignment: Alignment | None = None
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None for an unaligned scene
+    problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
 
     def pixel_scene(self) -> PixelScene:
-        """The scene, for those who need one Gaussian per pixel.
-
-        Raises:
-            SceneError: If it is unaligned; says why.
-        """
+        """The scene, for those who need one Gaussian per pixel. SceneError if it is unaligned; says why."""
         if isinstance(self.scene, PixelScene):
             return self.scene
         raise SceneError(self.ply.path, self.problem or "expected one Gaussian per pixel")
@@ -132,8 +113,8 @@ def load_scene(
     **hints: Any,
 ) -> SceneLoad:
     """:func:`read_scene` with everything that was learned on the way."""
-    chosen = make_hints(hints)
-    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=chosen)
+    read_hints = make_hints(hints)
+    return load_files(find_scene_files(path, cameras=cameras, images=images), opacity=opacity, hints=read_hints)
 
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
@@ -158,26 +139,19 @@ def align_scene(
 ) -> SceneLoad:
     """Put Gaussians, cameras and images together and decide which row belongs to which pixel.
 
-    Args:
-        ply: The Gaussians.
-        files: Where the cameras and images are.
-        camera_file: The cameras, if they are read already.
-        hints: What the caller says about the files.
-        photos: Whether to look for photos.
-
-    Raises:
-        SceneError: As :func:`read_scene`.
+    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none are
+    looked for.
     """
-    if camera_file is None and files.cameras is None and hints.order == "none":
-        return _without_cameras(ply, files, hints)
+    if camera_file is None and files.cameras is None and hints.order == "none":  # views are placed later
+        gaussians, notes = usable_rows(ply, hints)
+        problem = "expected one Gaussian per pixel, found no cameras that have any"
+        return _unaligned(ply, files, None, UnalignedScene(gaussians, _NO_CAMERAS, None, ()), problem, hints, notes)
     exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     known = camera_file.order if exporter is None else exporter.order
     order = known if hints.order == "auto" else hints.order
-    notes: list[str] = []
     pictures = stored_photos(files, camera_file) if photos else None
-    if camera_file.lenses:
-        camera_file, pictures, notes = as_pinholes(camera_file, pictures)
+    camera_file, pictures, notes = as_pinholes(camera_file, pictures)
     pictures, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     fit = fit_cameras(ply, camera_file, pictures, order=order, scale=hints.scene_scale)
     notes += [*smaller, *fit.notes]
@@ -192,8 +166,7 @@ def _aligned(
 ) -> SceneLoad:
     inputs, camera_file = fit.inputs, fit.camera_file
     layout, frame, cameras = recovery.best.layout, recovery.best.frame, inputs.cameras
-    exporter = find_exporter(hints.exporter)
-    exporters = recognise(ply.info, layout, frame, camera_file.source) if exporter is None else (exporter,)
+    exporters = choose_exporters(hints.exporter, ply.info, layout, frame, camera_file.source)
     if frame is not IDENTITY:
         cameras = with_poses(cameras, frame.move_viewmats(inputs.viewmats))
     views = Views(cameras, inputs.images, camera_file.names, tuple(dict.fromkeys(layout.views)))
@@ -207,7 +180,7 @@ def _aligned(
     notes += _layout_notes(recovery, inputs) + filled + rotated + _color_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
     text = (*ply_notes(ply.info), *notes)
-    return SceneLoad(scene, ply.info, files, camera_file, alignment, recovery, None, exporters, text, views)
+    return SceneLoad(scene, ply.info, files, camera_file, views, exporters, text, alignment, recovery)
 
 
 def _unaligned(
@@ -219,19 +192,11 @@ def _unaligned(
     hints: ReadHints,
     notes: list[str],
 ) -> SceneLoad:
-    exporter, source = find_exporter(hints.exporter), "" if camera_file is None else camera_file.source
-    exporters = recognise(ply.info, None, None, source) if exporter is None else (exporter,)
+    source = "" if camera_file is None else camera_file.source
+    exporters = choose_exporters(hints.exporter, ply.info, None, None, source)
     views = Views(scene.cameras, scene.images, scene.names, tuple(range(len(scene))))
     text = (*ply_notes(ply.info), *notes)
-    return SceneLoad(scene, ply.info, files, camera_file, None, None, problem, exporters, text, views)
-
-
-def _without_cameras(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> SceneLoad:
-    """Gaussians alone: views are placed later."""
-    none = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
-    gaussians, notes = usable_rows(ply, hints)
-    problem = "expected one Gaussian per pixel, found no cameras that have any"
-    return _unaligned(ply, files, None, UnalignedScene(gaussians, none, None, ()), problem, hints, notes)
+    return SceneLoad(scene, ply.info, files, camera_file, views, exporters, text, problem=problem)
 
 
 def _fill(scene: PixelScene, recovery: Recovery, inputs: AlignmentInput) -> tuple[PixelScene, list[str]]:
@@ -278,11 +243,8 @@ def _color_notes(scene: PixelScene) -> list[str]:
     colors = scene.gaussians.sh0.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
     photos = scene.images.reshape(len(scene), -1, 3)[:, ::step].mean(-1)
     valid = scene.stored.reshape(len(scene), -1)[:, ::step]
-    odd = [
-        name
-        for name, color, photo, ok in zip(scene.names, colors, photos, valid, strict=True)
-        if _correlation(color[ok], photo[ok]) < _MIN_CORRELATION
-    ]
+    views = zip(scene.names, colors, photos, valid, strict=True)
+    odd = [name for name, color, photo, ok in views if _correlation(color[ok], photo[ok]) < _MIN_CORRELATION]
     return [f"{len(odd)} of {len(scene)} images do not look like their Gaussians, for example {odd[0]}"] if odd else []
 
 
@@ -295,17 +257,11 @@ def _correlation(a: Tensor, b: Tensor) -> float:
 
 @dataclass(frozen=True)
 class CamerasInScene:
-    """Gaussians and views of one frame.
+    """Gaussians and views of one frame."""
 
-    Args:
-        gaussians: The file's, with rotations read as the scene has them.
-        views: Of the camera file.
-        notes: What was adapted or looks odd, one sentence each, without a full stop.
-    """
-
-    gaussians: Gaussians
-    views: Views
-    notes: tuple[str, ...]
+    gaussians: Gaussians  # the file's, with rotations read as the scene has them
+    views: Views  # of the camera file
+    notes: tuple[str, ...]  # what was adapted or looks odd, one sentence each, without a full stop
 
 
 def place_cameras_in_scene(
@@ -313,11 +269,7 @@ def place_cameras_in_scene(
 ) -> CamerasInScene:
     """Views in the frame of the Gaussians, if their pixels or colours show it; otherwise as their file has them.
 
-    Args:
-        ply: The Gaussians.
-        files: Where the cameras and photos are.
-        hints: What the caller says about the files.
-        photos: Whether photos that cannot be read are an error; otherwise they are left out.
+    ``photos`` that cannot be read are an error; with False they are left out.
 
     Raises:
         SceneError: If there are no cameras, or they have no size.
@@ -331,9 +283,9 @@ def place_cameras_in_scene(
         aligned = isinstance(load.scene, PixelScene)
         notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
         return CamerasInScene(load.scene.file_gaussians, load.views, notes)
-    images = read_photos(files, camera_file) if photos else None
-    size = None if images is None else (images.shape[2], images.shape[1])
-    cameras = to_cameras(camera_file, size)
+    pictures = stored_photos(files, camera_file) if photos else None
+    images = None if pictures is None else as_tensor(pictures)
+    cameras = to_cameras(camera_file, photo_size(pictures))
     views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"
     return CamerasInScene(ply.gaussians, views, (*ply_notes(ply.info), note))

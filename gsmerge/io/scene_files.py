@@ -23,13 +23,7 @@ _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """The files of a scene.
-
-    Args:
-        ply: The Gaussians.
-        cameras: Camera file or COLMAP folder; None without any.
-        images: Folder of images, or the ``.npz`` or ``.torch`` that holds them; None without any.
-    """
+    """The files of a scene; cameras may be a COLMAP folder, images the ``.npz`` or ``.torch`` that holds them."""
 
     ply: Path
     cameras: Path | None
@@ -49,10 +43,7 @@ def find_scene_files(
     ``IMAGE_PLACES`` in their order. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because they
     are those that the model saw.
 
-    Args:
-        path: A ``.ply`` or a folder.
-        cameras: Named by the user: used instead of searching.
-        images: The same.
+    Cameras and images that the user names are used instead of searching.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist.
@@ -64,16 +55,13 @@ def find_scene_files(
     roots = list(dict.fromkeys(Path(os.path.realpath(root)) for root in (given, *_roots(ply))))
     camera_path = _named(cameras) or next((c for c in map(find_cameras, roots) if c is not None), None)
     image_path = _named(images)
-    if image_path is None and camera_path is not None and _holds_images(camera_path):
-        image_path = camera_path
+    if image_path is None and camera_path is not None:
+        has_images = camera_path.suffix == CHUNK or (camera_path.suffix == ".npz" and holds_images(camera_path))
+        image_path = camera_path if has_images else None
     if image_path is None:
         folders = (root / place for root in roots for place in IMAGE_PLACES)
         image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
     return SceneFiles(ply, camera_path, image_path)
-
-
-def _holds_images(cameras: Path) -> bool:
-    return cameras.suffix == CHUNK or (cameras.suffix == ".npz" and holds_images(cameras))
 
 
 def _named(path: str | os.PathLike[str] | None) -> Path | None:
@@ -97,15 +85,13 @@ def _roots(ply: Path) -> list[Path]:
 
 def _find_ply(folder: Path) -> Path:
     named = named_ply(folder)
-    if named is not None:
-        return named
-    others = other_plys(folder)
-    if not others:
+    plys = other_plys(folder) if named is None else [named]
+    if not plys:
         raise SceneError(folder, "expected a .ply file in the folder, found none")
-    if len(others) > 1:
-        names = ", ".join(p.name for p in others[:4])
-        raise SceneError(folder, f"expected one .ply file in the folder, found {len(others)} ({names})", "name one")
-    return others[0]
+    if len(plys) > 1:
+        names = ", ".join(p.name for p in plys[:4])
+        raise SceneError(folder, f"expected one .ply file in the folder, found {len(plys)} ({names})", "name one")
+    return plys[0]
 
 
 def named_ply(folder: Path) -> Path | None:
@@ -119,8 +105,5 @@ def named_ply(folder: Path) -> Path | None:
 
 def other_plys(folder: Path) -> list[Path]:
     """The other files directly in a folder that may be scenes: no results of gsmerge, no point clouds."""
-    return sorted(
-        p
-        for p in folder.glob("*.ply")
-        if not p.name.startswith(".") and not _RESULT.search(p.name) and p.name not in _POINT_CLOUDS
-    )
+    plys = (p for p in folder.glob("*.ply") if not p.name.startswith(".") and p.name not in _POINT_CLOUDS)
+    return sorted(p for p in plys if not _RESULT.search(p.name))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,8 @@ from gsmerge.io.cameras.sharp import read_sharp
 from gsmerge.io.formats.ply import PlyScene
 from gsmerge.io.photos import (
     Photos,
+    PhotoTransform,
     Size,
-    as_tensor,
     decode_images,
     find_image,
     image_size,
@@ -38,9 +37,7 @@ _FLOAT_PIXEL = 12  # bytes
 
 def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
     """The cameras: from their file, from the ``.ply`` itself, or estimated for the images where there is nothing else.
-
-    Raises:
-        SceneError: If there are none and they cannot be estimated.
+    SceneError if there are none and they cannot be estimated.
     """
     if files.cameras is not None:
         return read_cameras(files.cameras, scene=files.ply.stem)
@@ -49,41 +46,24 @@ def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
         paths = list_images(files.images)
         width, height = image_size(paths[0]) if paths else (0, 0)
         names = [path.relative_to(files.images).as_posix() for path in paths]
-        cameras = estimate_cameras(files.ply, ply.gaussians, ply.valid.numpy(), names, width, height)
+        cameras = estimate_cameras(files.ply, ply.gaussians, ply.valid, names, width, height)
     if cameras is None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        raise SceneError(
-            files.ply,
-            f"no cameras found next to it (looked for {places}, one .torch chunk)",
-            "name them with --cameras, or have views placed with --order none",
-        )
+        problem = f"no cameras found next to it (looked for {places}, one .torch chunk)"
+        raise SceneError(files.ply, problem, "name them with --cameras, or have views placed with --order none")
     return cameras
 
 
-def read_photos(files: SceneFiles, camera_file: CameraFile) -> Tensor | None:
-    """The images of the cameras: from the folder, an ``.npz`` or ``.torch``, or where the camera file itself says.
-
-    Args:
-        files: Where the images are.
-        camera_file: The cameras.
-
-    Returns:
-        ``[c,h,w,3]`` float32 in [0, 1], in the order of the cameras; None if there are none.
-
-    Raises:
-        SceneError: As :func:`gsmerge.io.read_images`.
-    """
-    photos = stored_photos(files, camera_file)
-    return None if photos is None else as_tensor(photos)
-
-
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    """:func:`read_photos` as c arrays ``[h,w,3]`` uint8."""
+    """The photos of the cameras: from the folder, an ``.npz`` or ``.torch``, or where the camera file itself says.
+
+    None if there are none. Raises as :func:`gsmerge.io.read_images`.
+    """
     photos = _stored_photos(files, camera_file)
-    size = int(camera_file.widths[0]), int(camera_file.heights[0])
-    if photos is None or camera_file.source != SHARP or photo_size(photos) == size:
+    old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
+    if photos is None or old is None or camera_file.source != SHARP or old == size:
         return photos
-    return resize_to((photos[0].shape[1], photos[0].shape[0]), size).photos(photos)
+    return resize_to(old, size).photos(photos)
 
 
 def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
@@ -106,44 +86,36 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
 def limit_photo_size(
     photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
 ) -> tuple[Photos | None, list[str]]:
-    """Decoded photos at a size that memory has room for; and a note about it.
+    """Decoded photos at a size that memory has room for, none of what does not fit longer than ``max_side``; and a
+    note.
 
-    Args:
-        photos: c uint8 photos of one size.
-        rows: Gaussians of the file: where they may be the photos' pixels as they are, the photos stay.
-        max_side: Longest side of what does not fit, pixels.
-        unaligned: Whether the Gaussians are known to belong to no pixels: then no photo stays larger than that.
+    Where the file's Gaussians (``rows``) may be the photos' pixels as they are, the photos stay; not where they are
+    known to be unaligned.
     """
     size = photo_size(photos)
-    if photos is None or size is None or max(size) <= max_side:
+    if photos is None or size is None:
         return photos, []
     pixels = len(photos) * size[0] * size[1]
     if not unaligned and (_FLOAT_PIXEL * pixels <= _MAX_BYTES or 2 * rows > pixels):
         return photos, []
-    to = _limit(size, max_side)
-    return resize_to(size, to).photos(photos), [_note(size, to, max_side)]
+    transform, notes = _limit(size, max_side)
+    return photos if transform is None else transform.photos(photos), notes
 
 
 def limit_view_size(cameras: Cameras, images: Tensor | None, max_side: int) -> tuple[Cameras, Tensor | None, list[str]]:
     """Cameras and photos ``[c,h,w,3]`` of unaligned Gaussians, no side longer than ``max_side`` pixels; and a note."""
-    size = cameras.width, cameras.height
+    transform, notes = _limit((cameras.width, cameras.height), max_side)
+    if transform is not None:
+        cameras = transform.cameras(cameras)
+        images = None if images is None else torch.from_numpy(np.stack(transform.photos(images.numpy())))
+    return cameras, images, notes
+
+
+def _limit(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
+    """What brings pictures to ``max_side``, and a note; None where nothing has to."""
     if max(size) <= max_side:
-        return cameras, images, []
-    to = _limit(size, max_side)
-    transform = resize_to(size, to)
-    smaller = replace(cameras, Ks=transform.intrinsics(cameras.Ks), width=to[0], height=to[1])
-    if images is not None:
-        images = torch.from_numpy(np.stack(transform.photos(images.numpy())))
-    return smaller, images, [_note(size, to, max_side)]
-
-
-def _limit(size: Size, max_side: int) -> Size:
-    scale = min(1.0, max_side / max(size))
-    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-
-
-def _note(size: Size, to: Size, max_side: int) -> str:
-    return (
-        f"views of {size[0]} x {size[1]} are worked on at {to[0]} x {to[1]}: no side is longer than {max_side} pixels"
-        " (max_side)"
-    )
+        return None, []
+    scale = max_side / max(size)
+    width, height = (max(1, round(side * scale)) for side in size)
+    note = f"views of {size[0]} x {size[1]} are worked on at {width} x {height}"
+    return resize_to(size, (width, height)), [f"{note}: no side is longer than {max_side} pixels (max_side)"]

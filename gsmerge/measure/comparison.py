@@ -13,19 +13,12 @@ from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 @dataclass(frozen=True)
 class Storage:
-    """What a file holds.
+    """What a file holds."""
 
-    Args:
-        path: The file.
-        num_gaussians: Rows.
-        bytes: Of the file.
-        by_attribute: Bytes of the rows by attribute.
-    """
-
-    path: str
-    num_gaussians: int
-    bytes: int
-    by_attribute: Mapping[str, int]
+    path: str  # the file
+    num_gaussians: int  # rows
+    bytes: int  # of the file
+    by_attribute: Mapping[str, int]  # bytes of the rows by attribute
 
     @property
     def bytes_each(self) -> float:
@@ -35,48 +28,28 @@ class Storage:
 
 @dataclass(frozen=True)
 class SceneCosts:
-    """What one of the scenes costs.
+    """What one of the scenes costs."""
 
-    Args:
-        name: As given.
-        storage: Of its file.
-        speeds: Render time at every size and on every device.
-        overdraw: Gaussians blended per pixel.
-        merge_seconds: Time that making it took; None where it is not known.
-    """
-
-    name: str
-    storage: Storage
-    speeds: tuple[Speed, ...]
-    overdraw: float
-    merge_seconds: float | None
+    name: str  # as given
+    storage: Storage  # of its file
+    speeds: tuple[Speed, ...]  # render time at every size and on every device
+    overdraw: float  # Gaussians blended per pixel
+    merge_seconds: float | None  # time that making it took; None where it is not known
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A scene and its compact versions.
+    """A scene and its compact versions."""
 
-    Args:
-        before: The scene.
-        after: Its compact versions.
-        quality: Of all of them.
-    """
-
-    before: SceneCosts
-    after: tuple[SceneCosts, ...]
-    quality: Evaluation
+    before: SceneCosts  # the scene
+    after: tuple[SceneCosts, ...]  # its compact versions
+    quality: Evaluation  # of all of them
 
 
 def break_even(merge_seconds: float, before: float, after: float) -> float | None:
     """Frames after which merging has paid for itself in render time (paper, supplement: timing).
 
-    Args:
-        merge_seconds: Time that merging took.
-        before: Seconds per frame of the input.
-        after: Seconds per frame of the result.
-
-    Returns:
-        None where the result does not render faster.
+    ``before`` and ``after`` are seconds per frame; None where the result does not render faster.
     """
     return merge_seconds / (before - after) if after < before else None
 
@@ -93,17 +66,9 @@ def compare(
 ) -> Comparison:
     """Measure a scene and its compact versions.
 
-    Args:
-        scene: The input, with views.
-        results: Compact Gaussians by name, in the scene's world.
-        storage: What their files hold, by name; the scene's under "input".
-        targets: Held-out views; None: the input views alone.
-        options: Which measures of quality.
-        long_sides: Pixels along the longer side to render at; None: the views' own, and twice that.
-        merge_seconds: Time that making the results took, by name, where it is known.
-
-    Raises:
-        UsageError: If a size is not positive, or as :func:`gsmerge.evaluate`.
+    ``storage`` has what their files hold, by name, the scene's under "input"; ``merge_seconds`` the time that making
+    them took, where it is known. ``long_sides`` are pixels along the longer side to render at, by default the views'
+    own, and twice that. A UsageError if one is not positive, or as :func:`gsmerge.evaluate`.
     """
     own = max(scene.cameras.width, scene.cameras.height)
     sides = (own, 2 * own) if long_sides is None else long_sides

@@ -23,14 +23,11 @@ _STYLE = (
 def comparison_document(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]:
     """A comparison as plain JSON types.
 
-    Returns:
-        ``schema_version`` 1: tool, before, after (storage, factors, speeds, overdraw, merge seconds, break-even
-        frames), quality as of ``evaluate``, notes. Keys are only ever added within one schema version.
+    ``schema_version`` 1: tool, before, after (storage, factors, speeds, overdraw, merge seconds, break-even frames),
+    quality as of ``evaluate``, notes. Keys are only ever added within one schema version.
     """
-    files = {
-        side.name: {"path": side.storage.path, "bytes": side.storage.bytes}
-        for side in (comparison.before, *comparison.after)
-    }
+    sides = (comparison.before, *comparison.after)
+    files = {side.name: {"path": side.storage.path, "bytes": side.storage.bytes} for side in sides}
     quality = evaluation_document(comparison.quality, files)
     return {
         **document_head(),
@@ -75,17 +72,11 @@ def _tables(document: Mapping[str, Any]) -> Iterator[tuple[str, Row, list[Row]]]
     head = ("", "Gaussians", "bytes each", "file", "smaller by", "of it by count", "by bytes each")
     yield "Storage", head, rows
     names = list(dict.fromkeys(name for side in sides for name in side["by_attribute"]))
-    yield (
-        "Bytes by attribute",
-        ("", *names),
-        [(s["name"], *(human_bytes(s["by_attribute"].get(name, 0)) for name in names)) for s in sides],
-    )
+    rows = [(side["name"], *(human_bytes(side["by_attribute"].get(name, 0)) for name in names)) for side in sides]
+    yield "Bytes by attribute", ("", *names), rows
     yield "Rendering", ("", "device", "size", "ms a frame", "faster by", "earned back after"), list(_speed_rows(sides))
-    yield (
-        "Overdraw",
-        ("", "Gaussians blended into a pixel"),
-        [(side["name"], f"{side['overdraw']:.1f}") for side in sides],
-    )
+    rows = [(side["name"], f"{side['overdraw']:.1f}") for side in sides]
+    yield "Overdraw", ("", "Gaussians blended into a pixel"), rows
     yield _quality_table(document["quality"])
 
 
@@ -128,12 +119,7 @@ def _line(cells: Row) -> str:
 
 
 def comparison_html(document: Mapping[str, Any], picture: bytes | None = None) -> str:
-    """The comparison as one HTML file, which loads nothing.
-
-    Args:
-        document: As of :func:`comparison_document`.
-        picture: A PNG to be shown, such as a contact sheet; None: none.
-    """
+    """The comparison, with a PNG such as a contact sheet if there is one, as one HTML file, which loads nothing."""
     title = html.escape(f"{document['before']['path']}: before and after")
     parts = [f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
     for heading, head, rows in _tables(document):

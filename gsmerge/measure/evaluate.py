@@ -75,57 +75,34 @@ class Views:
 
 @dataclass(frozen=True)
 class Quality:
-    """How close an image is to another one; None where it was not measured.
+    """How close an image is to another one; None where it was not measured."""
 
-    Args:
-        psnr: dB; inf for equal pictures.
-        ssim: At most 1.
-        lpips_vgg: At least 0, lower is closer.
-        lpips_alex: The same with AlexNet.
-    """
-
-    psnr: float | None = None
-    ssim: float | None = None
-    lpips_vgg: float | None = None
-    lpips_alex: float | None = None
+    psnr: float | None = None  # dB; inf for equal pictures
+    ssim: float | None = None  # at most 1
+    lpips_vgg: float | None = None  # at least 0, lower is closer
+    lpips_alex: float | None = None  # the same with AlexNet
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One result in one view.
+    """One result in one view."""
 
-    Args:
-        split: "context": an input view; "target": one that was held out.
-        view: Its name.
-        visible: Share of the pixels that the input views have seen.
-        full: Over all pixels.
-        masked: Over those that the input views have seen (supplement A).
-    """
-
-    split: str
-    view: str
-    visible: float
-    full: Quality
-    masked: Quality
+    split: str  # "context": an input view; "target": one that was held out
+    view: str  # its name
+    visible: float  # share of the pixels that the input views have seen
+    full: Quality  # over all pixels
+    masked: Quality  # over those that the input views have seen (supplement A)
 
 
 @dataclass(frozen=True)
 class ResultScores:
-    """One result.
+    """One result."""
 
-    Args:
-        name: As given.
-        num_gaussians: Their number.
-        ratio: Of the input's.
-        render_seconds: Mean wall time of one view, all threads.
-        scores: One for each view.
-    """
-
-    name: str
-    num_gaussians: int
-    ratio: float
-    render_seconds: float
-    scores: tuple[ViewScore, ...]
+    name: str  # as given
+    num_gaussians: int  # their number
+    ratio: float  # of the input's
+    render_seconds: float  # mean wall time of one view, all threads
+    scores: tuple[ViewScore, ...]  # one for each view
 
     def mean(self, split: str) -> tuple[Quality, Quality]:
         """Means over the views of a split: over all pixels, and over the visible ones."""
@@ -161,12 +138,9 @@ def evaluate(
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out ones.
 
-    Args:
-        scene: The input. Without photos, results are compared with its own renders.
-        results: Gaussians by name, in the scene's world.
-        targets: Held-out views in the scene's world, see :func:`gsmerge.io.read_held_out`; None: input views alone.
-        options: What is measured.
-        progress: Called with ("evaluate", done, total) after each result.
+    ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
+    ``targets`` are held-out views in that world, see :func:`gsmerge.io.read_held_out`; ``progress`` is called with
+    ("evaluate", done, total) after each result.
 
     Raises:
         UsageError: If the scene has no views, or a result is called "input".
@@ -202,11 +176,7 @@ def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) ->
 
 
 def near_plane(scene: PixelScene | UnalignedScene) -> float:
-    """Near plane where a scene and its results are compared, world units.
-
-    Raises:
-        ValueError: If there is no valid Gaussian or no view.
-    """
+    """Near plane where a scene and its results are compared, world units; there must be a valid Gaussian and a view."""
     return NEAR * scene_frame(scene).unit
 
 
@@ -223,15 +193,13 @@ def _splits(
     scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, near: float
 ) -> dict[str, Views]:
     """The views by split, with their photos or the input's renders."""
-    splits = {}
-    if options.context or targets is None:
-        images = scene.images
-        if images is None:
-            images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
-        splits["context"] = Views(scene.cameras, images, scene.names)
-    if targets is not None:
-        splits["target"] = targets
-    return splits
+    target = {} if targets is None else {"target": targets}
+    if targets is not None and not options.context:
+        return target
+    images = scene.images
+    if images is None:
+        images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
+    return {"context": Views(scene.cameras, images, scene.names), **target}
 
 
 def _score_result(
@@ -252,24 +220,17 @@ def _score_result(
             image = _image(gaussians, views.cameras, i, near)
             seconds, count = seconds + time.perf_counter() - start, count + 1
             nets = options.lpips if i in perceptual else ()
-            scores.append(_score(split, view, image.numpy(), views.images[i].numpy(), visible[split][i], nets))
-    return ResultScores(
-        name, len(gaussians), len(gaussians) / max(num_input, 1), seconds / max(count, 1), tuple(scores)
-    )
+            photo, seen = views.images[i].numpy(), visible[split][i]
+            full = _quality(image.numpy(), photo, None, nets)
+            masked = full if seen.all() else _quality(image.numpy(), photo, seen, nets) if seen.any() else Quality()
+            scores.append(ViewScore(split, view, float(seen.mean()), full, masked))
+    ratio = len(gaussians) / max(num_input, 1)
+    return ResultScores(name, len(gaussians), ratio, seconds / max(count, 1), tuple(scores))
 
 
 def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
     """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
     return render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
-
-
-def _score(
-    split: str, view: str, image: np.ndarray, photo: np.ndarray, visible: NDArray[np.bool_], nets: Sequence[str]
-) -> ViewScore:
-    share = float(visible.mean())
-    full = _quality(image, photo, None, nets)
-    masked = full if visible.all() else _quality(image, photo, visible, nets) if visible.any() else Quality()
-    return ViewScore(split, view, share, full, masked)
 
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
@@ -282,8 +243,5 @@ def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | Non
 
 
 def _mean(scores: Sequence[Quality]) -> Quality:
-    means = {}
-    for field in fields(Quality):
-        values = [value for score in scores if (value := getattr(score, field.name)) is not None]
-        means[field.name] = float(np.mean(values)) if values else None
-    return Quality(**means)
+    columns = {f.name: [v for one in scores if (v := getattr(one, f.name)) is not None] for f in fields(Quality)}
+    return Quality(**{name: float(np.mean(values)) if values else None for name, values in columns.items()})

@@ -7,6 +7,7 @@ import os
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from gsmerge.errors import SceneError
@@ -22,108 +23,95 @@ from gsmerge.io import (
     read_cameras,
     read_ply_with_hints,
 )
-from gsmerge.io.alignment.unaligned import CameraCheck, check_cameras
+from gsmerge.io.alignment.poses import CameraCheck, check_cameras
 from gsmerge.io.exporters import exporter_names
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
-from gsmerge.io.formats.ply_writer import file_bytes
+from gsmerge.io.formats.writing import file_bytes
 from gsmerge.io.hints import make_hints
-from gsmerge.measure.extents import Coverage, Extents, coverage, extents
 from gsmerge.options import CompactOptions
 from gsmerge.report import finite
 from gsmerge.runtime.estimate import estimate_run
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.group import default_count
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
+MAX_SAMPLES = 200_000  # Gaussians that are measured
+OUTLIER_BOX = 10.0  # times the box of 1 % to 99 %: what lies beyond is an outlier
+HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
 _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
 _OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
 
 
 @dataclass(frozen=True)
+class Extents:
+    """Where the Gaussians lie and how large they are, world units."""
+
+    box_low: tuple[float, ...]  # 1 % quantile of the positions per axis
+    box_high: tuple[float, ...]  # 99 % quantile of the same
+    diagonal: float  # of that box
+    share_outliers: float  # share of the Gaussians outside of the box made ten times as large about its middle
+    scale_median: float  # of each Gaussian's largest scale
+    scale_max: float  # the largest scale of all
+    share_huge: float  # share of the Gaussians whose largest scale is above a tenth of the diagonal
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What one view shows."""
+
+    name: str  # of its image
+    share_of_pixels: float | None  # share of the pixels that have a visible Gaussian of their own; None without pixels
+    share_of_gaussians: float  # share of all Gaussians whose centre is inside the picture
+
+
+@dataclass(frozen=True)
 class Inspection:
-    """Everything that was recognised, in plain Python values.
+    """Everything that was recognised, in plain Python values."""
 
-    Args:
-        path: The ``.ply``.
-        layout: Name of the column layout.
-        format: "ascii", "binary little-endian" or "binary big-endian".
-        count: Gaussians in the file.
-        bytes: Size of the file.
-        bytes_by_attribute: Bytes of the rows by attribute.
-        extra_columns: Columns that mean nothing here.
-        extra_elements: Elements besides ``vertex``.
-        sh_degree: 0 to 4.
-        opacity_encoding: "logit" or "raw".
-        extents: How far the Gaussians reach, outliers, and how large they are.
-        box_low: 1 % quantile of the positions per axis, world units.
-        box_high: 99 % quantile of the same.
-        num_nonfinite: Rows with NaN or inf.
-        num_clipped_scales: Gaussians with a scale beyond what a float32 covariance can hold.
-        num_zero_quats: Gaussians without a rotation.
-        num_opaque: Gaussians with an opacity of at least 0.995.
-        num_transparent: Finite Gaussians with an opacity below 1/255.
-        num_saturated: Finite Gaussians with an opacity within 1e-6 of 0 or 1.
-        num_views: Cameras, 0 without; with pixels, those that the file has.
-        per_pixel: Gaussians of each pixel; 0 without pixels.
-        num_missing: Pixels of the views that the file has no Gaussian for.
-        width: Of the Gaussian grid, pixels; 0 while it is not verified.
-        height: The same.
-        cameras: Where the cameras are; None without.
-        camera_format: Name of their format.
-        images: Where the images are; None without.
-        alignment: The measured alignment; None if it could not be measured.
-        alignment_problem: Why the scene is not known to have one Gaussian per pixel; None if it has.
-        exporter: The exporters that may have written the file.
-        rows: Which order of the rows fits best, and by how much; None without pixels.
-        alignment_score: Share of the Gaussians at most one pixel from their pixels' centres; None without pixels.
-        alignment_margin: How many times nearer they are than in the second-best order; None without pixels.
-        sight: How many of the Gaussians the cameras see, and how far colours are from the photos; None without
-            cameras that fit.
-        coverage: What every view shows.
-        estimate: What ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
-            ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would
-            refuse the scene.
-        notes: Warnings about the input and what was adapted, one sentence each.
-    """
-
-    path: str
-    layout: str
-    format: str
-    count: int
-    bytes: int
-    bytes_by_attribute: dict[str, int]
-    extra_columns: tuple[str, ...]
-    extra_elements: tuple[str, ...]
-    sh_degree: int
-    opacity_encoding: str
-    extents: Extents
-    box_low: tuple[float, ...]
-    box_high: tuple[float, ...]
-    num_nonfinite: int
-    num_clipped_scales: int
-    num_zero_quats: int
-    num_opaque: int
-    num_transparent: int
-    num_saturated: int
-    notes: tuple[str, ...]
-    exporter: str
-    num_views: int = 0
-    per_pixel: int = 0
-    num_missing: int = 0
-    width: int = 0
-    height: int = 0
-    cameras: str | None = None
-    camera_format: str | None = None
-    images: str | None = None
-    alignment: Alignment | None = None
-    alignment_problem: str | None = None
-    rows: str | None = None
+    path: str  # the ``.ply``
+    layout: str  # name of the column layout
+    format: str  # "ascii", "binary little-endian" or "binary big-endian"
+    count: int  # Gaussians in the file
+    bytes: int  # size of the file
+    bytes_by_attribute: dict[str, int]  # bytes of the rows by attribute
+    extra_columns: tuple[str, ...]  # columns that mean nothing here
+    extra_elements: tuple[str, ...]  # elements besides ``vertex``
+    sh_degree: int  # 0 to 4
+    opacity_encoding: str  # "logit" or "raw"
+    extents: Extents  # how far the Gaussians reach, outliers, and how large they are
+    box_low: tuple[float, ...]  # 1 % quantile of the positions per axis, world units
+    box_high: tuple[float, ...]  # 99 % quantile of the same
+    num_nonfinite: int  # rows with NaN or inf
+    num_clipped_scales: int  # Gaussians with a scale beyond what a float32 covariance can hold
+    num_zero_quats: int  # Gaussians without a rotation
+    num_opaque: int  # Gaussians with an opacity of at least 0.995
+    num_transparent: int  # finite Gaussians with an opacity below 1/255
+    num_saturated: int  # finite Gaussians with an opacity within 1e-6 of 0 or 1
+    notes: tuple[str, ...]  # warnings about the input and what was adapted, one sentence each
+    exporter: str  # the exporters that may have written the file
+    num_views: int = 0  # cameras, 0 without; with pixels, those that the file has
+    per_pixel: int = 0  # Gaussians of each pixel; 0 without pixels
+    num_missing: int = 0  # pixels of the views that the file has no Gaussian for
+    width: int = 0  # of the Gaussian grid, pixels; 0 while it is not verified
+    height: int = 0  # the same
+    cameras: str | None = None  # where the cameras are; None without
+    camera_format: str | None = None  # name of their format
+    images: str | None = None  # where the images are; None without
+    alignment: Alignment | None = None  # the measured alignment; None if it could not be measured
+    alignment_problem: str | None = None  # why the scene is not known to have one Gaussian per pixel; None if it has
+    rows: str | None = None  # which order of the rows fits best, and by how much; None without pixels
+    # share of the Gaussians at most one pixel from their pixels' centres; None without pixels
     alignment_score: float | None = None
+    # how many times nearer they are than in the second-best order; None without pixels
     alignment_margin: float | None = None
+    # how many of the Gaussians the cameras see, and how far colours are from the photos; None without cameras that fit
     sight: CameraCheck | None = None
-    coverage: tuple[Coverage, ...] = ()
+    coverage: tuple[Coverage, ...] = ()  # what every view shows
+    # what ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
+    # ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would refuse the
+    # scene.
     estimate: dict[str, float] | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -141,17 +129,12 @@ def inspect(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Inspection:
-    """Say what a scene is made of, and whether it has one Gaussian per pixel of its views.
+    """Say what a scene, a ``.ply`` or the folder of one, is made of, and whether it has one Gaussian per pixel.
 
-    Cameras that are missing or do not fit are reported, not raised.
-
-    Args:
-        path: A ``.ply`` or a folder that has one.
-        cameras: Camera file or folder; None: next to the ``.ply``.
-        images: Folder of images, or an ``.npz`` that holds them; None: next to the ``.ply``.
-        opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
-        **hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
-            ``max_side``.
+    Cameras that are missing or do not fit are reported, not raised. ``cameras``, a file or a folder, and ``images``, a
+    folder or an ``.npz``, are searched next to the ``.ply`` unless they are given. ``opacity`` is as of
+    :func:`gsmerge.io.read_ply`; ``hints`` are fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``,
+    ``order``, ``scene_scale``, ``max_side``.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist.
@@ -221,9 +204,8 @@ def _sight(load: SceneLoad) -> CameraCheck | None:
     scene = load.scene
     if len(scene) == 0:
         return None
-    valid = torch.ones(len(scene.gaussians), dtype=torch.bool)
-    if isinstance(scene, PixelScene):
-        valid = scene.stored.reshape(-1)
+    whole = torch.ones(len(scene.gaussians), dtype=torch.bool)
+    valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else whole
     return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
 
@@ -246,3 +228,52 @@ def estimate(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
             num_rest=3 * scene.gaussians.shN.shape[1],
         ),
     }
+
+
+def extents(gaussians: Gaussians) -> Extents:
+    """Measure finite Gaussians; zeros where there are none. Large scenes are sampled, except for the largest scale."""
+    if len(gaussians) == 0:
+        return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0)
+    step = -(-len(gaussians) // MAX_SAMPLES)
+    points = gaussians.means[::step].numpy().astype(np.float64)
+    largest = gaussians.scales.amax(1).numpy()
+    low, high = np.percentile(points, (1, 99), axis=0)
+    diagonal = float(np.linalg.norm(high - low))
+    half = np.maximum((high - low) / 2, 1e-3 * max(diagonal, 1e-30))
+    outside = (np.abs(points - (low + high) / 2) > OUTLIER_BOX * half).any(1)
+    return Extents(
+        box_low=tuple(map(float, low)),
+        box_high=tuple(map(float, high)),
+        diagonal=diagonal,
+        share_outliers=float(outside.mean()),
+        scale_median=float(np.median(largest[::step])),
+        scale_max=float(largest.max()),
+        share_huge=float((largest[::step] > HUGE_SCALE_SHARE * diagonal).mean()),
+    )
+
+
+def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
+    """What every view shows of a scene; of several Gaussians per pixel each layer is a view."""
+    if len(scene) == 0:
+        return ()
+    rows = torch.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
+    if isinstance(scene, PixelScene):
+        rows = rows[scene.stored.reshape(-1)[rows]]
+    shares = _shares_inside(scene.gaussians.means[rows].numpy().astype(np.float64), scene.cameras)
+    pixels: list[float | None] = [None] * len(scene)
+    if isinstance(scene, PixelScene):
+        visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
+        pixels = [float(view.double().mean()) for view in visible]
+    return tuple(map(Coverage, scene.names, pixels, shares))
+
+
+def _shares_inside(points: np.ndarray, cameras: Cameras) -> list[float]:
+    size = np.array([cameras.width, cameras.height])
+    shares = []
+    for viewmat, K in zip(cameras.viewmats.double().numpy(), cameras.Ks.double().numpy(), strict=True):
+        image = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+        with np.errstate(all="ignore"):
+            xy = image[:, :2] / image[:, 2:]
+        inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < size).all(1)
+        shares.append(float(inside.mean()) if len(points) else 0.0)
+    return shares

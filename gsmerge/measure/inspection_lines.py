@@ -14,11 +14,7 @@ _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
-    """An inspection for people.
-
-    Args:
-        scene: ``Inspection.to_dict()``.
-    """
+    """An inspection, as of ``Inspection.to_dict()``, for people."""
     parts = ", ".join(f"{name} {human_bytes(size)}" for name, size in scene["bytes_by_attribute"].items())
     ignored = _ignored(scene)
     low, high = (" ".join(f"{value:.4g}" for value in scene[key]) for key in ("box_low", "box_high"))

@@ -82,80 +82,55 @@ def lpips(
 ) -> float:
     """Learned perceptual distance (LPIPS, Zhang et al. 2018, version 0.1): 0 for equal images, lower is closer.
 
-    Args:
-        image: ``[h,w,3]`` sRGB in [0, 1], at least 16 x 16 pixels for vgg, 31 x 31 for alex.
-        reference: ``[h,w,3]``.
-        net: ``"vgg"`` (VGG-16) or ``"alex"`` (AlexNet); the figures of the two do not compare.
-        mask: ``[h,w]`` pixels that count; the others are taken from ``reference`` before the networks see them,
-            so they add nothing of their own, and the mean stays over the whole image. None: all count.
-
-    Returns:
-        The distance, at least 0.
+    The images are ``[h,w,3]`` sRGB in [0, 1], at least 16 x 16 pixels for ``"vgg"`` (VGG-16), 31 x 31 for ``"alex"``
+    (AlexNet); the figures of the two do not compare. Pixels outside of ``mask [h,w]`` are taken from ``reference``
+    before the networks see them, so they add nothing of their own, and the mean stays over the whole image.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.
         SceneError: If a file of weights does not hold what it should.
         ValueError: If the shapes differ, the images are too small, no pixel counts or ``net`` is unknown.
     """
-    architecture = _architecture(net)
     first, second = image_pair(image, reference)
     if first.shape[2] != 3:
         raise ValueError(f"expected two images [h,w,3] of one shape, got {list(first.shape)} and {list(second.shape)}")
-    if min(first.shape[:2]) < architecture.min_size:
-        size = architecture.min_size
+    size = min_size(net)
+    if min(first.shape[:2]) < size:
         raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
-    return _distance(first, second, _load(_weights_file(net), net))
+    layers = _load(_weights_file(net), net)
+    features = _kept_features(second, layers)
+    with torch.inference_mode():
+        return float(_weighted(_unit_features(_as_tensor(first), layers), features, layers))
 
 
 def lpips_available(net: str = "vgg") -> bool:
-    """Whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed.
-
-    Raises:
-        ValueError: If ``net`` is unknown.
-    """
+    """Whether the weights of ``net``, ``"vgg"`` or ``"alex"``, are installed."""
     return _find_weights(net) is not None
 
 
 def require_lpips(net: str) -> None:
-    """Refuse to go on without the weights of ``net``.
-
-    Raises:
-        GsmergeError: If they are not installed.
-    """
+    """Raise a GsmergeError if the weights of ``net`` are not installed."""
     _weights_file(net)
 
 
 def min_size(net: str) -> int:
-    """Pixels per side of the smallest image that ``net`` takes.
-
-    Raises:
-        ValueError: If ``net`` is unknown.
-    """
+    """Pixels per side of the smallest image that ``net`` takes."""
     return _architecture(net).min_size
 
 
 def _architecture(net: str) -> _Architecture:
+    """A ValueError if ``net`` is unknown."""
     if net not in _ARCHITECTURES:
         raise ValueError(f"net: expected {' or '.join(_ARCHITECTURES)}, got {net}")
     return _ARCHITECTURES[net]
 
 
 def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
-    """:func:`lpips`, differentiable in ``image``.
+    """:func:`lpips`, differentiable in ``image``, ``[h,w,3]`` float32 on the CPU; the reference has no gradient.
 
-    Args:
-        image: ``[h,w,3]`` float32 on the CPU, sRGB in [0, 1].
-        reference: ``[h,w,3]``, without gradient.
-        mask: ``[h,w]`` pixels that count.
-        net: As there.
-
-    Returns:
-        The distance; 0 where the images are too small for the network or no pixel counts.
-
-    Raises:
-        GsmergeError: If the package with the weights is not installed.
+    0 where the images are too small for the network or no pixel counts.
     """
     if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
         return image.new_zeros(())
@@ -165,13 +140,6 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
 
 
-def _distance(image: Array, reference: Array, layers: tuple[_Layer, ...]) -> float:
-    """Of arrays, without gradients."""
-    kept = _kept_features(reference, layers)
-    with torch.inference_mode():
-        return float(_weighted(_unit_features(_as_tensor(image), layers), kept, layers))
-
-
 def _as_tensor(image: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image, np.float32))
 
@@ -179,14 +147,10 @@ def _as_tensor(image: Array) -> Tensor:
 def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_Layer, ...]) -> Tensor:
     """Squared differences of unit features, weighted, averaged over pixels, added up (equation 1 of Zhang et al.)."""
     distance = torch.zeros((), dtype=torch.float64)
-    for weights, unit, other in zip(_compared(layers), units, others, strict=True):
+    compared = [layer.weights for layer in layers if layer.weights is not None]
+    for weights, unit, other in zip(compared, units, others, strict=True):
         distance = distance + ((unit - other).square().mean((1, 2)) @ weights).double()
     return distance
-
-
-def _compared(layers: tuple[_Layer, ...]) -> list[Tensor]:
-    """The weights of those layers that are compared."""
-    return [layer.weights for layer in layers if layer.weights is not None]
 
 
 def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]:
@@ -237,11 +201,7 @@ def _weights_file(net: str) -> Path:
 
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[_Layer, ...]:
-    """The layers of ``net`` from its file.
-
-    Raises:
-        SceneError: If the file is no pickle of float arrays, or of other ones.
-    """
+    """The layers of ``net`` from its file; a SceneError if that is no pickle of float arrays, or of other ones."""
     with path.open("rb") as stream:
         try:
             return _layers(_ArrayUnpickler(stream).load(), _architecture(net))

@@ -45,19 +45,10 @@ def contact_sheet(
     min_width: int = 320,
     near: float = 0.01,
 ) -> Picture:
-    """One row per view: the photo where there is one, then each scene from the same camera.
+    """One row per view, at most ``max_views``: the photo where there is one, then each scene from the same camera.
 
-    Args:
-        scenes: Name and Gaussians of each scene.
-        cameras: The cameras.
-        photos: ``[c,h,w,3]`` of the same cameras, or None.
-        max_views: Largest number of rows, evenly spread over the cameras.
-        min_width: Small renders are enlarged by a whole factor until a tile has this many columns.
-        near: Near plane, world units.
-
-    Returns:
-        ``[h,w,3]`` 8 bit RGB. Every render is labelled with its number of Gaussians, and with its PSNR against
-        the photo, or without photos against the first scene.
+    Every render is labelled with its number of Gaussians, and with its PSNR against the photo ``[c,h,w,3]``, or without
+    photos against the first scene. Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
     """
     ids = pick_views(len(cameras), max_views)
     factor = max(1, -(-min_width // cameras.width))
@@ -88,12 +79,7 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
 
 
 def draw_borders(image: Tensor, labels: Tensor) -> Picture:
-    """The photo with the borders between superpixels in yellow.
-
-    Args:
-        image: ``[h,w,3]`` sRGB in [0, 1].
-        labels: ``[h,w]`` integers.
-    """
+    """The photo ``[h,w,3]`` (sRGB in [0, 1]) with the borders between superpixels ``[h,w]`` in yellow."""
     picture, ids = to_picture(image).copy(), labels.numpy()
     border = np.zeros(ids.shape, bool)
     border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
@@ -103,12 +89,7 @@ def draw_borders(image: Tensor, labels: Tensor) -> Picture:
 
 
 def draw_means(image: Tensor, labels: Tensor) -> Picture:
-    """Every superpixel filled with its mean colour.
-
-    Args:
-        image: ``[h,w,3]`` sRGB in [0, 1].
-        labels: ``[h,w]`` integers from 0.
-    """
+    """Every superpixel ``[h,w]`` (from 0) filled with its mean colour of ``[h,w,3]`` sRGB in [0, 1]."""
     flat = labels.reshape(-1).long()
     count = int(flat.max()) + 1
     sums = torch.zeros(count, 3, dtype=torch.float64).index_add_(0, flat, image.reshape(-1, 3).double())
@@ -120,5 +101,10 @@ def draw_heat(values: Tensor) -> Picture:
     """``[h,w]`` non-negative values as a heat map, the 99th percentile at the top."""
     top = float(torch.quantile(values.double().flatten(), 0.99)) or 1.0
     level = (values.double() / top).clamp(0, 1)
-    colored = cv2.applyColorMap((level.numpy() * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
+    return heat_map(level.numpy())
+
+
+def heat_map(levels: np.ndarray) -> Picture:
+    """``[h,w]`` levels in [0, 1] from black through red to yellow."""
+    colored = cv2.applyColorMap((levels * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
     return np.ascontiguousarray(colored[..., ::-1], np.uint8)

@@ -22,16 +22,10 @@ CSV_COLUMNS = (
 def evaluation_document(
     evaluation: Evaluation, files: Mapping[str, Mapping[str, Any]], notes: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """An evaluation as plain JSON types.
+    """An evaluation as plain JSON types, with what is known of each result's file (path, bytes, bytes by attribute).
 
-    Args:
-        evaluation: The figures.
-        files: For each result what is known of its file: path, bytes, bytes by attribute.
-        notes: What the readers had to say.
-
-    Returns:
-        ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a
-        score for each view), notes. Keys are only ever added within one schema version.
+    ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a score
+    for each view), notes. Keys are only ever added within one schema version.
     """
     return {
         **document_head(),
@@ -43,17 +37,13 @@ def evaluation_document(
 
 
 def _result(one: ResultScores, splits: Mapping[str, int], file: Mapping[str, Any]) -> dict[str, Any]:
-    means = {}
-    for split in splits:
-        full, masked = one.mean(split)
-        means[split] = _flat(full, masked)
     return {
         "name": one.name,
         **file,
         "num_gaussians": one.num_gaussians,
         "ratio": one.ratio,
         "render_seconds": round(one.render_seconds, 5),
-        "mean": means,
+        "mean": {split: _flat(*one.mean(split)) for split in splits},
         "views": [
             {"split": s.split, "view": s.view, "visible_share": s.visible, **_flat(s.full, s.masked)}
             for s in one.scores
@@ -80,7 +70,8 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
     """A table for people: one line for each result and split, over the pixels that the input views have seen."""
-    nets = [name for name in ("lpips_vgg", "lpips_alex") if _measured(document, name + MASKED)]
+    means = [mean for result in document["results"] for mean in result["mean"].values()]
+    nets = [net for net in ("lpips_vgg", "lpips_alex") if any(mean[net + MASKED] is not None for mean in means)]
     width = max(6, *(len(result["name"]) for result in document["results"]))
     head = f"{'result':{width}}  {'Gaussians':>12}  {'kept':>7}  {'size':>9}  {'ms/view':>8}  {'views':<8} {'PSNR':>6}"
     head += "   SSIM" + "".join(f"  {name.replace('lpips_', 'LPIPS '):>10}" for name in nets)
@@ -88,17 +79,11 @@ def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
     for result in document["results"]:
         size = human_bytes(result["bytes"]) if "bytes" in result else ""
         for split, mean in result["mean"].items():
-            line = (
-                f"{result['name']:{width}}  {result['num_gaussians']:>12,}  {100 * result['ratio']:>6.2f}%  {size:>9}"
-            )
-            line += f"  {1000 * result['render_seconds']:>8.1f}  {split:<8}"
+            line = f"{result['name']:{width}}  {result['num_gaussians']:>12,}  {100 * result['ratio']:>6.2f}%"
+            line += f"  {size:>9}  {1000 * result['render_seconds']:>8.1f}  {split:<8}"
             line += f" {_number(mean['psnr' + MASKED], 2):>6}  {_number(mean['ssim' + MASKED], 3)}"
             lines.append(line + "".join(f"  {_number(mean[name + MASKED], 3):>10}" for name in nets))
     return lines
-
-
-def _measured(document: Mapping[str, Any], name: str) -> bool:
-    return any(mean[name] is not None for result in document["results"] for mean in result["mean"].values())
 
 
 def _number(value: float | None, digits: int) -> str:

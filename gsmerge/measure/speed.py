@@ -22,21 +22,13 @@ MAX_REPEATED_SECONDS = 2.0  # what takes longer is rendered once
 
 @dataclass(frozen=True)
 class Speed:
-    """Time to render one view of a scene.
+    """Time to render one view of a scene."""
 
-    Args:
-        device: "cpu" or "cuda".
-        width: Of the picture, pixels.
-        height: The same.
-        threads: Processor threads that rendered it; 0 on a GPU.
-        seconds: Mean over some views of the shortest of some repetitions.
-    """
-
-    device: str
-    width: int
-    height: int
-    threads: int
-    seconds: float
+    device: str  # "cpu" or "cuda"
+    width: int  # of the picture, pixels
+    height: int  # the same
+    threads: int  # processor threads that rendered it; 0 on a GPU
+    seconds: float  # mean over some views of the shortest of some repetitions
 
 
 def resized(cameras: Cameras, long_side: int) -> Cameras:
@@ -55,16 +47,10 @@ def measure_speeds(
     *,
     threads: int | None = None,
 ) -> dict[str, tuple[Speed, ...]]:
-    """Render scenes from the same views at several sizes, also with CUDA where it can be used.
+    """Render scenes from a few of the views at several sizes, also with CUDA where it can be used.
 
-    The scenes take turns, so that a machine that slows down slows all of them.
-
-    Args:
-        scenes: Gaussians by name.
-        cameras: Views; some of them are rendered.
-        long_sides: Pixels along the longer side.
-        near: Near plane, world units.
-        threads: Threads on the processor; None: all.
+    The scenes take turns, so that a machine that slows down slows all of them. ``long_sides`` are pixels along the
+    longer side, ``near`` is in world units.
     """
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     speeds: dict[str, list[Speed]] = {name: [] for name in scenes}
@@ -83,17 +69,18 @@ def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float)
     """Seconds per view of each scene, one after the other and again."""
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
     for gaussians in scenes.values():  # compiles, and fills caches
-        _draw(gaussians, views[[0]], near)
+        time_render(gaussians, views[[0]], near)
     for turn in range(REPEATS):
         for name, gaussians in scenes.items():
             if turn and shortest[name].max() > MAX_REPEATED_SECONDS:
                 continue
             for view in range(len(views)):
-                shortest[name][view] = min(shortest[name][view], _draw(gaussians, views[[view]], near))
+                shortest[name][view] = min(shortest[name][view], time_render(gaussians, views[[view]], near))
     return {name: float(seconds.mean()) for name, seconds in shortest.items()}
 
 
-def _draw(gaussians: Gaussians, view: Cameras, near: float) -> float:
+def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
+    """Seconds to render a view."""
     start = time.perf_counter()
     image = render(gaussians, view, near=near).images
     if image.is_cuda:

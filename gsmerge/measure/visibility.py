@@ -17,14 +17,9 @@ _DILATION = 3  # pixels of the input views per side of the square that every sam
 
 
 def context_points(scene: PixelScene | UnalignedScene, near: float) -> Points:
-    """A point in the world for every pixel of the input views: their depth samples.
+    """``[n,3]`` a point in the world for every pixel of the input views: their depth samples.
 
-    Args:
-        scene: Of a scene with pixels the Gaussians are the samples; otherwise its depth is rendered.
-        near: Nearest depth that is rendered, world units.
-
-    Returns:
-        ``[n,3]``.
+    Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered.
     """
     if isinstance(scene, PixelScene):
         return np.asarray(scene.gaussians.means[scene.valid.reshape(-1)].double().numpy())
@@ -42,17 +37,10 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
-    """Pixels on which, or next to which, at least one of the points falls, whatever occludes it.
+    """``[c,h,w]`` pixels on which, or next to which, at least one of the points ``[n,3]`` falls, whatever occludes it.
 
-    Args:
-        points: ``[n,3]`` depth samples of the input views, see :func:`context_points`.
-        cameras: The views to be scored.
-        near: Samples nearer than this do not count, world units.
-        sources: The input views: where the scored views have smaller pixels, a sample marks proportionally more of
-            them, as there would be gaps otherwise; None: pixels of the same size.
-
-    Returns:
-        ``[c,h,w]`` bool.
+    Points nearer than ``near``, world units, do not count. Where the views have smaller pixels than those that the
+    points come from (``sources``), a point marks proportionally more of them, as there would be gaps otherwise.
     """
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     size = np.array([cameras.width, cameras.height])
@@ -76,10 +64,5 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
     """Pixels per side, an odd number, of the square that a sample marks in a view with the intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
-    own = np.median(_focal(sources.Ks.double().numpy()))
-    return max(_DILATION, 2 * round((_DILATION * float(_focal(K) / own) - 1) / 2) + 1)
-
-
-def _focal(Ks: np.ndarray) -> np.ndarray:
-    """``[...]`` mean focal lengths of ``[...,3,3]`` intrinsics, pixels."""
-    return np.asarray(np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]))
+    focals = [np.sqrt(one[..., 0, 0] * one[..., 1, 1]) for one in (K, sources.Ks.double().numpy())]  # pixels
+    return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)

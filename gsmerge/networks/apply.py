@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsmerge.geometry import rotmat_to_quat
+from gsmerge.geometry import covariances, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
 from gsmerge.networks.residuals import (
@@ -113,12 +113,13 @@ def apply_encoding(
 
 
 def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Feature Gaussians as the K = 1 head would decode them, for matching (paper section 4.3)."""
-    if context.networks.options.outputs == "absolute":
-        return features  # such a head does not correct the moments
-    group_features = context.describe(features)
-    residuals = run_heads(group_features.base, np.arange(len(features)), features, group_features, context)
-    return move_features(features, group_features.base, residuals, group_features.frames)
+    """Feature Gaussians with means and covariances as the K = 1 head decodes them, for matching (paper section 4.3)."""
+    group_features, own = context.describe(features), np.arange(len(features))
+    if context.networks.options.outputs == "residual":  # of the moments themselves, exactly
+        residuals = run_heads(group_features.base, own, features, group_features, context)
+        return move_features(features, group_features.base, residuals, group_features.frames)
+    decoded = decode_with_group_features(group_features.base, own, features, group_features, context)
+    return replace(features, means=decoded.means, covars=covariances(decoded.quats, decoded.scales))
 
 
 def merge_features(
@@ -233,7 +234,8 @@ def decode_gaussians(
 ) -> Gaussians:
     """Children of Feature Gaussians with the corrections of the head for their number (paper section 4.3).
 
-    Three children take three slots of the head for four; five and more stay as they are.
+    Three children take three slots of the head for four. Five to eight are corrected in two halves, each like the
+    children of a group of its own; heads with absolute outputs know only one group, and leave them as they are.
 
     Args:
         children: Analytic Gaussians, those of one Feature Gaussian next to each other.
@@ -264,15 +266,16 @@ def prepare_children(
     group_features: GroupFeatures,
     networks: Networks,
 ) -> Gaussians:
-    """The Gaussians that the heads correct: the children; for absolute outputs a round grey Gaussian for each.
+    """The Gaussians that the heads correct: the children; for absolute outputs a round Gaussian for each.
 
-    It lies at its group's mean, as large as the group, half transparent, with the axes of the group's frame. Children
-    of the backing layer, and five or more of one parent, stay as they are: no head corrects them.
+    It lies at its group's mean and has its base colour, from which the head's outputs are offsets (paper section 4.3).
+    It is as large as the group, half transparent, with the axes of the group's frame. Children of the backing layer,
+    and five or more of one parent, stay as they are: no head corrects them.
     """
     if networks.options.outputs == "residual":
         return children
     sizes = np.bincount(parents, minlength=len(features))[parents]
-    replaced = torch.from_numpy((sizes <= SLOTS[-1]) & ~features.backing.numpy()[parents])
+    replaced = torch.from_numpy((sizes <= networks.max_children) & ~features.backing.numpy()[parents])
     own = torch.from_numpy(parents)
     means, scales = group_features.base.means[own], group_features.sizes[own, None].expand(-1, 3)
     quats = rotmat_to_quat(group_features.frames.double())[own].to(children.quats)
@@ -282,7 +285,7 @@ def prepare_children(
         quats=torch.where(replaced[:, None], quats, children.quats),
         scales=torch.where(replaced[:, None], scales, children.scales),
         opacities=torch.where(replaced, 0.5, children.opacities),
-        sh0=torch.where(replaced[:, None, None], 0.0, children.sh0),
+        sh0=torch.where(replaced[:, None, None], group_features.base.sh0[own], children.sh0),
     )
 
 
@@ -293,23 +296,33 @@ def run_heads(
     group_features: GroupFeatures,
     context: NetworkContext,
 ) -> Tensor:
-    """``[n,13]`` bounded corrections of children; zero for the backing layer and for five or more of one parent."""
+    """``[n,13]`` bounded corrections of children; zero where no head looks."""
     networks = context.networks
-    sizes = np.bincount(parents, minlength=len(features))
-    first = np.cumsum(sizes) - sizes
+    first, sizes, owners = _families(parents, len(features), halves=networks.max_children > SLOTS[-1])
     residuals = torch.zeros(len(children), RESIDUAL)
     for slots, fewest in zip(SLOTS, (1, 2, 3), strict=True):
-        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots) & ~features.backing.numpy())
+        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots) & ~features.backing.numpy()[owners])
         if len(rows) == 0:
             continue
         places = np.arange(slots)[None]
         mask = places < sizes[rows, None]
         ids = first[rows, None] + np.where(mask, places, 0)
-        raw = _run_head(slots, children, (rows, ids, mask), features, group_features, context)
+        raw = _run_head(slots, children, (owners[rows], ids, mask), features, group_features, context)
         valid = torch.from_numpy(mask.reshape(-1))
         ids_valid = torch.from_numpy(ids.reshape(-1))[valid]
         residuals = residuals.index_copy(0, ids_valid, bound_residuals(raw[valid], networks.options.head_bounds))
     return residuals
+
+
+def _families(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Children that one head looks at together, first, number and parent: those of a parent, many in two halves."""
+    sizes = np.bincount(parents, minlength=count)
+    first = np.cumsum(sizes) - sizes
+    large = (sizes > SLOTS[-1]) & halves
+    half = np.where(large, (sizes + 1) // 2, sizes)
+    begin = np.concatenate([first, (first + half)[large]])
+    num = np.concatenate([half, (sizes - half)[large]])
+    return begin, num, np.concatenate([np.arange(count), np.flatnonzero(large)])
 
 
 def _run_head(

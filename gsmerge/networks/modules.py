@@ -184,6 +184,11 @@ class Networks(nn.Module):
         self.heads = nn.ModuleDict({str(slots): Head(slots, self.options) for slots in SLOTS})
 
     @property
+    def max_children(self) -> int:
+        """Most children of a group that the heads correct; many in two halves, which absolute outputs do not know."""
+        return SLOTS[-1] if self.options.outputs == "absolute" else 2 * SLOTS[-1]
+
+    @property
     def num_parameters(self) -> int:
         """Weights in the checkpoint."""
         return sum(p.numel() for p in self.parameters())

@@ -61,7 +61,7 @@ class NetworkOptions:
         neighbors: Neighbours that the refiner reads.
         bounds: Largest corrections.
         outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, as in the paper: they do not
-            read these, and correct a round grey Gaussian at the group's mean, within wide bounds.
+            read these, and correct a round Gaussian of the group's mean and base colour, within wide bounds.
 
     Raises:
         ValueError: If a size is out of range or they do not go together.

@@ -177,7 +177,7 @@ def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, option
         raise UsageError(
             "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
         )
-    if options.decode.k > max_k:
+    if options.decode.max_k > max_k:
         raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:

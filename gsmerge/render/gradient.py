@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.kernels.raster import blend_backward, harmonics_backward, project_backward
+from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
 from gsmerge.render.blend import view_colors
 from gsmerge.render.plan import Array, ViewPlan, pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -201,7 +201,7 @@ def color_gradients(
         sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), rest, (3,)))
     with use_threads() as threads:
         parallel_map(
-            lambda span: harmonics_backward.view_colors_backward(
+            lambda span: harmonics.view_colors_backward(
                 splats.means, splats.shN, plan.ids, plan.eye, *span, colors, grad_colors, sh0, shN, means
             ),
             pieces(m, threads),

@@ -22,7 +22,7 @@ COST_SCORE = 0.07  # for each scored view: rendering from input and output
 COST_ROBUST = 1.6
 COST_COLOR_FIT = 0.9
 COST_FIT_RENDERS = 1.5  # what the full fit renders of all views besides its steps
-COST_BASELINES = {"paper": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
+COST_BASELINES = {"moment-matching": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
 COST_OTHER_BASELINE = 0.2
 COST_UNMERGED_STEP = 0.15  # for each step of the full fit of an input that was not merged
 # Processor seconds per step of the full fit and million pixels of one view:

@@ -100,7 +100,7 @@ def split_unseen(
     if num_unseen in (0, len(seen)):
         return scene, options, None
     count = exact_count(options.budget, len(seen), scene.gaussians.sh_degree)
-    rate = options.segment.share * options.decode.k if count is None else count / len(seen)
+    rate = options.segment.share * options.decode.mean_k if count is None else count / len(seen)
     unseen = scene.gaussians[~seen & (scene.gaussians.opacities >= options.decode.min_opacity)]
     num_kept = min(len(unseen), int(rate * num_unseen))
     if count is not None:

@@ -15,6 +15,8 @@ from gsmerge.stages.merge import MergedViews
 from gsmerge.types import FeatureGaussians, Gaussians
 
 MAX_CHILDREN = 8
+MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
+K_RULES = ("saliency", "distortion")
 GROUPS_PER_TASK = 8192
 PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
 
@@ -24,21 +26,45 @@ class DecodeOptions:
     """How many Gaussians a Feature Gaussian becomes.
 
     Args:
-        k: Children of each group, 1 to 8.
-        min_opacity: Gaussians below this opacity are left out (paper section 4.3).
+        k: Children of each group, 1 to 8; or ``"mixed"``: 1, 2 or 4 (paper supplement, per-superpixel K).
+        k_low: Percentile of ``"mixed"`` up to which groups become one Gaussian. The paper's percentiles are 33.3 and
+            66.7, which give more Gaussians than K = 2 everywhere.
+        k_high: Percentile above which they become four.
+        k_rule: What the percentiles are of: ``"saliency"``: the mean corner response of the group's pixels, as in the
+            paper. ``"distortion"``: as many Gaussians, where they lower distortion most.
+        min_opacity: Gaussians below this opacity are left out (paper section 4.3, tau_a).
 
     Raises:
-        ValueError: If K is not within 1 to 8 or the opacity not within 0 to 1.
+        ValueError: If a setting is unknown or out of range.
     """
 
-    k: int = 1
+    k: int | str = 1
+    k_low: float = 50.0
+    k_high: float = 85.0
+    k_rule: str = "saliency"
     min_opacity: float = 1 / 255
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
-            raise ValueError(f"k: expected 1 to {MAX_CHILDREN}, got {self.k!r}")
+        if self.k != MIXED and not (isinstance(self.k, int) and 1 <= self.k <= MAX_CHILDREN):
+            raise ValueError(f"k: expected 1 to {MAX_CHILDREN} or {MIXED}, got {self.k!r}")
+        if not 0 <= self.k_low <= 100:
+            raise ValueError(f"k_low: expected 0 to 100, got {self.k_low}")
+        if not self.k_low <= self.k_high <= 100:
+            raise ValueError(f"k_high: expected {self.k_low:g}, which is k_low, to 100, got {self.k_high}")
+        if self.k_rule not in K_RULES:
+            raise ValueError(f"k_rule: expected {' or '.join(K_RULES)}, got {self.k_rule!r}")
         if not 0 <= self.min_opacity <= 1:
             raise ValueError(f"min_opacity: expected 0 to 1, got {self.min_opacity}")
+
+    @property
+    def mean_k(self) -> float:
+        """Children of a group on average."""
+        return float(self.k) if self.k != MIXED else 1 + (100 - self.k_low + 2 * (100 - self.k_high)) / 100
+
+    @property
+    def max_k(self) -> int:
+        """Most children of a group."""
+        return MIXED_COUNTS[-1] if self.k == MIXED else int(self.k)
 
 
 def decode(
@@ -58,7 +84,8 @@ def decode(
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
-        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter.
+        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter. Needed where
+            K is mixed.
         rule: How children are pooled, the encoder's.
         networks: Networks whose heads correct the children; None: none does.
 
@@ -69,7 +96,7 @@ def decode(
         ValueError: If ``counts`` has the wrong shape or a count below 1.
     """
     if counts is None:
-        counts = np.full(len(features), options.k)
+        counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
@@ -98,9 +125,41 @@ def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions
     """``count`` Gaussians, spent where they lower distortion most; None: K of each Feature Gaussian."""
     if count is None and options.k == 1 and merged.k1_gaussians is not None:
         return merged.k1_gaussians
-    features, members = merged.features, merged.members
-    children = None if count is None else split_counts(features, members, max(0, count - len(features)))
-    return decode(features, members, options, children, rule, merged.networks)
+    features, members, networks = merged.features, merged.members, merged.networks
+    children = None
+    if count is not None:
+        most = MAX_CHILDREN if networks is None else networks.networks.max_children
+        children = split_counts(features, members, max(0, count - len(features)), most)
+    elif options.k == MIXED:
+        assert merged.saliency is not None
+        children = mixed_counts(features, members, merged.saliency, options)
+    return decode(features, members, options, children, rule, networks)
+
+
+def mixed_counts(
+    features: FeatureGaussians, members: Members, saliency: np.ndarray, options: DecodeOptions
+) -> np.ndarray:
+    """A K of 1, 2 or 4 for every group by its place among all (paper supplement, per-superpixel K).
+
+    Args:
+        features: g Feature Gaussians.
+        members: The scene's Gaussians.
+        saliency: ``[v·h·w]`` corner response of every pixel.
+        options: Percentiles and rule.
+
+    Returns:
+        ``[g]`` int64.
+    """
+    starts, ids = features.starts.numpy(), features.members.numpy()
+    pixels = ids if members.pixels is None else members.pixels[ids]
+    values = np.where(pixels >= 0, saliency[pixels], 0.0)
+    means = np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
+    front = ~features.backing.numpy()
+    low, high = np.percentile(means[front], (options.k_low, options.k_high)) if front.any() else (0.0, 0.0)
+    counts = np.where(front, 1 + (means > low) + 2 * (means > high), 1)
+    if options.k_rule == "distortion":
+        return split_counts(features, members, int((counts - 1).sum()), MIXED_COUNTS[-1])
+    return counts
 
 
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
@@ -113,14 +172,14 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     segmentation, members = merged.segmentation, merged.members
     if segmentation.exact and not grows:
         return segmentation.count
-    if members.pixels is None:
+    if members.pixels is None or options.k == MIXED:
         return None
     groups = segmentation.groups
     sizes = np.array(groups.counts)
     seen = members.pixels[members.pixels >= 0]
     labels = groups.labels.reshape(-1).numpy()[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].numel()]
     num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
-    return min(segmentation.count, options.k * (len(merged.features) + len(groups) - num_filled))
+    return min(segmentation.count, options.max_k * (len(merged.features) + len(groups) - num_filled))
 
 
 def divide(

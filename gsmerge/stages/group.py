@@ -72,10 +72,11 @@ def count_limits(scene: PixelScene | UnalignedScene, options: CompactOptions) ->
 def default_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
     """Gaussians that ``superpixels`` and K ask for; of a scene without views, a share of its Gaussians."""
     if len(scene) == 0:
-        return max(1, int(options.segment.share * scene.num_gaussians)) * options.decode.k
+        return round(max(1, int(options.segment.share * scene.num_gaussians)) * options.decode.mean_k)
     per_view = superpixels_per_view(scene, options)
     total = per_view * scene.num_gaussians // scene.pixels_per_view
-    return max(len(scene), total if isinstance(scene, PixelScene) else per_view * len(scene)) * options.decode.k
+    total = max(len(scene), total if isinstance(scene, PixelScene) else per_view * len(scene))
+    return round(total * options.decode.mean_k)
 
 
 def budget_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int | None:

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from torch.nn.functional import normalize
 
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks import NetworkContext, match_geometry
@@ -22,15 +23,18 @@ class MatchOptions:
     """When two Feature Gaussians are taken for one.
 
     Args:
-        match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes) and star clusters
-            that cannot chain. ``"aabb"``: the paper's box IoU and connected components. ``"none"``: no merging
-            across views. None: ``"overlap"``, but ``"none"`` for a draft.
+        match: ``"overlap"``: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and
+            star clusters that cannot chain. ``"aabb"``, as in the paper (section 4.4): box IoU, similar latents, and
+            connected components. ``"none"``: no merging across views. None: ``"overlap"``, but ``"none"`` for a draft.
         effort: Of the whole run; ``"draft"`` matters here.
         geometry: Of what is compared where networks are loaded: ``"analytic"``, that of the moments, or ``"decoded"``,
             that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
-        overlap: Least overlap, 0 to 1.
+        overlap: Least overlap of ``"overlap"``, 0 to 1.
+        iou: Least IoU of the boxes of ``"aabb"``, 0 to 1 (tau_g).
+        similarity: Least cosine of the latents of ``"aabb"``, -1 to 1 (tau_f). Without networks there are no
+            latents, and colours are compared in their place.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
-        neighbors: Nearest neighbours in 3D that are compared, the own view's included.
+        neighbors: Nearest neighbours of other views in 3D that are compared (k).
         cluster_size: Most Feature Gaussians in a star cluster; None: as many as there are views (a cluster holds
             one of each view at most).
 
@@ -42,6 +46,8 @@ class MatchOptions:
     effort: str = "default"
     geometry: Geometry = "analytic"
     overlap: float = 0.7
+    iou: float = 0.2
+    similarity: float = 0.8
     max_color: float = 0.12
     neighbors: int = 16
     cluster_size: int | None = None
@@ -51,8 +57,11 @@ class MatchOptions:
             raise ValueError(f'match: expected "overlap", "aabb" or "none", got "{self.match}"')
         if self.geometry not in ("analytic", "decoded"):
             raise ValueError(f'geometry: expected "analytic" or "decoded", got "{self.geometry}"')
-        if not 0 <= self.overlap <= 1:
-            raise ValueError(f"overlap: expected 0 to 1, got {self.overlap}")
+        for name, low in (("overlap", 0), ("iou", 0), ("similarity", -1)):
+            if not low <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected {low} to 1, got {getattr(self, name)}")
+        if not self.max_color >= 0:
+            raise ValueError(f"max_color: expected at least 0, got {self.max_color}")
         if self.neighbors < 1:
             raise ValueError(f"neighbors: expected at least 1, got {self.neighbors}")
         if self.cluster_size is not None and self.cluster_size < 1:
@@ -93,23 +102,40 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     means, views = features.means.double().numpy()[rows], features.views.numpy()[rows]
     covars = features.covars.double().numpy()[rows].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[:, 0].double().numpy()[rows]
-    neighbors, boxes = _nearest(means, options.neighbors), options.method == "aabb"
+    neighbors, boxes = nearest_of_other_views(means, views, options.neighbors), options.method == "aabb"
+    latents = normalize(features.latents if boxes else features.latents[:, :0], dim=1).detach().numpy()[rows]
     scores = np.empty(neighbors.shape)
-    edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, views, options.max_color, boxes, scores)
+    limits = options.max_color, options.similarity
+    edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, latents, views, *limits, boxes, scores)
     if boxes:
-        return connected_components(neighbors, scores, options.overlap)
+        return connected_components(neighbors, scores, options.iou)
     order = np.lexsort((*means.T, -features.weights.numpy()[rows]))
     size = options.cluster_size or len(np.unique(views))
     return leader_clusters(order, neighbors, scores, views, options.overlap, size)
 
 
-def _nearest(means: np.ndarray, count: int) -> np.ndarray:
-    """``[g,k]`` int64 nearest neighbours of each point, without itself; -1 where there are fewer."""
+def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
+    """``[g,count]`` int64 nearest points of other views than the own (paper section 4.4), nearest first.
+
+    Among the nearest 16 times as many of all views; -1 where there are fewer. What lies behind so many of the own
+    view overlaps nothing.
+
+    Args:
+        means: ``[g,3]``.
+        views: ``[g]``; points of views below 0 belong to none, and count as of another one.
+        count: Neighbours of each.
+    """
     from scipy.spatial import cKDTree  # late: a quarter of a second that --match none does not need
 
-    k = min(count + 1, len(means))
+    tree, neighbors = cKDTree(means), np.full((len(means), count), -1, np.int64)
+    rows, num_near, most = np.arange(len(means)), min(count + count // 2 + 1, len(means)), min(16 * count, len(means))
     with use_threads() as threads:
-        _, ids = cKDTree(means).query(means, k=k, workers=threads)
-    ids = ids.astype(np.int64)
-    ids[ids == np.arange(len(means))[:, None]] = -1
-    return ids
+        while len(rows):
+            _, ids = tree.query(means[rows], k=np.arange(1, num_near + 1), workers=threads)
+            other = (ids != rows[:, None]) & ((views[ids] != views[rows, None]) | (views[rows, None] < 0))
+            picked = np.argsort(~other, axis=1, kind="stable")[:, :count]
+            near = np.where(np.take_along_axis(other, picked, 1), np.take_along_axis(ids, picked, 1), -1)
+            neighbors[rows, : near.shape[1]] = near
+            rows = rows[other.sum(1) < count] if num_near < most else rows[:0]
+            num_near = min(2 * num_near, most)
+    return neighbors

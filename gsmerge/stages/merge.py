@@ -26,6 +26,7 @@ class MergedViews:
         networks: Networks that correct; None: those are not used.
         choices: What the stages decided, for the report.
         k1_gaussians: What they become at K = 1, where that had to be known to choose them; None elsewhere.
+        saliency: ``[v·h·w]`` corner response of every pixel, where K depends on it; None elsewhere.
     """
 
     features: FeatureGaussians
@@ -34,6 +35,7 @@ class MergedViews:
     networks: NetworkContext | None = None
     choices: Mapping[str, Any] = field(default_factory=dict)
     k1_gaussians: Gaussians | None = None
+    saliency: np.ndarray | None = None
 
 
 def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:

@@ -203,6 +203,8 @@ def prepare(
         photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
         name = options.networks(photos=photos, aligned=aligned)
         checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
+        if checkpoint is not None:
+            check_networks(checkpoint, options)
         scored = len(scored_views(len(scene))) if scene.images is not None else len(scene)
         log.notes += [*notes, *([f"the input views are scored on {scored} of {len(scene)}"] * (scored < len(scene)))]
         limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
@@ -213,6 +215,23 @@ def prepare(
         return prepared
     with log.stage("segment"):
         return with_tree(prepared)
+
+
+def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
+    """Do the networks give what the options ask of them?
+
+    Raises:
+        UsageError: If not.
+    """
+    outputs, most = checkpoint.networks.options.outputs, checkpoint.networks.max_children
+    if options.recipe == "paper" and outputs != "absolute":
+        raise UsageError(
+            f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
+            " gsmerge train --preset paper makes them"
+        )
+    if options.decode.max_k > most:
+        k, name = options.decode.k, checkpoint.path
+        raise UsageError(f"k: expected at most {most} with the absolute outputs of {name}, got {k}")
 
 
 def drop_repeats(

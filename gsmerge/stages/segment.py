@@ -204,6 +204,11 @@ def saliency(image: Tensor | np.ndarray) -> Tensor:
     return torch.from_numpy(_corner_response(_as_pixels(image)))
 
 
+def scene_saliency(images: Tensor) -> np.ndarray:
+    """``[v·h·w]`` :func:`saliency` of every pixel of all views ``[v,h,w,3]``."""
+    return np.concatenate(parallel_map(lambda image: _corner_response(_as_pixels(image)).reshape(-1), images))
+
+
 def _corner_response(pixels: np.ndarray) -> np.ndarray:
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     return np.maximum(cv2.cornerMinEigenVal(grey, 3, ksize=3), 0)

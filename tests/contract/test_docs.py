@@ -184,7 +184,8 @@ def test_defaults_in_help_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     in_help = dict(cli_defaults())
     known = {"k", "superpixels", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
-    known |= {"levels", "device", "checkpoint", "geometry"}
+    known |= {"levels", "device", "checkpoint", "geometry", "k_low", "k_high", "k_rule", "min_opacity"}
+    known |= {"neighbors", "overlap", "iou", "similarity", "max_color"}
     assert set(in_help) == known
     assert library["robust"] is None
     assert library["fit_steps"] is None
@@ -192,6 +193,7 @@ def test_defaults_in_help_are_the_library_s() -> None:
         "robust": "unless --fit full or a draft",
         "fit_steps": "by effort",
         "match": "overlap, none for a draft",
+        "min_opacity": "1/255",
     }
     real = {name: worded.get(name, str(library[name])) for name in in_help}
     assert in_help == real

@@ -31,7 +31,7 @@ SETTINGS = gsmerge.CompactOptions().to_dict()
 # Defaults that help describes, because they depend on other settings or on the machine
 WORDED = {
     "robust": "unless --fit full or a draft", "fit_steps": "by effort", "match": "overlap, none for a draft",
-    "threads": "all processors",
+    "threads": "all processors", "min_opacity": "1/255",
 }  # fmt: skip
 
 

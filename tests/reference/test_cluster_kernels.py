@@ -97,20 +97,24 @@ def test_overlap_does_not_depend_on_the_unit_or_the_axes(size: float) -> None:
     assert overlap(*moved) == pytest.approx(overlap(a, b), rel=1e-9)
 
 
+@pytest.mark.parametrize("width", [0, 3])
 @pytest.mark.parametrize("boxes", [True, False])
-def test_edge_scores_match(boxes: bool) -> None:
+def test_edge_scores_match(boxes: bool, width: int) -> None:
     gaussians = random_gaussians(30, 5, 0.2)
     rng = np.random.default_rng(0)
     neighbors = rng.integers(-1, 30, (30, 6))
     colors, views = rng.uniform(0, 0.3, (30, 3)), rng.integers(-1, 3, 30)
     means, covars = np.stack([g[0] for g in gaussians]), np.stack([upper(g[1]) for g in gaussians])
+    latents = rng.normal(size=(30, width)).astype(np.float32)
+    latents /= np.maximum(np.linalg.norm(latents, axis=1, keepdims=True), 1e-9)
     scores = np.empty(neighbors.shape)
-    edge_scores(neighbors, means, covars, colors, views, 0.2, boxes, scores)
+    edge_scores(neighbors, means, covars, colors, latents, views, 0.2, 0.3, boxes, scores)
     score = box_reference if boxes else overlap_reference
     for i, row in enumerate(neighbors):
         for k, j in enumerate(row):
             own = views[i] >= 0 and views[i] == views[j]
-            if j < 0 or own or np.linalg.norm(colors[i] - colors[j]) > 0.2:
+            unlike = latents[i] @ latents[j] < 0.3 if width else np.linalg.norm(colors[i] - colors[j]) > 0.2
+            if j < 0 or own or unlike:
                 assert scores[i, k] == -1
             else:
                 assert scores[i, k] == pytest.approx(score(gaussians[i], gaussians[j]), rel=1e-9)

@@ -53,7 +53,8 @@ def test_map_coordinates(room: PixelScene, settings: dict) -> None:
     footprint = float(np.median(scene_members(room).footprints))
     back = replace(there, means=there.means - torch.from_numpy(UTM))
     assert there.means.dtype == torch.float64
-    scenes.assert_same_set(here, back, atol=1e-3 * footprint + 2e-5)
+    # the axes of nearly round Gaussians turn by some thousand times the last bit, on each processor by others
+    scenes.assert_same_set(here, back, atol=1e-3 * footprint + 1e-4)
 
 
 def test_map_coordinates_at_every_stage_of_the_report(room: PixelScene) -> None:

@@ -134,7 +134,7 @@ def test_an_interrupted_write_leaves_the_old_file(scene_copy: Path, monkeypatch:
             raise KeyboardInterrupt
         return np.ones(rows.shape, bool)
 
-    monkeypatch.setattr("gsmerge.io.formats.ply_writer.np.isfinite", fail_at_the_third)
+    monkeypatch.setattr("gsmerge.io.formats.writing.np.isfinite", fail_at_the_third)
     with pytest.raises(KeyboardInterrupt):
         write_ply(path, gaussians, overwrite=True)
     monkeypatch.undo()

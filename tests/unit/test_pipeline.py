@@ -191,7 +191,7 @@ def test_input_is_left_alone(scene: PixelScene) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"k": 0}, "k: expected 1 to 8, got 0"),
+        ({"k": 0}, "k: expected 1 to 8 or mixed, got 0"),
         ({"superpixels": 32 * 24 + 1}, "superpixels: expected at most 768"),
         ({"match": "iou"}, "match: expected"),
         ({"kk": 1}, "unknown setting 'kk'"),

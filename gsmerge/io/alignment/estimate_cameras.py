@@ -8,79 +8,58 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from torch import Tensor
 
 from gsmerge.io.alignment.layouts import Layout, exact_layouts, subsample
-from gsmerge.io.alignment.score import pixel_limit
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+from gsmerge.io.alignment.score import find_correspondences, pixel_limit, split_blocks
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.types import Gaussians
 
 SOURCE = "estimated from the grid"
 _SAMPLES = 300  # Gaussians per view
 _MARGIN = 2.0  # by which the best order of the rows must beat the next one
 _ROUNDS = 2  # each time without the Gaussians that lie far from their pixels
-_FLAGS = (
-    cv2.CALIB_USE_INTRINSIC_GUESS
-    | cv2.CALIB_FIX_PRINCIPAL_POINT
-    | cv2.CALIB_FIX_ASPECT_RATIO
-    | cv2.CALIB_ZERO_TANGENT_DIST
-    | cv2.CALIB_FIX_K1
-    | cv2.CALIB_FIX_K2
-    | cv2.CALIB_FIX_K3
-)
+_NO_DISTORTION = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+_ONE_FOCAL = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
 
 
 def estimate_cameras(
-    path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
+    path: Path, gaussians: Gaussians, valid: Tensor, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
-    """Poses and one focal length under which every Gaussian projects into its own pixel.
+    """Poses and one focal length under which every row of a full or trimmed grid projects into its own pixel.
 
-    Args:
-        path: The ``.ply``, for messages.
-        gaussians: Its rows, of a full or a trimmed grid; one per pixel.
-        valid: ``[n]`` bool.
-        names: Of the views, in their order.
-        width: Of the views, pixels.
-        height: The same.
-
-    Returns:
-        None if no order of the rows fits at least twice as well as all others.
+    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for messages.
+    None if no order of the rows fits at least twice as well as all others.
     """
-    means = gaussians.means.numpy()
-    fits = []
-    for layout in exact_layouts(len(gaussians), len(names), width, height):
-        if layout.per_pixel == 1 and len(layout.views) == len(names):
-            fits.append(_calibrate(means, valid, subsample(layout, _SAMPLES)))
+    layouts = exact_layouts(len(gaussians), len(names), width, height)
+    possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
+    fits = [_calibrate(gaussians.means, valid, subsample(layout, _SAMPLES)) for layout in possible]
     fits.sort(key=lambda fit: fit[0])
     limit = pixel_limit(width, height)
     if not fits or fits[0][0] > limit or (len(fits) > 1 and fits[1][0] < _MARGIN * fits[0][0]):
         return None
     _, focal, poses = fits[0]
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    count = len(names)
-    return make_camera_file(path, SOURCE, W2C_OPENCV, poses, [K] * count, [(width, height)] * count, names)
+    K = make_pinhole(focal, focal, width / 2, height / 2)
+    views = [View(name, pose, K, (width, height)) for name, pose in zip(names, poses, strict=True)]
+    return make_camera_file(path, SOURCE, W2C_OPENCV, views)
 
 
-def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
+def _calibrate(means: Tensor, valid: Tensor, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
     """(largest median distance in pixels, focal length, poses) of one order of the rows; inf without one."""
-    points, pixels = [], []
-    for rows, cells in zip(layout.rows, layout.pixels, strict=True):
-        good = valid[rows]
-        y, x = np.divmod(cells[good], layout.width)
-        points.append(means[rows[good]].astype(np.float64))
-        pixels.append(np.stack([x, y], 1) + 0.5)
-    everything = np.concatenate(points)
-    middle = np.median(everything, 0)
-    unit = float(np.median(np.abs(everything - middle))) or 1.0
-    points = [(p - middle) / unit for p in points]
-    f = 1.2 * max(layout.width, layout.height)
-    K = np.array([[f, 0, layout.width / 2], [0, f, layout.height / 2], [0, 0, 1]])
+    pairs = find_correspondences(means, valid, layout)
+    middle = np.median(pairs.points, 0)
+    unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
+    points = split_blocks((pairs.points - middle) / unit, pairs, len(layout.views))
+    pixels = split_blocks(pairs.pixels, pairs, len(layout.views))
+    focal = 1.2 * max(layout.width, layout.height)
+    K = make_pinhole(focal, focal, layout.width / 2, layout.height / 2)
     kept = [np.ones(len(p), bool) for p in points]
     try:
         for _ in range(_ROUNDS):
             near = [p[k].astype(np.float32) for p, k in zip(points, kept, strict=True)]
             where = [p[k].astype(np.float32) for p, k in zip(pixels, kept, strict=True)]
             _, K, _, rotations, shifts = cv2.calibrateCamera(
-                near, where, (layout.width, layout.height), K, np.zeros(5), flags=_FLAGS
+                near, where, (layout.width, layout.height), K, np.zeros(5), flags=_ONE_FOCAL | _NO_DISTORTION
             )
             errors = [
                 np.linalg.norm(cv2.projectPoints(p, r, t, K, None)[0][:, 0] - q, axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.grid import GridFit, other_grids, photo_grid, small_photos_error
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
-from gsmerge.io.alignment.poses import check_one_fits, find_aligned_poses, other_conventions, poses_note
+from gsmerge.io.alignment.poses import choose_fit, find_aligned_poses, other_conventions
 from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput, color_error
 from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
@@ -27,19 +27,12 @@ _MAX_TRIED = 6  # fits that only the number of rows speaks for and that are trie
 
 @dataclass(frozen=True)
 class CameraFit:
-    """Cameras and photos at the size of the grid, and which row is which pixel.
-
-    Args:
-        inputs: The cameras and photos at the size of the grid, and the Gaussians.
-        recovery: Which row is which pixel; None where the rows belong to no pixels that could be recovered.
-        camera_file: The cameras as they were read in the end.
-        notes: What was adapted.
-    """
+    """Cameras and photos at the size of the grid, and which row is which pixel."""
 
     inputs: AlignmentInput
-    recovery: Recovery | None
-    camera_file: CameraFile
-    notes: list[str]
+    recovery: Recovery | None  # None where the rows belong to no pixels that could be recovered
+    camera_file: CameraFile  # as it was read in the end
+    notes: list[str]  # what was adapted
 
 
 @dataclass(frozen=True)
@@ -58,15 +51,8 @@ def fit_cameras(
 ) -> CameraFit:
     """Find the size, the transform of the photos and the convention of the poses under which the rows are pixels.
 
-    Args:
-        ply: The Gaussians.
-        camera_file: The cameras.
-        photos: c uint8 photos of one size, or None.
-        order: Of the rows, where it is known.
-        scale: Of the Gaussians' world in units of the cameras', where it is known.
-
-    Raises:
-        SceneError: If sizes do not agree, or several conventions fit.
+    ``photos`` are c uint8 ones of one size; ``order`` and ``scale`` are those of :class:`AlignmentInput`. SceneError if
+    sizes do not agree, or several conventions fit.
     """
     source = _Source(ply, photos, photo_size(photos), order, scale)
     try:
@@ -74,7 +60,7 @@ def fit_cameras(
     except SceneError as error:
         plain, problem = None, error
     searched = order == "none"
-    if not searched and (plain is None or _is_large(ply, plain)):
+    if not searched and (plain is None or len(plain.cameras) * math.prod(plain.size) > _LARGE * len(ply.gaussians)):
         searched, other_size = True, _other_size(source, camera_file)
         if other_size is not None:
             return other_size
@@ -92,7 +78,7 @@ def fit_cameras(
     other_poses = find_aligned_poses(inputs, camera_file) if recovery is None else None
     if other_poses is not None:
         poses, recovery = other_poses
-        notes.append(poses_note(poses, camera_file.convention))
+        notes.append(f"{poses.describe(camera_file.convention)}: read so")
         inputs = replace(inputs, cameras=with_poses(inputs.cameras, poses.viewmats))
         camera_file = with_convention(camera_file, poses.convention)
     if recovery is None and order not in MAY_BE_UNALIGNED:
@@ -105,60 +91,57 @@ def fit_cameras(
     return CameraFit(inputs, recovery, camera_file, notes)
 
 
-def _is_large(ply: PlyScene, plain: GridFit) -> bool:
-    pixels = len(plain.cameras) * plain.cameras.width * plain.cameras.height
-    return pixels > _LARGE * len(ply.gaussians)
-
-
 def _make_input(source: _Source, camera_file: CameraFile, fit: GridFit, *, photos: bool = True) -> AlignmentInput:
     """The scene with the cameras of one fit; without photos where only positions matter."""
     fitted = source.photos if photos else None
     if fitted is not None and fit.transform is not None:
         fitted = fit.transform.photos(fitted)
-    images = None if fitted is None else as_tensor(fitted)
-    depths: Callable[[], np.ndarray | None] = partial(read_depths, Path(camera_file.path))
-    labellings, ply = _labellings(camera_file.names), source.ply
-    return AlignmentInput(ply.gaussians, ply.valid, fit.cameras, images, labellings, depths, source.order, source.scale)
-
-
-def _labellings(names: Sequence[str]) -> list[list[int]]:
-    """Orders that the views may be in: that of the camera file, and that of the images' names."""
-    return [list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))]
+    names, ply = camera_file.names, source.ply
+    return AlignmentInput(
+        gaussians=ply.gaussians,
+        valid=ply.valid,
+        cameras=fit.cameras,
+        images=None if fitted is None else as_tensor(fitted),
+        labellings=[list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))],
+        depths=partial(read_depths, Path(camera_file.path)),
+        order=source.order,
+        scale=source.scale,
+    )
 
 
 def _other_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> CameraFit | None:
     """The fit at another size that puts the Gaussians nearest to their pixels; None where grids of two sizes do.
 
-    Those that only the number of rows speaks for are tried in the frame of the cameras first: there may be many.
-
-    Args:
-        source: All but the cameras.
-        camera_file: The cameras.
-        exact_frames: Try all of them only in that frame.
+    Those that only the number of rows speaks for are tried in the frame of the cameras first, because there may be
+    many; with ``exact_frames`` all are tried in that frame only.
     """
     recovered: list[tuple[GridFit, Recovery]] = []
     guesses: list[GridFit] = []
     make_input = partial(_make_input, source, camera_file)
+
+    def try_fit(fit: GridFit, *, exact_frames: bool) -> None:
+        recovery = recover(make_input(fit, photos=False), exact_frames=exact_frames)
+        if recovery is not None:
+            recovered.append((fit, recovery))
+
     for fit in other_grids(source.ply.info, camera_file, source.size):
         if recovered and fit.rank > recovered[0][0].rank:
             break
         if fit.guessed:
             guesses.append(fit)
-        recovery = recover(make_input(fit, photos=False), exact_frames=fit.guessed or exact_frames)
-        recovered += [] if recovery is None else [(fit, recovery)]
+        try_fit(fit, exact_frames=fit.guessed or exact_frames)
     for fit in guesses[:_MAX_TRIED] if not (recovered or exact_frames) else []:
-        recovery = recover(make_input(fit, photos=False))
-        recovered += [] if recovery is None else [(fit, recovery)]
+        try_fit(fit, exact_frames=False)
     if not recovered:
         return None
-    grid, best = min(((_grid(fit), recovery.best) for fit, recovery in recovered), key=lambda one: one[1].worst_px)
+    grid, best = min(((fit.size, recovery.best) for fit, recovery in recovered), key=lambda one: one[1].worst_px)
     px = best.worst_px
     exact = best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
-    others = (recovery for fit, recovery in recovered if _grid(fit) != grid)
+    others = (recovery for fit, recovery in recovered if fit.size != grid)
     if exact and any(other.best.worst_px < MARGIN * max(px, 1e-3) for other in others):
         return None
     near = max(_ALIKE * px, px + _ALIKE_PX)
-    alike = [(fit, r) for fit, r in recovered if _grid(fit) == grid and r.best.worst_px <= near]
+    alike = [(fit, r) for fit, r in recovered if fit.size == grid and r.best.worst_px <= near]
     fits = [CameraFit(make_input(fit), recovery, camera_file, list(fit.notes)) for fit, recovery in alike]
     if len(fits) == 1:
         return fits[0]
@@ -168,21 +151,15 @@ def _other_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool 
 
 def _other_size_and_poses(source: _Source, camera_file: CameraFile) -> CameraFit | None:
     """The one fit at another size, with the poses read in another way; only where no pixel and no frame is missing.
-
-    Raises:
-        SceneError: If several readings fit alike.
+    SceneError if several readings fit alike.
     """
     fits = []
     for poses in other_conventions(camera_file.viewmats.double().numpy(), camera_file.convention):
         fit = _other_size(source, with_convention(camera_file, poses.convention), exact_frames=True)
         if fit is not None and fit.recovery is not None:
-            fits.append((poses, fit.recovery, fit))
-    check_one_fits(camera_file, [(poses, recovery) for poses, recovery, _ in fits])
-    if not fits:
+            fits.append((poses, fit.recovery.best.worst_px, fit))
+    best = choose_fit(camera_file, fits)
+    if best is None:
         return None
-    poses, _, fit = min(fits, key=lambda one: one[1].best.worst_px)
-    return replace(fit, notes=[*fit.notes, poses_note(poses, camera_file.convention)])
-
-
-def _grid(fit: GridFit) -> tuple[int, int]:
-    return fit.cameras.width, fit.cameras.height
+    poses, fit = best
+    return replace(fit, notes=[*fit.notes, f"{poses.describe(camera_file.convention)}: read so"])

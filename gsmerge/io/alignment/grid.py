@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.layouts import PER_PIXEL, TRIM
@@ -23,18 +23,19 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 class GridFit:
     """One way to bring cameras and photos to the grid.
 
-    Args:
-        cameras: At the grid's size.
-        transform: What is done to the photos; None: nothing.
-        notes: What it is, for people.
-        rank: What speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
-            of rows alone (2); a network's usual sizes (3).
+    Its rank is what speaks for it: a size that files have (0); the number of rows and the photos' shape (1); the number
+    of rows alone (2); a network's usual sizes (3).
     """
 
-    cameras: Cameras
-    transform: PhotoTransform | None
-    notes: tuple[str, ...]
+    cameras: Cameras  # at the grid's size
+    transform: PhotoTransform | None  # what is done to the photos, if anything
+    notes: tuple[str, ...]  # what it is, for people
     rank: int = 0
+
+    @property
+    def size(self) -> Size:
+        """(width, height) of the grid."""
+        return self.cameras.width, self.cameras.height
 
     @property
     def guessed(self) -> bool:
@@ -43,35 +44,25 @@ class GridFit:
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
-    """The grid has the photos' size, or that of the cameras where there are no photos.
-
-    Raises:
-        SceneError: If the cameras' size is not the photos' or a multiple of it.
+    """The grid has the photos' size, or that of the cameras where there are no photos. SceneError if the cameras' size
+    is not the photos' or a multiple of it.
     """
     if size is None:
         return GridFit(to_cameras(camera_file), None, ())
     width, height = size
     for w, h in sizes_of(camera_file):
         if not same_shape((w, h), size):
+            problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
             swapped = (w, h) == (height, width)
-            raise SceneError(
-                camera_file.path,
-                f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}",
-                "width and height are swapped" if swapped else "crop cameras and images alike",
-            )
+            remedy = "width and height are swapped" if swapped else "crop cameras and images alike"
+            raise SceneError(camera_file.path, problem, remedy)
     other = [s for s in sizes_of(camera_file) if s != size]
     notes = tuple(f"intrinsics scaled from {w} x {h} to the images' {width} x {height}" for w, h in other)
     return GridFit(to_cameras(camera_file, size), None, notes)
 
 
 def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
-    """All other grids that the files and the number of rows allow, the likely ones first.
-
-    Args:
-        ply: What the header of the ``.ply`` says.
-        camera_file: The cameras at the size that their file has.
-        size: (width, height) of the photos; None without any.
-    """
+    """All other grids that the files and the number of rows allow, the likely ones first; ``size`` is the photos'."""
     known = sizes_of(camera_file)
     own = known[0] if len(known) == 1 else None
     if size is not None and own is not None and own != size:
@@ -80,13 +71,13 @@ def other_grids(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> Ite
     if base is None or any(not same_shape(s, base) for s in known):
         return
     cameras = to_cameras(camera_file, base)
-    patches = patch_grids(base) if ply.sh_degree == 0 and ply.opacity_encoding == "logit" else iter(())
     what = "photos and cameras" if size is not None else "cameras"
-    for rank, transform in [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)] + [
-        (3, t) for t in patches if ply.count < len(camera_file) * t.width * t.height
-    ]:
+    ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
+    if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
+        ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
+    for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
-        yield GridFit(_transformed(cameras, transform), transform, (note,), rank)
+        yield GridFit(transform.cameras(cameras), transform, (note,), rank)
         if not known and transform.crops:
             whole = to_cameras(camera_file, (transform.width, transform.height))
             yield GridFit(whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
@@ -103,22 +94,11 @@ def _between(camera_file: CameraFile, size: Size, own: Size) -> Iterator[GridFit
     if not same_shape(own, size):
         for transform in (resize_to(own, size), resize_and_crop(own, size)):
             note = f"cameras of {own[0]} x {own[1]} are {transform.description}, the images' size"
-            yield GridFit(_transformed(cameras, transform), None, (note,))
-
-
-def _transformed(cameras: Cameras, transform: PhotoTransform) -> Cameras:
-    Ks = transform.intrinsics(cameras.Ks)
-    return replace(cameras, Ks=Ks, width=transform.width, height=transform.height)
+            yield GridFit(transform.cameras(cameras), None, (note,))
 
 
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
-    """Transforms to smaller grids that the number of rows allows, with as many rows for each of all views.
-
-    Args:
-        count: Rows of the file.
-        views: Cameras.
-        size: Of the photos, pixels.
-    """
+    """Transforms of photos to smaller grids that ``count`` rows allow, with as many for each of all ``views``."""
     crops: list[PhotoTransform] = []
     for trim in (0, TRIM):
         for per_pixel in PER_PIXEL:
@@ -144,19 +124,17 @@ def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
             yield to
 
 
-def patch_grids(size: Size) -> Iterator[PhotoTransform]:
+def patch_grids(size: Size) -> list[PhotoTransform]:
     """Transforms of networks that take multiples of 14: each side to the nearest one, or cropped to it."""
-    known = set()
+    transforms = []
     for side in SIDES:
-        for whole in (max(size), min(size)):
-            scale = side / whole
-            nearest = tuple(PATCH * max(1, round(s * scale / PATCH)) for s in size)
-            below = tuple(PATCH * max(1, int(round(s * scale) // PATCH)) for s in size)
-            resized, cropped = (nearest[0], nearest[1]), (below[0], below[1])
-            for transform in (resize_to(size, resized), resize_and_crop(size, cropped, scale)):
-                if transform not in known and scale <= 1:
-                    known.add(transform)
-                    yield transform
+        for scale in (side / max(size), side / min(size)):
+            if scale <= 1:
+                width, height = (PATCH * max(1, round(s * scale / PATCH)) for s in size)
+                transforms.append(resize_to(size, (width, height)))
+                width, height = (PATCH * max(1, round(s * scale) // PATCH) for s in size)
+                transforms.append(resize_and_crop(size, (width, height), scale))
+    return list(dict.fromkeys(transforms))
 
 
 def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None) -> SceneError | None:
@@ -164,8 +142,5 @@ def small_photos_error(ply: PlyInfo, camera_file: CameraFile, size: Size | None)
     own = next((s for s in sizes_of(camera_file) if ply.count == len(camera_file) * s[0] * s[1]), None)
     if size is None or own is None or own == size:
         return None
-    return SceneError(
-        camera_file.path,
-        f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}",
-        "give the images that the backbone saw, or their originals",
-    )
+    problem = f"expected images of the Gaussian grid's size {own[0]} x {own[1]} or larger, found {size[0]} x {size[1]}"
+    return SceneError(camera_file.path, problem, "give the images that the backbone saw, or their originals")

@@ -14,7 +14,7 @@ from gsmerge.io.alignment.layouts import Layout
 from gsmerge.io.alignment.projected_rows import ProjectedRows
 from gsmerge.io.alignment.pruned import finer_scale, pruned_layout, rough_scale
 from gsmerge.io.alignment.score import AlignmentInput, AlignmentScore, find_correspondences, sample_layout, score_layout
-from gsmerge.io.alignment.similarity import IDENTITY, Correspondences, Similarity, candidate_similarities, scale_by
+from gsmerge.io.alignment.similarity import IDENTITY, Similarity, candidate_similarities, scale_by
 from gsmerge.io.alignment.unordered import unordered_layout
 
 _ROUNDS = 3  # of a layout and the scale that follows from it
@@ -34,25 +34,24 @@ def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
     for order, read in (("view-major", _pruned), ("view-fastest", _interleaved), ("unordered", _unordered)):
         possible = missing > 0 or (missing == 0 and order == "unordered")
         if possible and inputs.order in ("auto", order) and not any(score.ok for score in scores):
-            scores += [score for score in read(inputs, rows) if score is not None]
+            score = read(inputs, rows)
+            scores += [] if score is None else [score]
     return scores
 
 
-def _pruned(inputs: AlignmentInput, rows: ProjectedRows) -> list[AlignmentScore | None]:
+def _pruned(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
     """In the frame of the cameras or at a given scale; at any other scale, where that does not fit well or at all."""
     same = _search(inputs, rows, pruned_layout, _given_frame(inputs))
-    if same is not None and same.worst_px >= _CERTAIN_PX and _mostly_missing(same.layout):
-        same = replace(same, ok=False)  # with so many pixels to choose from, any row is near to one
+    if same is not None and same.worst_px >= _CERTAIN_PX:
+        num_pixels, num_rows = len(same.layout.views) * rows.width * rows.height, sum(map(len, same.layout.rows))
+        if 2 * num_rows < num_pixels:  # with so many pixels to choose from, any row is near to one
+            same = replace(same, ok=False)
     if inputs.scale is not None or (same is not None and same.worst_px < _CERTAIN_PX):
-        return [same]
+        return same
     other = _pruned_and_scaled(inputs, rows)
     if other is None or same is None:
-        return [same, other]
-    return [other if other.ok and (other.worst_px * _BETTER < same.worst_px or not same.ok) else same]
-
-
-def _mostly_missing(layout: Layout) -> bool:
-    return 2 * sum(len(rows) for rows in layout.rows) < len(layout.views) * layout.width * layout.height
+        return other or same
+    return other if other.ok and (other.worst_px * _BETTER < same.worst_px or not same.ok) else same
 
 
 def _pruned_and_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
@@ -68,17 +67,17 @@ def _pruned_and_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Alignment
         if score is None or score.worst_px > _AS_GOOD * best.worst_px:
             break
         best = score
-        pairs, _ = find_correspondences(inputs, sample_layout(best.layout), colored=False)
+        pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(best.layout))
         finer = (f for f in candidate_similarities(pairs, inputs.viewmats, inputs.Ks, effort=1) if f.scale != 1)
         frame = next(finer, frame)
     return replace(best, ok=best.ok and best.worst_px < _CERTAIN_PX)
 
 
-def _interleaved(inputs: AlignmentInput, rows: ProjectedRows) -> list[AlignmentScore | None]:
-    return [_search(inputs, rows, interleaved_layout, _given_frame(inputs))]
+def _interleaved(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
+    return _search(inputs, rows, interleaved_layout, _given_frame(inputs))
 
 
-def _unordered(inputs: AlignmentInput, rows: ProjectedRows) -> list[AlignmentScore | None]:
+def _unordered(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
     """Only in frames that need no solving: without an order no pixel is known before the frame is."""
     base, color_of = sh0_to_rgb(inputs.gaussians.sh0.numpy()[rows.ids, 0]), None
     if inputs.images is not None:
@@ -87,10 +86,9 @@ def _unordered(inputs: AlignmentInput, rows: ProjectedRows) -> list[AlignmentSco
         def color_of(some: np.ndarray, view: int, pixels: np.ndarray) -> np.ndarray:
             return np.abs(base[some].clip(0, 1) - photos[view, pixels]).mean(1)
 
-    none = Correspondences(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int64))
-    frames = candidate_similarities(none, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=0)
+    frames = candidate_similarities(None, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=0)
     scores = (_search(inputs, rows, partial(unordered_layout, color_of=color_of), frame) for frame in frames)
-    return [next((score for score in scores if score is not None), None)]
+    return next((score for score in scores if score is not None), None)
 
 
 def _given_frame(inputs: AlignmentInput) -> Similarity:

@@ -21,10 +21,8 @@ def interleaved_layout(rows: ProjectedRows) -> Layout | None:
     """Which pixel of which view every row is, if its mean lies inside its pixel.
 
     Every row lies in some pixel of every view. In the order of the file the true ones can only go forward: pixel by
-    pixel, within a pixel view by view. The path through the views that goes forward in the smallest steps wins.
-
-    Returns:
-        A layout; None if no path goes forward, or hardly any step changes the view.
+    pixel, within a pixel view by view. The path through the views that goes forward in the smallest steps wins; None if
+    none goes forward, or hardly any step changes the view.
     """
     count, views = len(rows), rows.num_views
     if not 1 < views <= MAX_VIEWS or count < MIN_BLOCK * views or count * views > MAX_CELLS:
@@ -38,15 +36,15 @@ def interleaved_layout(rows: ProjectedRows) -> Layout | None:
     if not goes_forward:
         return None
     own_pixel = pixels[np.arange(count), chosen]
-    parts, cells = [], []
+    parts = []
     for view in range(views):
         own = np.flatnonzero((chosen == view) & (own_pixel >= 0))
         first = np.unique(own_pixel[own], return_index=True)[1]  # a step back may come to a pixel twice
-        parts.append(own[np.sort(first)].astype(np.int64))
-        cells.append(own_pixel[parts[-1]].astype(np.int64))
-    if min(len(part) for part in parts) < MIN_BLOCK:
+        own = own[np.sort(first)]
+        parts.append((view, own, own_pixel[own].astype(np.int64)))
+    if min(len(own) for _, own, _ in parts) < MIN_BLOCK:
         return None
-    return rows.layout("view-fastest", range(views), parts, cells, missing=views * rows.width * rows.height - count)
+    return rows.layout("view-fastest", parts, missing=views * rows.width * rows.height - count)
 
 
 def _best_path(pixels: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -76,12 +74,8 @@ def _step_cost(before, view_before, after, view):
 def cheapest_views(pixels, came_from, views):
     """Viterbi's path through ``pixels [n,v]`` int32, the pixel of each row in each view, -1 outside it.
 
-    Args:
-        came_from: ``[n,v]`` int8, overwritten: the best view of the row before.
-        views: ``[n]`` int64, overwritten: the view of each row.
-
-    Returns:
-        How many steps of the path go back.
+    Returns how many of its steps go back. Overwritten: ``views [n]`` int64, the view of each row; ``came_from [n,v]``
+    int8, the best view of the row before.
     """
     n, num_views = pixels.shape
     cost, fresh = np.zeros(num_views), np.zeros(num_views)

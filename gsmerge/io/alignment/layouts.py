@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -25,29 +25,17 @@ DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anythin
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote.
+    """Rows and pixels, block by block: a block is what one view (or one layer of it) wrote."""
 
-    Args:
-        description: What it is, for people.
-        kind: "full", "trim", "box", "box+depth" or "pruned": which pixels there are.
-        order: In which order the rows are.
-        width: Of the grid, pixels.
-        height: The same.
-        views: The camera of each block.
-        rows: The rows of each block, of any shape: not a copy where a stride will do.
-        pixels: ``[p]`` the pixel ``y·W + x`` of each of these rows.
-        per_pixel: Gaussians per pixel; above 1 each layer is a block.
-    """
-
-    description: str
-    kind: str
-    order: str
-    width: int
+    description: str  # what it is, for people
+    kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
+    order: str  # in which order the rows are
+    width: int  # of the grid, pixels
     height: int
-    views: tuple[int, ...]
-    rows: tuple[np.ndarray, ...]
-    pixels: tuple[np.ndarray, ...]
-    per_pixel: int = 1
+    views: tuple[int, ...]  # the camera of each block
+    rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
+    pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
+    per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
 
     @property
     def is_plain(self) -> bool:
@@ -72,27 +60,29 @@ class Box:
 
 def boxes(width: int, height: int) -> list[Box]:
     """What is cut off at the border: nothing, 8 pixels, or 8/256 of each side as Depth Anything 3 does."""
-    top, left = da3_border(width, height)
     out = [Box("full", "every pixel", 0, 0)]
     if min(width, height) > 2 * TRIM:
         out.append(Box("trim", f"{TRIM} pixels trimmed at every border", TRIM, TRIM))
-    if (top or left) and (top, left) != (TRIM, TRIM):
-        out.append(Box("box", f"{top} rows and {left} columns trimmed at every border", top, left))
+    da3 = da3_box(width, height)
+    if (da3.top or da3.left) and (da3.top, da3.left) != (TRIM, TRIM):
+        out.append(da3)
     return out
 
 
-def da3_border(width: int, height: int) -> tuple[int, int]:
-    """Rows and columns that Depth Anything 3 cuts off at each side."""
-    return int(8 / 256 * height), int(8 / 256 * width)
+def da3_box(width: int, height: int) -> Box:
+    """What Depth Anything 3 cuts off."""
+    top, left = int(8 / 256 * height), int(8 / 256 * width)
+    return Box("box", f"{top} rows and {left} columns trimmed at every border", top, left)
 
 
-def every_nth(views: int, count: int) -> tuple[int, ...] | None:
-    """Which ``count`` of the views an exporter that takes every n-th one has; None where no n does."""
-    for step in range(1, views + 1):
-        chosen = tuple(range(0, views, step))
-        if len(chosen) == count:
-            return chosen
-    return None
+def every_nth(views: int) -> list[tuple[int, ...]]:
+    """The choices of views of exporters that take every n-th one, for all n."""
+    return [tuple(range(0, views, step)) for step in range(1, views + 1)]
+
+
+def plain_layout(views: int, width: int, height: int) -> Layout:
+    """One Gaussian per pixel, view by view and row by row."""
+    return next(one for one in exact_layouts(views * width * height, views, width, height) if one.is_plain)
 
 
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
@@ -100,20 +90,17 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
 
     Which camera a block belongs to is a first guess: the cameras in order, or every n-th of them.
     """
-    index = np.arange(count, dtype=np.int64)
     for box in boxes(width, height):
-        size = (height - 2 * box.top) * (width - 2 * box.left)
         for per_pixel in PER_PIXEL:
-            blocks, rest = divmod(count, size * per_pixel)
+            blocks, rest = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
             if rest or not 1 <= blocks <= views:
                 continue
-            chosen = every_nth(views, blocks) or tuple(range(blocks))
-            yield from _orders(index, box, box.pixels(width, height), per_pixel, chosen, width, height)
+            chosen = next((some for some in every_nth(views) if len(some) == blocks), tuple(range(blocks)))
+            yield from _orders(count, box, per_pixel, chosen, width, height)
 
 
-def _orders(
-    index: np.ndarray, box: Box, grid: np.ndarray, per_pixel: int, views: tuple[int, ...], width: int, height: int
-) -> Iterator[Layout]:
+def _orders(count: int, box: Box, per_pixel: int, views: tuple[int, ...], width: int, height: int) -> Iterator[Layout]:
+    index, grid = np.arange(count, dtype=np.int64), box.pixels(width, height)
     rows, columns, blocks = *grid.shape, len(views)
     arranged = {
         "view-major": index.reshape(blocks, rows, columns, per_pixel).transpose(0, 3, 1, 2),
@@ -121,12 +108,10 @@ def _orders(
         "column-major": index.reshape(blocks, columns, rows, per_pixel).transpose(0, 3, 2, 1),
         "layer-major": index.reshape(per_pixel, blocks, rows, columns).transpose(1, 0, 2, 3),
     }
-    pixels = grid.reshape(-1)
+    layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
     for order, ids in arranged.items():
         if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and blocks == 1):
             continue
-        layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
-        parts = tuple(ids[block, layer] for block in range(blocks) for layer in range(per_pixel))
         yield Layout(
             description=f"{box.description}{layers}, {order}",
             kind=box.kind,
@@ -134,41 +119,30 @@ def _orders(
             width=width,
             height=height,
             views=tuple(view for view in views for _ in range(per_pixel)),
-            rows=parts,
-            pixels=(pixels,) * len(parts),
+            rows=tuple(layer for block in ids for layer in block),
+            pixels=(grid.reshape(-1),) * (blocks * per_pixel),
             per_pixel=per_pixel,
         )
 
 
-def depth_layout(count: int, depths: np.ndarray) -> Layout | None:
+def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     """The layout of Depth Anything 3 from its depth maps: border, nearest 90 % of each view, every n-th view.
 
-    Args:
-        count: Rows of the file.
-        depths: ``[v,h,w]``; only their order matters, so any scale will do.
-
-    Returns:
-        None if no choice of views has that many pixels.
+    Of ``depths [v,h,w]`` only the order matters, so any scale will do. Empty if no choice of views has ``count``
+    pixels.
     """
     views, height, width = depths.shape
     kept = [depth_mask(depth) for depth in depths]
-    for step in range(1, views + 1):
-        chosen = tuple(range(0, views, step))
-        if sum(len(kept[view]) for view in chosen) == count:
-            ends = np.cumsum([len(kept[view]) for view in chosen])
-            top, left = da3_border(width, height)
+    for step, chosen in enumerate(every_nth(views), 1):
+        pixels = tuple(kept[view] for view in chosen)
+        ends = np.cumsum([len(some) for some in pixels])
+        if ends[-1] == count:
+            border = da3_box(width, height).description.removesuffix(" at every border")
             every = "" if step == 1 else f", every {step}. view"
-            return Layout(
-                description=f"{top} rows and {left} columns trimmed, nearest 90 % of each view{every}, view-major",
-                kind="box+depth",
-                order="view-major",
-                width=width,
-                height=height,
-                views=chosen,
-                rows=tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1])),
-                pixels=tuple(kept[view] for view in chosen),
-            )
-    return None
+            description = f"{border}, nearest 90 % of each view{every}, view-major"
+            rows = tuple(np.split(np.arange(count, dtype=np.int64), ends[:-1]))
+            return [Layout(description, "box+depth", "view-major", width, height, chosen, rows, pixels)]
+    return []
 
 
 def depth_mask(depth: np.ndarray) -> np.ndarray:
@@ -180,10 +154,8 @@ def depth_mask(depth: np.ndarray) -> np.ndarray:
     height, width = depth.shape
     rank = int(DEPTH_SHARE * (depth.size - 1))
     mask = depth <= np.partition(depth.reshape(-1), rank)[rank]
-    top, left = da3_border(width, height)
-    inside = np.zeros_like(mask)
-    inside[top : height - top, left : width - left] = True
-    return np.flatnonzero(mask & inside)
+    inside = da3_box(width, height).pixels(width, height)
+    return inside[mask.reshape(-1)[inside]]
 
 
 def subsample(layout: Layout, per_block: int) -> Layout:
@@ -202,17 +174,10 @@ def subsample(layout: Layout, per_block: int) -> Layout:
 def to_grid(
     gaussians: Gaussians, valid: Tensor, layout: Layout, cameras: Cameras, images: Tensor | None, names: tuple[str, ...]
 ) -> PixelScene:
-    """The scene on the full grid of the layout.
+    """The scene on the full grid of the layout; pixels without a row get a fully transparent Gaussian.
 
-    Pixels without a row get a fully transparent Gaussian, like rows that are not finite.
-
-    Args:
-        gaussians: The file's rows.
-        valid: ``[n]`` bool.
-        layout: Which row belongs to which pixel.
-        cameras: All cameras, in the frame of the Gaussians and at the grid's size.
-        images: ``[c,h,w,3]`` of all cameras, or None.
-        names: Names of all cameras.
+    ``gaussians`` and ``valid [n]`` are the file's rows; cameras (in their frame and at the grid's size), ``images
+    [c,h,w,3]`` and names are those of all views.
     """
     views = list(layout.views)
     if views != list(range(len(cameras))):
@@ -221,45 +186,31 @@ def to_grid(
     names = tuple(names[view] for view in views)
     if layout.is_plain:
         return PixelScene(gaussians, cameras, images, valid.reshape(grid), names)
-    source = _row_of_pixel(layout)
-    missing = source < 0
-    none = torch.from_numpy(missing) if missing.any() else None
-    if none is not None:
-        there = np.where(missing, 0, np.arange(len(source)))
-        there[: int(np.argmin(missing))] = int(np.argmin(missing))
-        source = source[np.maximum.accumulate(there)]
-    index = torch.from_numpy(source)
-    out, kept = gaussians[index], valid[index]
-    if none is not None:
-        kept[none] = False
-        for values, value in ((out.opacities, 0.0), (out.sh0, 0.0), (out.shN, 0.0)):
-            values[none] = value
-        out.quats[none] = torch.tensor((1.0, 0, 0, 0))
-    return PixelScene(out, cameras, images, kept.reshape(grid), names, None if none is None else none.reshape(grid))
-
-
-def _row_of_pixel(layout: Layout) -> np.ndarray:
-    """The file row of every pixel of the grid, -1 where there is none."""
     size = layout.width * layout.height
-    source = np.full(size * len(layout.views), -1, np.int64)
+    source = np.full(size * len(views), -1, np.int64)
     for i, (rows, pixels) in enumerate(zip(layout.rows, layout.pixels, strict=True)):
         source[i * size + pixels] = rows.reshape(-1)
-    return source
+    missing = source < 0
+    if not missing.any():
+        index = torch.from_numpy(source)
+        return PixelScene(gaussians[index], cameras, images, valid[index].reshape(grid), names)
+    before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(len(source))))
+    index, none = torch.from_numpy(source[before]), torch.from_numpy(missing)
+    out, kept = gaussians[index], valid[index]
+    kept[none] = False
+    for values in (out.opacities, out.sh0, out.shN):
+        values[none] = 0.0
+    out.quats[none] = torch.tensor((1.0, 0, 0, 0))
+    return PixelScene(out, cameras, images, kept.reshape(grid), names, none.reshape(grid))
 
 
 def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     """The scene with a Gaussian for each pixel that the file has no row for.
 
-    It lies on the pixel's ray at the depth of the map, in units that follow from the other pixels (as depth along z or
-    as distance, whichever they agree with). Its colour is the photo's; its opacity, rotation and size in pixels are
-    those of the pixel before it in the same row.
-
-    Args:
-        scene: With photos; on the full grid.
-        depths: ``[v,h,w]`` of its views.
-
-    Returns:
-        The scene as it was if it has no photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
+    It lies on the pixel's ray at the depth of the map (``depths [v,h,w]`` of the scene's views), in units that follow
+    from the other pixels: as depth along z or as distance, whichever they agree with. Its colour is the photo's; its
+    opacity, rotation and size in pixels are those of the pixel before it in the same row. The scene stays as it is if
+    it has no photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
     """
     if scene.images is None or scene.missing is None:
         return scene
@@ -289,15 +240,15 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     local = rays.reshape(-1, 3)[rows] * new_z.reshape(-1)[rows, None]
     world = np.einsum("tji,tj->ti", V[view, :3, :3], local - V[view, :3, 3])
     source, at = torch.from_numpy(before[rows]), torch.from_numpy(rows)
-    columns = {name: getattr(g, name).clone() for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
-    columns["means"][at] = torch.from_numpy(world).to(g.means.dtype)
+    full = Gaussians(**{field.name: getattr(g, field.name).clone() for field in fields(g)})
+    full.means[at] = torch.from_numpy(world).to(g.means.dtype)
     growth = torch.from_numpy(new_z.reshape(-1)[rows] / z.reshape(-1)[before[rows]]).float()
-    columns["scales"][at] = g.scales[source] * growth[:, None]
-    columns["quats"][at], columns["opacities"][at] = g.quats[source], g.opacities[source]
-    columns["sh0"][at] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[at])
+    full.scales[at] = g.scales[source] * growth[:, None]
+    full.quats[at], full.opacities[at] = g.quats[source], g.opacities[source]
+    full.sh0[at] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[at])
     kept = scene.valid.reshape(-1).clone()
     kept[at] = True
-    return replace(scene, gaussians=type(g)(**columns), valid=kept.reshape(scene.valid.shape))
+    return replace(scene, gaussians=full, valid=kept.reshape(scene.valid.shape))
 
 
 def _agreement(ratio: np.ndarray, far: int) -> tuple[float, float, int]:

@@ -19,21 +19,13 @@ class ProjectedRows:
 
     A search (pruned, interleaved, unordered) takes these and returns a layout whose pixels still have to be measured,
     or None if the rows do not look like what it searches for.
-
-    Args:
-        points: ``[n,3]`` float64 means.
-        ids: ``[n]`` rows of the file.
-        viewmats: ``[c,4,4]`` float64 world to camera, in the frame of the Gaussians.
-        Ks: ``[c,3,3]`` float64 intrinsics, pixels.
-        width: Of the grid, pixels.
-        height: The same.
     """
 
-    points: np.ndarray
-    ids: np.ndarray
-    viewmats: np.ndarray
-    Ks: np.ndarray
-    width: int
+    points: np.ndarray  # ``[n,3]`` float64 means
+    ids: np.ndarray  # ``[n]`` rows of the file
+    viewmats: np.ndarray  # ``[c,4,4]`` float64 world to camera, in the frame of the Gaussians
+    Ks: np.ndarray  # ``[c,3,3]`` float64 intrinsics, pixels
+    width: int  # of the grid, pixels
     height: int
 
     def __len__(self) -> int:
@@ -60,33 +52,17 @@ class ProjectedRows:
         return pixels, u, v
 
     def layout(
-        self,
-        order: str,
-        views: Sequence[int],
-        rows: Sequence[np.ndarray],
-        pixels: Sequence[np.ndarray],
-        *,
-        missing: int,
-        note: str = "",
+        self, order: str, parts: Sequence[tuple[int, np.ndarray, np.ndarray]], *, missing: int, note: str = ""
     ) -> Layout:
-        """The layout of a search's result: for each view some of these rows and their pixels.
-
-        Args:
-            order: Of the rows in the file.
-            views: b views.
-            rows: Of each view.
-            pixels: Of each of its rows.
-            missing: Pixels without a row.
-            note: What else to say about it.
-        """
-        said = "in no order" if order == "unordered" else order
+        """A search's result: ``parts`` are views, some of these rows, and their pixels; ``missing`` have none."""
+        words = "in no order" if order == "unordered" else order
         return Layout(
-            description=f"{missing:,} pixels of {len(views)} views dropped, {said}{note}",
+            description=f"{missing:,} pixels of {len(parts)} views dropped, {words}{note}",
             kind="pruned",
             order=order,
             width=self.width,
             height=self.height,
-            views=tuple(views),
-            rows=tuple(self.ids[some] for some in rows),
-            pixels=tuple(pixels),
+            views=tuple(view for view, _, _ in parts),
+            rows=tuple(self.ids[rows] for _, rows, _ in parts),
+            pixels=tuple(pixels for _, _, pixels in parts),
         )

@@ -30,9 +30,8 @@ def pruned_layout(rows: ProjectedRows) -> Layout | None:
     blocks = _blocks(rows)
     if blocks is None:
         return None
-    pixels = [assign_pixels(*rows.project(some, view), rows.width, rows.height) for view, some in blocks]
-    missing = len(blocks) * rows.width * rows.height - len(rows)
-    return rows.layout("view-major", [v for v, _ in blocks], [some for _, some in blocks], pixels, missing=missing)
+    parts = [(v, some, assign_pixels(*rows.project(some, v), rows.width, rows.height)) for v, some in blocks]
+    return rows.layout("view-major", parts, missing=len(blocks) * rows.width * rows.height - len(rows))
 
 
 def _blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
@@ -109,17 +108,11 @@ def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
 
 
 def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Strictly increasing pixels for the rows of one view.
+    """Strictly increasing pixels for the rows of one view, projected to ``u [n]``, ``v [n]``; NaN where unknown.
 
-    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With
-    the row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the
-    jitter over stretches without gaps.
-
-    Args:
-        u: ``[n]`` projected columns, pixels; NaN where unknown.
-        v: ``[n]`` projected rows.
-        width: Of the grid, pixels.
-        height: The same.
+    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With the
+    row known, ``pixel - rank`` never decreases, and follows from isotonic regression, which averages the jitter over
+    stretches without gaps.
     """
     count, known = len(u), np.isfinite(u) & np.isfinite(v)
     u, v = np.where(known, u, 0.0), np.where(known, v, 0.0)
@@ -127,7 +120,7 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     noise = float(np.median(np.abs(du[known[1:] & known[:-1]] - 1))) if (known[1:] & known[:-1]).any() else 0.0
     cut = (du < -max(2.0, 4 * noise + 1)) & known[1:] & known[:-1]
     scanline = np.concatenate([[0], np.cumsum(cut)])
-    row = np.clip(np.floor(_rows_of(scanline, np.where(known, v, np.nan))), 0, height - 1)[scanline]
+    row = np.clip(np.floor(_rows_of(scanline, v, known)), 0, height - 1)[scanline]
     rank = np.arange(count)
     sure = known & (np.abs(v - row - 0.5) < 2 + 4 * noise) & (u > -2 - 4 * noise) & (u < width + 2 + 4 * noise)
     key = row * width + np.clip(u, 0, width) - 0.5 - rank
@@ -135,15 +128,15 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
     return np.asarray(np.clip(np.rint(pixels), 0, width * height - count), np.int64) + rank
 
 
-def _rows_of(scanline: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Median of v of every scanline, made never to decrease."""
-    order = np.lexsort((v, scanline))  # NaN comes last
-    sizes = np.bincount(scanline)
-    finite = np.bincount(scanline, np.isfinite(v)).astype(np.int64)
-    first = np.cumsum(sizes) - sizes
-    low, high = (v[order[first + np.maximum(np.maximum(finite, 1) - shift, 0) // 2]] for shift in (1, 0))
-    median = np.where(finite > 0, (low + np.where(np.isfinite(high), high, low)) / 2, 0.0)
-    return _never_falling(median, np.maximum(finite, _SMALL))
+def _rows_of(scanline: np.ndarray, v: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Median of the known v of every scanline, made never to decrease."""
+    from scipy.ndimage import median
+
+    counts = np.bincount(scanline[known], minlength=scanline[-1] + 1)
+    medians, some = np.zeros(len(counts)), np.flatnonzero(counts)
+    if len(some):
+        medians[some] = median(v[known], scanline[known], some)
+    return _never_falling(medians, np.maximum(counts, _SMALL))
 
 
 def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -176,12 +169,8 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     """The scale, up to a quarter off ``rough``, under which rows lie nearest to the pixels that they come to.
 
     A scale that is wrong by little moves rows by parts of a pixel, which finding their pixels hides: so scales are
-    tried in steps that move most rows by a quarter of a pixel at most.
-
-    Args:
-        rows: All rows of the file, and the cameras in their own frame.
-        layout: Its blocks are right, its pixels need not be.
-        rough: Where to search.
+    tried in steps that move most rows by a quarter of a pixel at most. The cameras are in their own frame; the blocks
+    of the layout are right, its pixels need not be.
     """
     chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
     starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]

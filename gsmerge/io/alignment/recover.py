@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.io.alignment.incomplete import score_incomplete
-from gsmerge.io.alignment.layouts import Layout, depth_layout, exact_layouts, subsample
+from gsmerge.io.alignment.layouts import Layout, depth_layouts, exact_layouts, subsample
 from gsmerge.io.alignment.score import (
     QUICK_SAMPLES,
     SAMPLES,
@@ -21,13 +20,7 @@ from gsmerge.io.alignment.score import (
     score_layout,
     shuffled_score,
 )
-from gsmerge.io.alignment.similarity import (
-    IDENTITY,
-    Correspondences,
-    candidate_similarities,
-    fits_all_cameras,
-    pixel_errors,
-)
+from gsmerge.io.alignment.similarity import IDENTITY, candidate_similarities, fits_all_cameras, pixel_errors
 
 MARGIN = 2.0  # by which the best reading must beat the next one
 SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
@@ -42,23 +35,16 @@ _SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 
 @dataclass(frozen=True)
 class Recovery:
-    """The reading that won.
-
-    Args:
-        best: The winner.
-        runner_up: The next best; None where the count allows no other.
-        margin: How many times nearer the winner's Gaussians are to their pixels than the runner-up's, or than
-            to shuffled pixels.
-        color_margin: How many times farther from the photos the runner-up's colours are, where only that decides
-            between the two; None where the pixels do.
-        confirmed: Whether the photos' colours agree with the reading; None where there are no photos, or none that
-            could decide.
-    """
+    """The reading that won."""
 
     best: AlignmentScore
-    runner_up: AlignmentScore | None
+    runner_up: AlignmentScore | None  # the next best; None where the count allows no other
+    # how many times nearer the winner's Gaussians are to their pixels than the runner-up's, or than to shuffled pixels
     margin: float
+    # how many times farther from the photos the runner-up's colours are, where only that decides between the two; None
+    # where the pixels do
     color_margin: float | None = None
+    # whether the photos' colours agree with the reading; None where there are no photos, or none that could decide
     confirmed: bool | None = None
 
     @property
@@ -69,27 +55,22 @@ class Recovery:
         if self.color_margin is None:
             text += f"{min(self.margin, 9999):.0f} times nearer than the next reading ({other})"
         else:
-            text += (
-                f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next reading"
-                f" ({other}), which fits the pixels as well"
-            )
+            text += f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next"
+            text += f" reading ({other}), which fits the pixels as well"
         return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
 
 
 def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
     """The reading under which every Gaussian projects into its own pixel; None where none stands out.
 
-    Of readings that put the Gaussians about equally near to their pixels, the photos' colours choose one.
-
-    Args:
-        inputs: The scene.
-        exact_frames: Only consider cameras in the frame of their file and files without missing pixels: quick.
+    Of readings that put the Gaussians about equally near to their pixels, the photos' colours choose one. With
+    ``exact_frames`` only cameras in the frame of their file and files without missing pixels are considered: quick.
     """
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return None
     scores: list[AlignmentScore] = []
-    layouts = list(_exact(inputs))
+    layouts = _exact(inputs)
     for effort in (0,) if exact_frames else (0, 1, 2):
         if not any(score.ok for score in scores):
             scores += [score for layout in layouts for score in _readings(inputs, layout, effort)]
@@ -109,7 +90,9 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if not _stands_out(best, shuffled_px):
         return None
     next_px = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px)
-    confirmed = _is_confirmed(color_error(inputs, best.layout), shuffled_color)
+    confirmed = None
+    if shuffled_color > _VARIES:
+        confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
     return Recovery(best, runner_up, next_px / max(best.worst_px, _SMALLEST_PX), None, confirmed)
 
 
@@ -131,22 +114,15 @@ def _stands_out(best: AlignmentScore, shuffled_px: float) -> bool:
     return best.ok and shuffled_px >= SHUFFLED_MARGIN * max(best.worst_px, _SMALLEST_PX)
 
 
-def _is_confirmed(color: float, shuffled: float) -> bool | None:
-    """Whether the colours are nearer to the photos than to shuffled pixels; None where neither can be said."""
-    return color <= _UNCONFIRMED * shuffled if shuffled > _VARIES else None
-
-
-def _exact(inputs: AlignmentInput) -> Iterator[Layout]:
+def _exact(inputs: AlignmentInput) -> list[Layout]:
+    """The layouts that the number of rows allows, or the depth maps next to the cameras."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
-    for layout in exact_layouts(count, len(cameras), cameras.width, cameras.height):
-        if inputs.order in ("auto", layout.order):
-            yield layout
+    layouts = list(exact_layouts(count, len(cameras), cameras.width, cameras.height))
     if count < len(cameras) * cameras.width * cameras.height and inputs.order in ("auto", "view-major"):
         depths = inputs.depths()
         if depths is not None and depths.shape == (len(cameras), cameras.height, cameras.width):
-            masked = depth_layout(count, depths)
-            if masked is not None:
-                yield masked
+            layouts += depth_layouts(count, depths)
+    return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
 
 
 def _readings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[AlignmentScore]:
@@ -167,9 +143,9 @@ def _readings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Align
 
 
 def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> AlignmentScore:
-    pairs, colors = find_correspondences(inputs, sample_layout(layout, samples))
+    pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout, samples))
     frames = candidate_similarities(pairs, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=effort)
-    scores = [score_layout(inputs, layout, frame, (pairs, colors)) for frame in frames]
+    scores = [score_layout(inputs, layout, frame, pairs) for frame in frames]
     lowest = min(score.worst_px for score in scores)
     best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
     if best.ok and best.frame is not IDENTITY and inputs.scale is None:
@@ -186,22 +162,16 @@ def _refine(inputs: AlignmentInput, score: AlignmentScore) -> AlignmentScore:
 
 def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
     """For each block the camera into whose pixels it projects best; None where two want the same."""
-    small = subsample(layout, 300)
-    pairs, _ = find_correspondences(inputs, replace(small, views=tuple(range(len(small.views)))), colored=False)
-    viewmats, Ks = inputs.viewmats, inputs.Ks
+    pairs = find_correspondences(inputs.gaussians.means, inputs.valid, subsample(layout, 300))
     chosen = []
-    for block in range(len(small.views)):
-        own = pairs.blocks == block
-        if not own.any():
+    for block in range(len(layout.views)):
+        own = pairs.select(pairs.blocks == block)
+        if not len(own.rows):
             return None
-        some = Correspondences(pairs.points[own], pairs.pixels[own], pairs.views[own], pairs.blocks[own])
-        errors = [
-            np.median(pixel_errors(replace(some, views=np.full(int(own.sum()), view)), viewmats, Ks))
-            for view in range(len(viewmats))
-        ]
+        views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
+        errors = [np.median(pixel_errors(replace(own, views=some), inputs.viewmats, inputs.Ks)) for some in views]
         chosen.append(int(np.argmin(errors)))
-    distinct = len(set(chosen)) * layout.per_pixel == len(chosen)
-    return chosen if distinct else None
+    return chosen if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 
 
 def _differs(one: Layout, other: Layout) -> bool:

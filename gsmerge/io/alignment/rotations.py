@@ -29,13 +29,9 @@ _DESCRIPTIONS = {
 
 
 def read_rotations(scene: PixelScene, quats: QuatChoice) -> PixelScene:
-    """The scene with its stored rotations read in another way.
+    """The scene with its stored rotations, which were read as wxyz, read in another way; see :class:`ReadHints`.
 
-    Args:
-        scene: Rotations as they are in the file, read as wxyz, local to world.
-        quats: "wxyz": as they are; "xyzw": w comes last; "xyzw-root": w comes last, and each is applied
-            twice: of its two square roots, the one whose thinnest axis follows the surface better; "camera": wxyz,
-            relative to the camera of the own view.
+    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
     """
     if quats in ("auto", "wxyz"):
         return scene
@@ -69,13 +65,9 @@ def square_roots(quats: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
-    """How the rotations are to be read: the way that rotates the thinnest axes towards the surface's normals.
+    """How the rotations (read as wxyz) are to be read so that thinnest axes follow the surface's normals; and a note.
 
-    Args:
-        scene: Rotations as they are in the file, read as wxyz.
-
-    Returns:
-        The reading, and a sentence about it; "wxyz" and "" unless another one is better by a large margin.
+    "wxyz" and "" unless another reading is better by a large margin.
     """
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
@@ -114,15 +106,9 @@ def _cosines(quats: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
 def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Tensor, normals: Tensor) -> bool:
     """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
 
-    The better of two is better by chance as well: every other reading gets a second rotation as the roots have it,
-    half a turn more about the same axis.
-
-    Args:
-        scene: As it is in the file.
-        rows: ``[t]`` Gaussians that are compared.
-        single: ``[t,4]`` their rotations as read otherwise; as stored first, as xyzw next.
-        thinnest: ``[t]`` their thinnest axes.
-        normals: ``[t,3]`` of the surface there, roughly: a first comparison, which takes little time.
+    The better of two is better by chance as well: every other reading gets a second rotation as the roots have it, half
+    a turn more about the same axis. ``single`` are the readings ``[t,4]`` of some Gaussians, as stored first, as xyzw
+    next; ``normals`` are rough: a first comparison, which takes little time.
     """
     others = [square_roots(single[0]), *((one, _half_a_turn_more(one)) for one in single)]
     roots = square_roots(single[1])
@@ -164,10 +150,7 @@ def _smooth_normals(scene: PixelScene) -> Tensor:
 def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
     """Normals ``[t,3]`` of some pixels' surface, their rows and their views."""
     v, h, w = scene.valid.shape
-    if min(h, w) <= 2 * _STEP:
-        empty = torch.zeros(0, dtype=torch.int64)
-        return torch.zeros(0, 3), empty, empty
-    inner = torch.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
+    inner = torch.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].flatten(1)
     step = max(1, inner.shape[1] // _SAMPLES)
     while step > 1 and np.gcd(step, w - 2 * _STEP) > 1:
         step += 1

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from gsmerge.geometry import project_points, sh0_to_rgb
-from gsmerge.io.alignment.layouts import Layout, subsample
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.io.alignment.layouts import Layout, plain_layout, subsample
 from gsmerge.io.alignment.similarity import Correspondences, Similarity, pixel_errors
 from gsmerge.types import Cameras, Gaussians
 
@@ -23,27 +21,17 @@ MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a li
 
 @dataclass(frozen=True)
 class AlignmentInput:
-    """What the pixels are recovered from.
+    """What the pixels are recovered from."""
 
-    Args:
-        gaussians: The file's n rows.
-        valid: ``[n]`` bool.
-        cameras: All c cameras at the grid's size, in their own world.
-        images: ``[c,h,w,3]``, or None.
-        labellings: Orders that the views may be in: the file's, that of the names.
-        depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
-        order: The order of the rows where it is given, otherwise "auto".
-        scale: Size of the Gaussians' world in units of the cameras', where it is given.
-    """
-
-    gaussians: Gaussians
-    valid: Tensor
-    cameras: Cameras
-    images: Tensor | None
-    labellings: Sequence[Sequence[int]]
+    gaussians: Gaussians  # the file's n rows
+    valid: Tensor  # ``[n]`` bool
+    cameras: Cameras  # all c cameras at the grid's size, in their own world
+    images: Tensor | None  # ``[c,h,w,3]``, or None
+    labellings: Sequence[Sequence[int]]  # orders that the views may be in: the file's, that of the names
+    # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
-    order: str = "auto"
-    scale: float | None = None
+    order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
+    scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
 
     @property
     def viewmats(self) -> np.ndarray:
@@ -58,23 +46,13 @@ class AlignmentInput:
 
 @dataclass(frozen=True)
 class AlignmentScore:
-    """One reading of a file, and how well it fits.
+    """One reading of a file, and how well it fits."""
 
-    Args:
-        layout: Which row belongs to which pixel.
-        frame: From the frame of the cameras to that of the Gaussians.
-        median_px: Median distance of the projected Gaussians from their pixels; inf where most are behind.
-        worst_px: The same of the worst view.
-        color_error: Mean distance of the base colours from the photos, 0 to 1; NaN without photos.
-        ok: Whether it is near enough to be true.
-    """
-
-    layout: Layout
-    frame: Similarity
-    median_px: float
-    worst_px: float
-    color_error: float
-    ok: bool
+    layout: Layout  # which row belongs to which pixel
+    frame: Similarity  # from the frame of the cameras to that of the Gaussians
+    median_px: float  # median distance of the projected Gaussians from their pixels; inf where most are behind
+    worst_px: float  # the same of the worst view
+    ok: bool  # whether it is near enough to be true
 
     @property
     def description(self) -> str:
@@ -92,77 +70,63 @@ def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
     return subsample(layout, max(MIN_SAMPLES, samples // len(layout.views)))
 
 
-def find_correspondences(
-    inputs: AlignmentInput, layout: Layout, *, colored: bool = True
-) -> tuple[Correspondences, np.ndarray | None]:
-    """The rows of a layout with their pixels and views, and ``[t]`` distances of their colours from the photos."""
+def find_correspondences(means: Tensor, valid: Tensor, layout: Layout) -> Correspondences:
+    """The valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
     rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
     blocks = np.repeat(np.arange(len(layout.views)), [len(some) for some in layout.rows])
-    good = inputs.valid.numpy()[rows]
+    good = valid.numpy()[rows]
     rows, pixels, blocks = rows[good], pixels[good], blocks[good]
-    views = np.array(layout.views)[blocks]
     y, x = np.divmod(pixels, layout.width)
-    points = inputs.gaussians.means.numpy()[rows].astype(np.float64)
-    colors = None
-    if colored and inputs.images is not None:
-        base = sh0_to_rgb(inputs.gaussians.sh0.numpy()[rows, 0])
-        colors = np.abs(base.clip(0, 1) - inputs.images.numpy()[views, y, x]).mean(1)
-    return Correspondences(points, np.stack([x, y], 1) + 0.5, views, blocks), colors
+    points = means.numpy()[rows].astype(np.float64)
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[blocks], blocks, rows)
 
 
 def score_layout(
-    inputs: AlignmentInput,
-    layout: Layout,
-    frame: Similarity,
-    pairs: tuple[Correspondences, np.ndarray | None] | None = None,
+    inputs: AlignmentInput, layout: Layout, frame: Similarity, pairs: Correspondences | None = None
 ) -> AlignmentScore:
     """The score of a layout in a frame, on a sample of its rows: ``pairs``, where they are at hand."""
-    matches, colors = find_correspondences(inputs, sample_layout(layout)) if pairs is None else pairs
-    errors = pixel_errors(matches, frame.move_viewmats(inputs.viewmats), inputs.Ks)
-    bounds = np.concatenate([[0], np.cumsum(np.bincount(matches.blocks, minlength=len(layout.views)))])
-    medians = [float(np.median(errors[a:b])) for a, b in itertools.pairwise(bounds) if b > a]
-    median = float(np.median(errors)) if len(errors) else math.inf
-    limit = pixel_limit(layout.width, layout.height)
-    ok = bool(medians) and max(medians) < limit and bool(np.isfinite(errors).mean() > 0.5)
-    return AlignmentScore(layout, frame, median, max(medians, default=math.inf), _mean(colors), ok)
+    if pairs is None:
+        pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout))
+    errors = pixel_errors(pairs, frame.move_viewmats(inputs.viewmats), inputs.Ks)
+    medians = [float(np.median(part)) for part in split_blocks(errors, pairs, len(layout.views)) if len(part)]
+    median, worst = float(np.median(errors)) if len(errors) else math.inf, max(medians, default=math.inf)
+    ok = bool(medians) and worst < pixel_limit(layout.width, layout.height) and bool(np.isfinite(errors).mean() > 0.5)
+    return AlignmentScore(layout, frame, median, worst, ok)
 
 
 def shuffled_score(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float, float]:
     """Median distance, pixels, and mean distance of the colours, with a reading's pixels shuffled within each block."""
     rng, some = np.random.default_rng(0), sample_layout(best.layout)
     shuffled = replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels))
-    pairs, colors = find_correspondences(inputs, shuffled)
+    pairs = find_correspondences(inputs.gaussians.means, inputs.valid, shuffled)
     errors = pixel_errors(pairs, best.frame.move_viewmats(inputs.viewmats), inputs.Ks)
-    return float(np.median(errors)), _mean(colors)
+    return float(np.median(errors)), _color_distance(inputs, pairs)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
     """Mean distance of the base colours from the photos at a layout's pixels, 0 to 1; NaN without photos."""
-    return _mean(find_correspondences(inputs, sample_layout(layout))[1])
+    return _color_distance(inputs, find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout)))
 
 
-def _mean(colors: np.ndarray | None) -> float:
-    return math.nan if colors is None or not len(colors) else float(colors.mean())
+def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
+    if inputs.images is None or not len(pairs.rows):
+        return math.nan
+    base = sh0_to_rgb(inputs.gaussians.sh0.numpy()[pairs.rows, 0])
+    x, y = pairs.pixels.astype(np.int64).T
+    return float(np.abs(base.clip(0, 1) - inputs.images.numpy()[pairs.views, y, x]).mean(1).mean())
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How well every view's own Gaussians project into their own pixels.
+    """How well every view's own Gaussians project into their own pixels."""
 
-    Args:
-        median_px: Median distance from the pixel centre per view, pixels; inf where most are behind the camera,
-            NaN where a view has no finite Gaussian.
-        share_in_front: Share of all checked Gaussians with positive depth in their own view.
-        share_within_1px: Share of all checked Gaussians at most one pixel from their pixel's centre.
-        limit_px: Largest median that counts as aligned.
-        ok: Whether every view's median is below the limit and most Gaussians are in front.
-    """
-
+    # median distance from the pixel centre per view, pixels; inf where most are behind the camera, NaN where a view has
+    # no finite Gaussian
     median_px: tuple[float, ...]
-    share_in_front: float
-    share_within_1px: float
-    limit_px: float
-    ok: bool
+    share_in_front: float  # share of all checked Gaussians with positive depth in their own view
+    share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
+    limit_px: float  # largest median that counts as aligned
+    ok: bool  # whether every view's median is below the limit and most Gaussians are in front
 
     @property
     def worst_px(self) -> float:
@@ -170,53 +134,38 @@ class Alignment:
         return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
 
 
-@dataclass(frozen=True)
-class PixelSample:
-    """Some pixels of every view: ``points`` [v,s,3] float64, ``pixels`` [s,2] centres, ``valid`` [v,s]."""
-
-    points: Tensor
-    pixels: Tensor
-    valid: Tensor
-
-
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Alignment:
     """Project a sample of every view's own Gaussians into that view.
 
-    Args:
-        gaussians: V·H·W rows, assumed to be in view-major, row-major order.
-        cameras: The V views.
-        valid: ``[V,H,W]`` or ``[V·H·W]`` bool; rows that are False are left out.
-
-    Raises:
-        ValueError: If the number of rows is not V·H·W.
+    ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid [V·H·W]``
+    (or ``[V,H,W]``) are left out. ValueError if the number of rows is another.
     """
-    return check_sample(sample_pixels(gaussians, cameras, valid), cameras)
+    return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
 
 
-def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> PixelSample:
+def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Correspondences:
     """The sample of :func:`check_alignment`."""
-    views, width, pixels = len(cameras), cameras.width, cameras.width * cameras.height
-    if len(gaussians) != views * pixels:
-        raise ValueError(f"expected {views} x {cameras.height} x {width} Gaussians, got {len(gaussians)}")
-    step = -(-pixels // MAX_CHECKED)
-    while math.gcd(step, width) > 1:  # a step that divides the width would only see some columns
-        step += 1
-    ids = torch.arange(0, pixels, step)
-    centres = torch.stack([ids % width, ids.div(width, rounding_mode="floor")], 1).double() + 0.5
-    points = gaussians.means.reshape(views, pixels, 3)[:, ids].double()
-    return PixelSample(points, centres, valid.reshape(views, pixels)[:, ids])
+    views, width, height = len(cameras), cameras.width, cameras.height
+    if len(gaussians) != views * height * width:
+        raise ValueError(f"expected {views} x {height} x {width} Gaussians, got {len(gaussians)}")
+    layout = plain_layout(views, width, height)
+    return find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))
 
 
-def check_sample(sample: PixelSample, cameras: Cameras) -> Alignment:
+def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
     """:func:`check_alignment` of a sample under cameras that may be others."""
     limit = pixel_limit(cameras.width, cameras.height)
-    xy, depth = project_points(sample.points, cameras.viewmats.double(), cameras.Ks.double())
-    in_front = depth > 0
-    distance = (xy - sample.pixels).norm(dim=-1)
-    distance = torch.where(in_front, distance, torch.inf).nan_to_num(nan=torch.inf, posinf=torch.inf)
-    median = [float(d[ok].median()) if ok.any() else math.nan for d, ok in zip(distance, sample.valid, strict=True)]
-    count = max(1, int(sample.valid.sum()))
-    share = float((in_front & sample.valid).sum()) / count
-    near = float(((distance <= 1) & sample.valid).sum()) / count
-    fits = [m < limit for m in median if not math.isnan(m)]
-    return Alignment(tuple(median), share, near, limit, bool(fits) and all(fits) and share > 0.5)
+    errors = pixel_errors(pairs, cameras.viewmats.double().numpy(), cameras.Ks.double().numpy())
+    medians = tuple(
+        float(np.quantile(part, 0.5, method="lower")) if len(part) else math.nan
+        for part in split_blocks(errors, pairs, len(cameras))
+    )
+    count = max(1, len(errors))
+    in_front, near = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
+    fits = [median < limit for median in medians if not math.isnan(median)]
+    return Alignment(medians, in_front, near, limit, bool(fits) and all(fits) and in_front > 0.5)
+
+
+def split_blocks(errors: np.ndarray, pairs: Correspondences, count: int) -> list[np.ndarray]:
+    """The errors of each of ``count`` blocks."""
+    return np.split(errors, np.cumsum(np.bincount(pairs.blocks, minlength=count))[:-1])

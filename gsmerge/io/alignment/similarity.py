@@ -22,20 +22,13 @@ _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared wi
 
 @dataclass(frozen=True)
 class Similarity:
-    """``x_gaussians = scale * rotation @ x_cameras + shift``.
+    """``x_gaussians = scale * rotation @ x_cameras + shift``."""
 
-    Args:
-        rotation: ``[3,3]``.
-        scale: Positive.
-        shift: ``[3]``, units of the Gaussians.
-        description: What it is, for people; empty where both frames are the same.
-        kind: "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other".
-    """
-
-    rotation: np.ndarray
-    scale: float
-    shift: np.ndarray
-    description: str = ""
+    rotation: np.ndarray  # ``[3,3]``
+    scale: float  # positive
+    shift: np.ndarray  # ``[3]``, units of the Gaussians
+    description: str = ""  # what it is, for people; empty where both frames are the same
+    # "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other"
     kind: str = "same"
 
     def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
@@ -56,19 +49,17 @@ def scale_by(scale: float, note: str = "") -> Similarity:
 
 @dataclass(frozen=True)
 class Correspondences:
-    """t Gaussians, each with the pixel and the view to which it is assumed to belong.
+    """t Gaussians, each with the pixel and the view to which it is assumed to belong."""
 
-    Args:
-        points: ``[t,3]`` float64 means.
-        pixels: ``[t,2]`` pixel centres (x, y).
-        views: ``[t]`` rows of the camera arrays.
-        blocks: ``[t]`` what wrote them, in order: a view, or one layer of it.
-    """
+    points: np.ndarray  # ``[t,3]`` float64 means
+    pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
+    views: np.ndarray  # ``[t]`` rows of the camera arrays
+    blocks: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
+    rows: np.ndarray  # ``[t]`` of the file
 
-    points: np.ndarray
-    pixels: np.ndarray
-    views: np.ndarray
-    blocks: np.ndarray
+    def select(self, some: np.ndarray) -> Correspondences:
+        """Some of them."""
+        return Correspondences(*(column[some] for column in vars(self).values()))
 
 
 def ray_directions(pairs: Correspondences, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -91,44 +82,35 @@ def pixel_errors(pairs: Correspondences, viewmats: np.ndarray, Ks: np.ndarray) -
 
 
 def candidate_similarities(
-    pairs: Correspondences, viewmats: np.ndarray, Ks: np.ndarray, *, scale: float | None = None, effort: int = 2
+    pairs: Correspondences | None, viewmats: np.ndarray, Ks: np.ndarray, *, scale: float | None = None, effort: int = 2
 ) -> Iterator[Similarity]:
-    """Similarities from the most to the least plausible: the simplest first.
+    """Similarities from the most to the least plausible, the simplest first: the same frame; a scale; rotated by the
+    first or the middle camera, alone, scaled, or scaled and shifted, as exporters do; any, from the poses that the
+    pixels ask for.
 
-    Args:
-        pairs: Gaussians with their pixels.
-        viewmats: ``[c,4,4]`` of the cameras' own world.
-        Ks: ``[c,3,3]``.
-        scale: Size of the Gaussians' world in units of the cameras', where it is given.
-        effort: 0 solves for nothing, 1 for scale and shift, 2 for the rotation as well.
-
-    Yields:
-        The same frame; a scale; rotated by the first or the middle camera, alone, scaled, or scaled and shifted, as
-        exporters do; any similarity, from the poses that the pixels ask for.
+    Cameras ``viewmats [c,4,4]``, ``Ks [c,3,3]`` are in their own world; ``scale`` is the size of the Gaussians' world
+    in its units, where it is given. Effort 0 solves for nothing (then there may be no pairs), 1 for scale and shift, 2
+    for the rotation as well.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
-    rays, centres = ray_directions(pairs, viewmats, Ks)
+    rays = None if pairs is None or effort == 0 else ray_directions(pairs, viewmats, Ks)
     for rotation, name, kind in _known_rotations(viewmats):
         if name:
             yield Similarity(rotation, scale or 1.0, np.zeros(3), name, kind)
-        if effort == 0:
+        if pairs is None or rays is None:
             continue
-        comma = f"{name}, " if name else ""
-        for shifted in (False, True):
-            if scale is not None and not shifted:
-                continue
-            frame = _solve(pairs.points, rays @ rotation.T, centres @ rotation.T, rotation, shifted=shifted)
+        for shifted in (False, True) if scale is None else (True,):
+            frame = _solve(pairs.points, rays, rotation, shifted=shifted)
             if frame is not None:
-                text = f"{comma}positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
+                text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
+                text = f"{name}, {text}" if name else text
                 yield replace(frame, description=text, kind=kind or ("shifted" if shifted else "scaled"))
-    if effort < 2:
+    if pairs is None or rays is None or effort < 2:
         return
     free = _mean_rotation(_pose_of_each_view(pairs, Ks), viewmats)
-    if free is None:
-        return
-    frame = _solve(pairs.points, rays @ free.T, centres @ free.T, free, shifted=True)
+    frame = None if free is None else _solve(pairs.points, rays, free, shifted=True)
     if frame is not None:
-        angle = np.degrees(np.arccos(np.clip((np.trace(free) - 1) / 2, -1, 1)))
+        angle = np.degrees(np.arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
         if angle < _SMALL_ROTATION and abs(np.log(frame.scale)) < _SMALL_SCALE:
             return  # no exporter does so: the cameras are inexact, and a rotation hides it
         text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
@@ -146,17 +128,10 @@ def _known_rotations(viewmats: np.ndarray) -> Iterator[tuple[np.ndarray, str, st
 
 
 def _solve(
-    points: np.ndarray, rays: np.ndarray, centres: np.ndarray, rotation: np.ndarray, *, shifted: bool
+    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
-    """Scale and shift that bring every point nearest to its ray, robustly; None where nothing positive does.
-
-    Args:
-        points: ``[t,3]``.
-        rays: ``[t,3]`` unit directions, rotated already.
-        centres: ``[t,3]`` origins, rotated already.
-        rotation: By which they were rotated.
-        shifted: Whether there may be a shift.
-    """
+    """Scale and shift that, after a rotation, bring every point nearest to its ray, robustly; None if not positive."""
+    rays, centres = (part @ rotation.T for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [np.einsum("tij,tj->ti", across, centres)[:, :, None]] + ([across] if shifted else [])
     A, b = np.concatenate(columns, 2), np.einsum("tij,tj->ti", across, points)
@@ -174,7 +149,7 @@ def _solve(
         angle = np.linalg.norm(np.einsum("tij,tj->ti", across, away), axis=1) / depth
         spread = 3 * np.median(angle) + 1e-12
         weights = 1 / (depth**2 * (1 + (angle / spread) ** 2))
-    return Similarity(rotation, float(solution[0]), np.asarray(shift, np.float64))
+    return Similarity(rotation, float(solution[0]), shift)
 
 
 def _pose_of_each_view(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:

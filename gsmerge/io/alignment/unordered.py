@@ -27,27 +27,18 @@ ColorOf = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class _Spread:
-    """How far rows are from their own pixels.
+    """How far rows are from their own pixels."""
 
-    Args:
-        tolerance: Pixels from a centre within which a view may be a row's own.
-        px: Median distance from the centre in the own view, pixels.
-        color: Median distance of the base colour from the photo in the own view; inf without photos.
-    """
-
-    tolerance: float
-    px: float
-    color: float
+    tolerance: float  # pixels from a centre within which a view may be a row's own
+    px: float  # median distance from the centre in the own view, pixels
+    color: float  # median distance of the base colour from the photo in the own view; inf without photos
 
 
 def unordered_layout(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
-    """Which pixel of which view every row is.
+    """Which pixel of which view every row is; None unless nearly all are at centres, and many more than by chance.
 
-    Each row goes to the view in which it is nearest to a pixel's centre; between several that are near, the colours
-    of the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
-
-    Returns:
-        A layout; None unless nearly all rows are at centres, and many more than by chance.
+    Each row goes to the view in which it is nearest to a pixel's centre; between several that are near, the colours of
+    the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
     """
     count, num_pixels = len(rows), rows.width * rows.height
     spread = _measure_spread(rows, color_of)
@@ -60,17 +51,11 @@ def unordered_layout(rows: ProjectedRows, *, color_of: ColorOf | None = None) ->
     used = np.flatnonzero(owner >= 0)
     if len(used) < MIN_SHARE * count:
         return None
-    parts = np.split(used, np.searchsorted(used, np.arange(1, rows.num_views) * num_pixels))
-    views = [view for view, part in enumerate(parts) if len(part)]
+    slots_of_views = np.split(used, np.searchsorted(used, np.arange(1, rows.num_views) * num_pixels))
+    parts = [(view, owner[own], own - view * num_pixels) for view, own in enumerate(slots_of_views) if len(own)]
     lost = count - len(used)
-    return rows.layout(
-        "unordered",
-        views,
-        [owner[parts[view]] for view in views],
-        [parts[view] - view * num_pixels for view in views],
-        missing=rows.num_views * num_pixels - len(used),
-        note=f", {lost:,} rows without a pixel" if lost else "",
-    )
+    note = f", {lost:,} rows without a pixel" if lost else ""
+    return rows.layout("unordered", parts, missing=rows.num_views * num_pixels - len(used), note=note)
 
 
 def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> _Spread | None:

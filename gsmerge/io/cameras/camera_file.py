@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -32,152 +32,121 @@ CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens that is no pinhole.
+    """A lens that is no pinhole."""
 
-    Args:
-        name: As the camera file calls the model.
-        model: "perspective": radial and tangential, as ``cv2.undistort``; "fisheye": as ``cv2.fisheye``.
-        coefficients: The first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0.
-    """
-
-    name: str
-    model: Literal["perspective", "fisheye"]
+    name: str  # as the camera file calls the model
+    model: Literal["perspective", "fisheye"]  # radial and tangential, as ``cv2.undistort``; as ``cv2.fisheye``
+    # the first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0
     coefficients: tuple[float, ...]
 
 
-def perspective(name: str, coefficients: Sequence[float]) -> Lens | None:
-    """A lens with coefficients in the order k1, k2, p1, p2, k3, k4, k5, k6; None where all are zero: a pinhole."""
-    return Lens(name, "perspective", tuple(coefficients)) if any(coefficients) else None
-
-
-def fisheye(name: str, coefficients: Sequence[float]) -> Lens:
-    """A fisheye with up to four coefficients; with none of them it is no pinhole either."""
-    return Lens(name, "fisheye", tuple(coefficients))
+def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
+    """The lens; None for a perspective without distortion, which is a pinhole: a fisheye is none even then."""
+    return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """c cameras in the order of their file.
+    """c cameras in the order of their file."""
 
-    Args:
-        path: The file or folder.
-        viewmats: ``[c,4,4]`` world to camera, OpenCV axes, float64.
-        Ks: ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5).
-        widths: ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it.
-        heights: The same.
-        names: Image names as the file gives them.
-        source: The format's name.
-        convention: How the format stores poses.
-        images: ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves.
-        order: Order of the Gaussians' rows where the file names it, otherwise "auto".
-        lenses: Of each camera where one of them is no pinhole; empty where all are.
-    """
-
-    path: str
-    viewmats: Tensor
-    Ks: Tensor
-    widths: Tensor
-    heights: Tensor
-    names: tuple[str, ...]
-    source: str
-    convention: Convention = W2C_OPENCV
-    images: np.ndarray | None = None
-    order: str = "auto"
-    lenses: tuple[Lens | None, ...] = ()
+    path: str  # the file or folder
+    viewmats: Tensor  # ``[c,4,4]`` world to camera, OpenCV axes, float64
+    Ks: Tensor  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
+    widths: Tensor  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
+    heights: Tensor  # the same
+    names: tuple[str, ...]  # image names as the file gives them
+    source: str  # the format's name
+    convention: Convention = W2C_OPENCV  # how the format stores poses
+    images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
+    order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
+    lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
 
     def __len__(self) -> int:
         return len(self.names)
+
+
+class View(NamedTuple):
+    """One camera as its file has it."""
+
+    name: str  # of its image
+    pose: np.ndarray  # 3x4 or 4x4, in the file's convention
+    K: np.ndarray  # ``[3,3]`` intrinsics, pixels, or divided by the image's size in all views of the file
+    size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
+    lens: Lens | None = None  # None for a pinhole
+
+
+def make_pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Intrinsics ``[3,3]``."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
 def make_camera_file(
     path: str | os.PathLike[str],
     source: str,
     convention: Convention,
-    poses: np.ndarray | Sequence[np.ndarray],
-    Ks: np.ndarray | Sequence[np.ndarray],
-    sizes: Sequence[tuple[int, int]],
-    names: Sequence[str],
+    views: Sequence[View],
     images: np.ndarray | None = None,
-    lenses: Sequence[Lens | None] = (),
 ) -> CameraFile:
-    """Translate poses to the one convention and check that they are poses.
-
-    Args:
-        path: The file, for messages.
-        source: The format's name.
-        convention: How ``poses`` are stored.
-        poses: c matrices, 3x4 or 4x4.
-        Ks: c matrices 3x3, pixels, or all of them divided by the image's size.
-        sizes: (width, height) of each camera, pixels; 0 where unknown.
-        names: Image names.
-        images: ``[c,h,w,3]`` uint8, if the file holds them.
-        lenses: None for a pinhole; empty for pinholes throughout.
-
-    Raises:
-        SceneError: If there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is
-            not positive.
+    """Translate poses to the one convention and check that they are poses; ``images [c,h,w,3]`` if the file holds them.
+    SceneError if there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is not
+    positive.
     """
-    if len(poses) == 0:
+    if not views:
         raise SceneError(path, "expected at least one camera, found none")
-    if len(poses) > MAX_VIEWS:
-        raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found {len(poses)}")
-    full = np.tile(np.eye(4), (len(poses), 1, 1))
-    for i, pose in enumerate(poses):
-        pose = np.asarray(pose, np.float64)
+    if len(views) > MAX_VIEWS:
+        raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found {len(views)}")
+    poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
+    for i, view in enumerate(views):
+        pose = np.asarray(view.pose, np.float64)
         if pose.shape not in ((3, 4), (4, 4)):
-            raise SceneError(path, f"view {names[i]}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
-        full[i, :3] = pose[:3]
-    K = np.asarray(Ks, np.float64).reshape(-1, 3, 3)
-    _check(path, full, K, names)
-    odd = next(((w, h) for w, h in sizes if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE)), None)
-    if odd is not None:
-        raise SceneError(path, f"expected a positive image size, found {odd[0]:.6g} x {odd[1]:.6g}")
-    K, sizes = _in_pixels(K, sizes)
+            raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
+        poses[i, :3] = pose[:3]
+        _check(path, view.name, poses[i], Ks[i])
+    for w, h in (view.size for view in views):
+        if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
+            raise SceneError(path, f"expected a positive image size, found {w:.6g} x {h:.6g}")
+    Ks, sizes = _in_pixels(Ks, [view.size for view in views])
+    lenses = tuple(view.lens for view in views)
     return CameraFile(
         path=str(path),
-        viewmats=torch.from_numpy(to_viewmats(full, convention)),
-        Ks=torch.from_numpy(K),
+        viewmats=torch.from_numpy(to_viewmats(poses, convention)),
+        Ks=torch.from_numpy(Ks),
         widths=torch.tensor([w for w, _ in sizes], dtype=torch.int64),
         heights=torch.tensor([h for _, h in sizes], dtype=torch.int64),
-        names=tuple(names),
+        names=tuple(view.name for view in views),
         source=source,
         convention=convention,
         images=images,
-        lenses=tuple(lenses) if any(lenses) else (),
+        lenses=lenses if any(lenses) else (),
     )
 
 
-def _in_pixels(Ks: np.ndarray, sizes: Sequence[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
+def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Intrinsics that are divided by the image's size, multiplied by it; where it is unknown, that of 1 x 1 pixels."""
-    known = [w > 0 and h > 0 for w, h in sizes]
     small = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     small &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
-    if not small.all() or any(ok and min(size) <= MAX_NORMALISED_FOCAL for ok, size in zip(known, sizes, strict=True)):
-        return Ks, list(sizes)
-    scale = [(w, h, 1) if ok else (1, 1, 1) for ok, (w, h) in zip(known, sizes, strict=True)]
-    return Ks * np.array(scale, np.float64)[:, :, None], [
-        s if ok else (1, 1) for ok, s in zip(known, sizes, strict=True)
-    ]
+    if not small.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
+        return Ks, sizes
+    sizes = [size if min(size) > 0 else (1, 1) for size in sizes]
+    return Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None], sizes
 
 
-def _check(path: str | os.PathLike[str], poses: np.ndarray, Ks: np.ndarray, names: Sequence[str]) -> None:
-    for name, pose, K in zip(names, poses, Ks, strict=True):
-        if not (np.isfinite(pose).all() and np.isfinite(K).all()):
-            raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
-        largest = max(np.abs(pose).max(), np.abs(K).max())
-        if largest > _MAX_NUMBER:
-            raise SceneError(path, f"view {name}: expected numbers up to {_MAX_NUMBER:g}, found {largest:g}")
-        rotation = pose[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_ROTATION_ERROR:
-            raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
-        if np.linalg.det(rotation) < 0:
-            raise SceneError(
-                path, f"view {name}: expected a rotation, found a mirrored (left-handed) one", "negate one axis"
-            )
-        if K[0, 0] < _MIN_FOCAL or K[1, 1] < _MIN_FOCAL:
-            raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
-        if np.abs(K[2] - (0, 0, 1)).max() > 1e-3 or abs(K[1, 0]) > 1e-3 * K[0, 0]:
-            raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
+def _check(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndarray) -> None:
+    if not (np.isfinite(pose).all() and np.isfinite(K).all()):
+        raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
+    largest = max(np.abs(pose).max(), np.abs(K).max())
+    if largest > _MAX_NUMBER:
+        raise SceneError(path, f"view {name}: expected numbers up to {_MAX_NUMBER:g}, found {largest:g}")
+    rotation = pose[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_ROTATION_ERROR:
+        raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
+    if np.linalg.det(rotation) < 0:
+        problem = f"view {name}: expected a rotation, found a mirrored (left-handed) one"
+        raise SceneError(path, problem, "negate one axis")
+    if K[0, 0] < _MIN_FOCAL or K[1, 1] < _MIN_FOCAL:
+        raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
+    if np.abs(K[2] - (0, 0, 1)).max() > 1e-3 or abs(K[1, 0]) > 1e-3 * K[0, 0]:
+        raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
 
 
 def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:
@@ -195,11 +164,6 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
     return np.linalg.inv(poses) if direction == "camera-to-world" else poses
 
 
-def describe(convention: Convention) -> str:
-    """A convention in words."""
-    return f"{convention[0]} matrices with {convention[1]} axes"
-
-
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
     """The same file, its poses read in another convention."""
     stored = from_viewmats(camera_file.viewmats.numpy(), camera_file.convention)
@@ -215,16 +179,10 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     """The views of these ids, in that order."""
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
-    return replace(
-        cameras,
-        viewmats=cameras.viewmats[ids],
-        Ks=cameras.Ks[ids],
-        widths=cameras.widths[ids],
-        heights=cameras.heights[ids],
-        names=tuple(cameras.names[i] for i in ids),
-        images=None if cameras.images is None else cameras.images[ids],
-        lenses=lenses if any(lenses) else (),
-    )
+    tensors = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
+    images = None if cameras.images is None else cameras.images[ids]
+    names = tuple(cameras.names[i] for i in ids)
+    return replace(cameras, **tensors, names=names, images=images, lenses=lenses if any(lenses) else ())
 
 
 def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
@@ -237,34 +195,30 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
-    """Cameras of one image size.
+    """Cameras of one image size (width, height) in pixels; None takes the file's.
 
-    Args:
-        camera_file: What was read.
-        size: (width, height), pixels; intrinsics of another size are scaled to it, each axis by itself. None takes
-            the file's size.
+    Intrinsics of another size are scaled to it, each axis by itself.
 
     Raises:
         SceneError: If no size is given and the file's cameras have none, or several; or a lens is no pinhole.
     """
-    if camera_file.lenses:
-        name, lens = next((n, x) for n, x in zip(camera_file.names, camera_file.lenses, strict=True) if x is not None)
-        raise SceneError(
-            camera_file.path,
-            f"view {name}: expected a pinhole camera, found {lens.name} with lens distortion",
-            "undistort the images first",
-        )
+    path = camera_file.path
+    for name, lens in zip(camera_file.names, camera_file.lenses, strict=False):
+        if lens is not None:
+            problem = f"view {name}: expected a pinhole camera, found {lens.name} with lens distortion"
+            raise SceneError(path, problem, "undistort the images first")
     if size is None:
         stored = _stored_sizes(camera_file)
         if len(stored) > 1:
             sizes = " and ".join(f"{w} x {h}" for w, h in stored[:2])
-            raise SceneError(camera_file.path, f"expected cameras of one image size, found {sizes}")
+            raise SceneError(path, f"expected cameras of one image size, found {sizes}")
         size = stored[0]
         if 0 in size or size == (1, 1):
-            raise SceneError(camera_file.path, "expected the image size (w, h) of the cameras, found none")
-    check_pixels(camera_file.path, *size)
-    known = (camera_file.widths > 0) & (camera_file.heights > 0)
-    scale = torch.ones(len(camera_file), 3, dtype=torch.float64)
-    scale[:, 0] = torch.where(known, size[0] / camera_file.widths.clamp_min(1), 1.0)
-    scale[:, 1] = torch.where(known, size[1] / camera_file.heights.clamp_min(1), 1.0)
-    return Cameras(camera_file.viewmats, camera_file.Ks * scale[:, :, None], *size)
+            raise SceneError(path, "expected the image size (w, h) of the cameras, found none")
+    check_pixels(path, *size)
+    sides = torch.stack([camera_file.widths, camera_file.heights], 1)
+    known = (sides > 0).all(1, keepdim=True)
+    scale = torch.where(known, torch.tensor(size) / sides.clamp_min(1), 1.0)
+    Ks = camera_file.Ks.clone()
+    Ks[:, :2] *= scale[:, :, None]
+    return Cameras(camera_file.viewmats, Ks, *size)

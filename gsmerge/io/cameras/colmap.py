@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, Lens, fisheye, make_camera_file, perspective
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_lens, make_pinhole
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
 _MODELS = (
@@ -28,8 +28,7 @@ _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 
 MAX_NAME = 1 << 16  # bytes of an image's name
 
-_Camera = tuple[np.ndarray, tuple[int, int], Lens | None]  # K [3,3], (width, height)
-_Image = tuple[str, int, list[float]]  # name, camera id, quaternion wxyz and translation
+_Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
 def is_colmap(folder: Path) -> bool:
@@ -38,10 +37,8 @@ def is_colmap(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> CameraFile:
-    """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes.
-
-    Raises:
-        SceneError: If a file is missing or damaged, or a lens of an unknown kind.
+    """Cameras of a COLMAP model in the order of its images file: world-to-camera, OpenCV axes. SceneError if a file is
+    missing or damaged, or a lens of an unknown kind.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"
@@ -55,24 +52,15 @@ def read_colmap(folder: Path) -> CameraFile:
         else:
             cameras = _text_cameras(camera_path, read_text(camera_path))
             images = _text_images(read_text(image_path, MAX_MODEL_BYTES))
-        poses = [_pose(numbers) for _, _, numbers in images]
+        unknown = next((name for name, camera, _ in images if camera not in cameras), None)
+        if unknown is not None:
+            raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
     except (struct.error, ValueError, IndexError) as error:
         raise SceneError(folder, f"expected a COLMAP model, found damaged cameras or images{suffix}") from error
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
-    unknown = next((name for name, camera, _ in images if camera not in cameras), None)
-    if unknown is not None:
-        raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
-    return make_camera_file(
-        folder,
-        f"COLMAP {'binary' if binary else 'text'}",
-        W2C_OPENCV,
-        poses,
-        [cameras[camera][0] for _, camera, _ in images],
-        [cameras[camera][1] for _, camera, _ in images],
-        [name for name, _, _ in images],
-        lenses=[cameras[camera][2] for _, camera, _ in images],
-    )
+    views = [cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images]
+    return make_camera_file(folder, f"COLMAP {'binary' if binary else 'text'}", W2C_OPENCV, views)
 
 
 @contextmanager
@@ -84,6 +72,7 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
 
 
 def _pose(numbers: list[float]) -> np.ndarray:
+    """``[3,4]`` from a quaternion wxyz and a translation."""
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
     quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
@@ -96,21 +85,18 @@ def _pose(numbers: list[float]) -> np.ndarray:
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 
 
-def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> _Camera:
+def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> View:
     if model not in _PERSPECTIVE | _FISHEYE:
-        raise SceneError(
-            path,
-            f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}",
-            "undistort the images first",
-        )
+        problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
+        raise SceneError(path, problem, "undistort the images first")
     one = model in _ONE_FOCAL
-    fx, fy, cx, cy = (params[0], params[0], *params[1:3]) if one else params[:4]
+    K = make_pinhole(params[0], *params[:3]) if one else make_pinhole(*params[:4])
     distortion = params[3 if one else 4 : _NUM_PARAMS[model]]
-    lens = fisheye(model, distortion) if model in _FISHEYE else perspective(model, distortion)
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size, lens
+    lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
+    return View("", np.eye(4), K, size, lens)
 
 
-def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, _Camera]:
+def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, View]:
     (count,) = struct.unpack_from("<Q", data)
     position, cameras = 8, {}
     for _ in range(count):
@@ -137,17 +123,19 @@ def _binary_images(data: mmap.mmap) -> list[_Image]:
         position = end + 9 + 24 * num_points
         if position > len(data):
             raise ValueError("early end of file")
-        images.append((name, camera, numbers))
+        images.append((name, camera, _pose(numbers)))
         if len(images) > MAX_VIEWS:
             break  # which is refused as too many
     return images
 
 
-def _text_cameras(path: Path, text: str) -> dict[int, _Camera]:
+def _says_something(line: str) -> bool:
+    return line.strip()[:1] not in ("", "#")
+
+
+def _text_cameras(path: Path, text: str) -> dict[int, View]:
     cameras = {}
-    for line in text.splitlines():
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
+    for line in filter(_says_something, text.splitlines()):
         camera_id, model, width, height, *params = line.split()
         if len(params) != _NUM_PARAMS.get(model, len(params)):
             raise ValueError("wrong number of parameters")
@@ -161,11 +149,11 @@ def _text_images(text: str) -> list[_Image]:
     lines = iter(text.splitlines())
     images = []
     for line in lines:
-        if not line.strip() or line.lstrip().startswith("#"):
+        if not _says_something(line):
             continue
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")
-        images.append((name.strip(), int(camera), [float(x) for x in numbers]))
+        images.append((name.strip(), int(camera), _pose([float(x) for x in numbers])))
         next(lines, None)
     return images

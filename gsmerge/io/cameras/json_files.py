@@ -17,9 +17,10 @@ from gsmerge.io.cameras.camera_file import (
     W2C_OPENCV,
     CameraFile,
     Lens,
-    fisheye,
+    View,
     make_camera_file,
-    perspective,
+    make_lens,
+    make_pinhole,
 )
 from gsmerge.io.photos import find_image, image_size
 
@@ -32,11 +33,7 @@ FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "
 
 
 def read_json_cameras(path: Path) -> CameraFile:
-    """Cameras of any of the known JSON files.
-
-    Raises:
-        SceneError: If it is none of them, or damaged.
-    """
+    """Cameras of any of the known JSON files. SceneError if it is none of them, or damaged."""
     data = read_json(path)
     if isinstance(data, dict) and "frames" in data:
         frames = data["frames"]
@@ -58,56 +55,44 @@ def read_transforms(path: Path, data: Mapping[str, Any] | list[Any]) -> CameraFi
 
     A dictionary with ``frames`` has camera-to-world poses with OpenGL axes; a bare list of frames (as one backbone
     writes) has camera-to-world poses with OpenCV axes. Intrinsics are global or per frame, in pixels or as field of
-    view. ``applied_transform`` is not applied: poses are as the Gaussians' world has them.
-
-    Raises:
-        SceneError: If a pose or an intrinsic is missing, or a lens of an unknown kind.
+    view. ``applied_transform`` is not applied: poses are as the Gaussians' world has them. SceneError if a pose or an
+    intrinsic is missing, or a lens of an unknown kind.
     """
-    bare = isinstance(data, list)
-    common: Mapping[str, Any] = {} if isinstance(data, list) else data
-    frames = data if isinstance(data, list) else data["frames"]
+    source, convention = ("frame list", C2W_OPENCV) if isinstance(data, list) else ("transforms.json", C2W_OPENGL)
+    common, frames = ({}, data) if isinstance(data, list) else (data, data["frames"])
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
-    poses, Ks, sizes, names, lenses = [], [], [], [], []
+    views = []
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path") or frame.get("image_path") or frame.get("name") or f"view {i}")
         if "transform_matrix" not in frame:
             raise SceneError(path, f"view {name}: expected 'transform_matrix', found none")
+        values = {**common, **frame}
         try:
-            poses.append(np.array(frame["transform_matrix"], np.float64))
-            lenses.append(_lens(path, name, {**common, **frame}))
-            K, size = _intrinsics(path, name, {**common, **frame})
+            pose = np.array(frame["transform_matrix"], np.float64)
+            lens = _lens(path, name, values)
+            views.append(View(name, pose, *_intrinsics(path, name, values), lens))
         except (TypeError, ValueError, ArithmeticError) as error:
             raise SceneError(path, f"view {name}: expected numbers ({error})") from error
-        names.append(name)
-        Ks.append(K)
-        sizes.append(size)
-    source = "frame list" if bare else "transforms.json"
-    convention = C2W_OPENCV if bare else C2W_OPENGL
-    return make_camera_file(path, source, convention, poses, Ks, sizes, names, lenses=lenses)
+    return make_camera_file(path, source, convention, views)
 
 
 def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
     """Intrinsics [3,3] and (width, height) of one frame, its own values before the global ones."""
+    if not any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")):
+        missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
+        problem = f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {missing} for view {name}"
+        raise SceneError(path, problem, "add them in pixels, for all frames or for each")
     width, height = float(values.get("w") or 0), float(values.get("h") or 0)
-    has_focal = any(key in values for key in ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y"))
-    if has_focal and not (width and height) and not {"fl_x", "cx", "cy"} <= values.keys():
+    if not (width and height) and not {"fl_x", "cx", "cy"} <= values.keys():
         image = find_image(path.parent, name)
         if image is None:
             raise SceneError(path, f"view {name}: expected 'w' and 'h', found neither them nor the image itself")
         width, height = image_size(image)
-    missing = [key for key in ("fl_x", "w", "h") if key not in values]
-    if not has_focal:
-        raise SceneError(
-            path,
-            f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {', '.join(missing)} for view {name}",
-            "add them in pixels, for all frames or for each",
-        )
     fx = _focal(values, "x", width) or _focal(values, "y", height)
     fy = _focal(values, "y", height) or fx
-    cx = float(values["cx"]) if "cx" in values else width / 2
-    cy = float(values["cy"]) if "cy" in values else height / 2
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (round(width), round(height))
+    K = make_pinhole(fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2)))
+    return K, (round(width), round(height))
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
@@ -127,29 +112,23 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     if not any(params.values()):
         params |= dict(zip(_DISTORTION, listed, strict=False))
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
-        return fisheye("OPENCV_FISHEYE", [params[key] for key in ("k1", "k2", "k3", "k4")])
+        return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
     odd = next((key for key in ("k4", "k5", "k6") if params[key]), None)
     if model not in _PERSPECTIVE or odd is not None:
-        what = (
-            f"camera model {model}" if odd is None else f"lens distortion {odd}, which formats understand differently"
-        )
-        raise SceneError(
-            path,
-            f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {what}",
-            "undistort the images first",
-        )
-    return perspective(
-        model if model in _DISTORTED else "OPENCV", [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
-    )
+        what = f"camera model {model}"
+        if odd is not None:
+            what = f"lens distortion {odd}, which formats understand differently"
+        problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {what}"
+        raise SceneError(path, problem, "undistort the images first")
+    coefficients = [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
+    return make_lens(model if model in _DISTORTED else "OPENCV", "perspective", coefficients)
 
 
 def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
     """Cameras of a parsed ``cameras.json``: camera-to-world rotation rows and centre, principal point in the middle.
-
-    Raises:
-        SceneError: If a key is missing or not a number.
+    SceneError if a key is missing or not a number.
     """
-    poses, Ks, sizes, names = [], [], [], []
+    views = []
     for i, entry in enumerate(entries):
         name = str(entry.get("img_name", f"view {i}"))
         missing = [key for key in _INRIA_KEYS if key not in entry]
@@ -159,34 +138,28 @@ def read_inria(path: Path, entries: list[dict[str, Any]]) -> CameraFile:
             rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
             centre = np.array(entry["position"], np.float64).reshape(3, 1)
             fx, fy, width, height = (float(entry[key]) for key in ("fx", "fy", "width", "height"))
-            sizes.append((round(width), round(height)))
+            size = round(width), round(height)
         except (TypeError, ValueError, ArithmeticError) as error:
             raise SceneError(path, f"view {name}: expected numbers ({error})") from error
-        poses.append(np.concatenate([rotation, centre], 1))
-        Ks.append(np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]))
-        names.append(name)
-    return make_camera_file(path, "INRIA cameras.json", C2W_OPENCV, poses, Ks, sizes, names)
+        K = make_pinhole(fx, fy, width / 2, height / 2)
+        views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
+    return make_camera_file(path, "INRIA cameras.json", C2W_OPENCV, views)
 
 
 def read_world_mirror(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Cameras of a parsed ``camera_params.json``.
 
-    ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV
-    axes, intrinsics in pixels of the processed size, which only the images have. ``camera_id``
-    is the stem of the image's name, or the image's number, by which the cameras are then sorted.
-
-    Raises:
-        SceneError: If the two lists do not name the same cameras, or a matrix is none.
+    ``extrinsics`` and ``intrinsics`` are lists of ``{camera_id, matrix}``; poses are camera-to-world with OpenCV axes,
+    intrinsics in pixels of the processed size, which only the images have. ``camera_id`` is the stem of the image's
+    name, or the image's number, by which the cameras are then sorted. SceneError if the two lists do not name the same
+    cameras, or a matrix is none.
     """
     poses, Ks = (_matrices(path, data, key, side) for key, side in (("extrinsics", 4), ("intrinsics", 3)))
     if poses.keys() != Ks.keys():
         odd = sorted(poses.keys() ^ Ks.keys())[0]
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
     names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
-    return make_camera_file(
-        path, "camera_params.json", C2W_OPENCV, [poses[n] for n in names], [Ks[n] for n in names],
-        [(0, 0)] * len(names), names,
-    )  # fmt: skip
+    return make_camera_file(path, "camera_params.json", C2W_OPENCV, [View(n, poses[n], Ks[n]) for n in names])
 
 
 def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[str, np.ndarray]:
@@ -209,32 +182,27 @@ def read_long_lrm(path: Path, data: Mapping[str, Any]) -> CameraFile:
     """Cameras of a parsed dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
     Next to it Long-LRM writes which frames it took (``input_frame_idx.txt``) and how the Gaussians' world lies in the
-    cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world.
-
-    Raises:
-        SceneError: If an entry is missing or no number, or a frame is named that is not there.
+    cameras': X = scene_scale (pos_avg_inv X_cameras). The cameras are brought into the Gaussians' world. SceneError if
+    an entry is missing or no number, or a frame is named that is not there.
     """
-    poses, Ks, sizes, names = [], [], [], []
+    frames = []
     for i, frame in enumerate(data["frames"]):
         name = str(frame.get("file_path") or frame.get("image_path") or f"view {i}")
         try:
-            poses.append(np.array(frame["w2c"], np.float64).reshape(4, 4))
-            fx, fy, cx, cy = (float(frame[key]) for key in ("fx", "fy", "cx", "cy"))
-            sizes.append((round(float(frame["w"])), round(float(frame["h"]))))
+            pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
+            K = make_pinhole(*(float(frame[key]) for key in ("fx", "fy", "cx", "cy")))
+            frames.append(View(name, pose, K, (round(float(frame["w"])), round(float(frame["h"])))))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise SceneError(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers ({error})") from error
-        Ks.append(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-        names.append(name)
     frame_ids = _numbers(path.with_name(FRAMES_FILE))
-    ids = range(len(names)) if frame_ids is None else [round(value) for value in frame_ids.reshape(-1)]
-    odd = next((i for i in ids if not 0 <= i < len(names)), None)
+    ids = range(len(frames)) if frame_ids is None else [round(value) for value in frame_ids]
+    odd = next((i for i in ids if not 0 <= i < len(frames)), None)
     if odd is not None:
-        raise SceneError(path.with_name(FRAMES_FILE), f"expected frames 0 to {len(names) - 1}, found {odd:.6g}")
+        raise SceneError(path.with_name(FRAMES_FILE), f"expected frames 0 to {len(frames) - 1}, found {odd:.6g}")
     with np.errstate(all="ignore"):  # what overflows is refused with the cameras
-        moved = _moved(path, np.array([poses[i] for i in ids]).reshape(-1, 4, 4))
-    return make_camera_file(
-        path, "Long-LRM", W2C_OPENCV, moved, [Ks[i] for i in ids], [sizes[i] for i in ids], [names[i] for i in ids]
-    )
+        poses = _moved(path, np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4))
+    views = [frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)]
+    return make_camera_file(path, "Long-LRM", W2C_OPENCV, views)
 
 
 def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
@@ -248,9 +216,9 @@ def _moved(path: Path, viewmats: np.ndarray) -> np.ndarray:
         except np.linalg.LinAlgError as error:
             raise SceneError(path.with_name(POSE_FILE), "expected a matrix that can be inverted") from error
     if scale is not None:
-        if scale.size != 1 or not scale.reshape(-1)[0] > 0:
+        if scale.size != 1 or not scale[0] > 0:
             raise SceneError(path.with_name(SCALE_FILE), "expected one positive number")
-        viewmats[:, :3, 3] *= scale.reshape(-1)[0]
+        viewmats[:, :3, 3] *= scale[0]
     return viewmats
 
 

@@ -16,9 +16,7 @@ from gsmerge.runtime.threads import parallel_map
 
 def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
     """Photos without lens distortion and cameras that are pinholes, with the same intrinsics; and a note about it.
-
-    Raises:
-        SceneError: If a lens is no pinhole and there are no photos of the camera's shape.
+    SceneError if a lens is no pinhole and there are no photos of the camera's shape.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -26,33 +24,21 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
     name = next(lens.name for lens in camera_file.lenses if lens is not None)
     size = photo_size(photos)
     if photos is None or size is None:
-        raise SceneError(
-            camera_file.path,
-            f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images",
-            "name the images with --images, or undistort them first",
-        )
-    other = next((s for s in sizes_of(camera_file) if not same_shape(s, size)), None)
-    if other is not None:
-        raise SceneError(
-            camera_file.path,
-            f"expected images of the cameras' {other[0]} x {other[1]} to undistort ({name}), found"
-            f" {size[0]} x {size[1]}",
-            "give the images as they were taken, or undistort them first",
-        )
+        problem = f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images"
+        raise SceneError(camera_file.path, problem, "name the images with --images, or undistort them first")
+    for w, h in sizes_of(camera_file):
+        if not same_shape((w, h), size):
+            problem = f"expected images of the cameras' {w} x {h} to undistort ({name}), found {size[0]} x {size[1]}"
+            raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
     straight = undistort_photos(photos, to_cameras(pinholes, size).Ks.numpy(), camera_file.lenses)
     return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
 
 
 def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> list[np.ndarray]:
-    """The photos that pinholes with the same intrinsics would have taken.
+    """The photos that pinholes with the same intrinsics would have taken; where one shows nothing, its border is
+    repeated.
 
-    Args:
-        photos: c uint8 photos ``[h,w,3]``.
-        Ks: ``[c,3,3]`` at the photos' size; the top-left pixel's centre is (0.5, 0.5).
-        lenses: Of each photo.
-
-    Returns:
-        c photos of the same size; where a photo shows nothing, its border is repeated.
+    ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
     """
 
     def one(item: tuple[np.ndarray, np.ndarray, Lens | None]) -> np.ndarray:

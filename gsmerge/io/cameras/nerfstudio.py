@@ -27,13 +27,7 @@ def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
 
     ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``
     (and ``applied_scale``) are already moved by that, so it is undone; which of the two holds has to be measured.
-
-    Args:
-        path: The file.
-        cameras: The camera file, of which ``applied_transform`` is read where it has one.
-
-    Raises:
-        SceneError: If there is no rotation, shift and positive scale in it.
+    SceneError if there is no rotation, shift and positive scale in it.
     """
     data = read_json(path)
     try:

@@ -16,7 +16,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.layouts import ORDERS
 from gsmerge.io.bounds import check_pixels
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.io.formats.npz import array_names, read_arrays
 
 _EXTRINSICS, _INTRINSICS = ("extrinsics", "exts"), ("intrinsics", "ixts")
@@ -28,20 +28,15 @@ def read_da3(path: Path) -> CameraFile:
     """Cameras (and images, where stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
     Intrinsics of another image size than the depth maps' (they are stored so when a COLMAP export ran in the same
-    call), or normalised ones, are scaled to it.
-
-    Raises:
-        SceneError: If the file cannot be read or lacks an array.
+    call), or normalised ones, are scaled to it. SceneError if the file cannot be read or lacks an array.
     """
-    arrays = _load(path)
-    poses, Ks = _first(arrays, _EXTRINSICS), _first(arrays, _INTRINSICS)
+    sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
+    arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *sizes})
+    poses, Ks, images, depths = (_first(arrays, names) for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS))
     if poses is None or Ks is None:
-        missing = [names[0] for names, a in ((_EXTRINSICS, poses), (_INTRINSICS, Ks)) if a is None]
-        raise SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
-    check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
-    images, depths = _first(arrays, _IMAGES), _first(arrays, _DEPTHS)
-    if images is not None:
-        images = as_images(path, images, len(poses))
+        raise _missing(path, [n for n, a in (("extrinsics", poses), ("intrinsics", Ks)) if a is None], arrays)
+    _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
+    images = None if images is None else _as_images(path, images, len(poses))
     grid = images if images is not None else depths
     Ks = Ks.astype(np.float64)
     if grid is not None and grid.ndim >= 3 and min(grid.shape[1:3]) > 0:
@@ -49,9 +44,30 @@ def read_da3(path: Path) -> CameraFile:
         Ks = _at_size(Ks, width, height)
     else:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
-    names = [f"view {i}" for i in range(len(poses))]
-    sizes = [(int(width), int(height))] * len(poses)
-    return make_camera_file(path, "DA3 npz", W2C_OPENCV, poses, Ks, sizes, names, images)
+    return make_camera_file(path, "DA3 npz", W2C_OPENCV, _views(poses, Ks, (width, height)), images)
+
+
+def is_dump(path: Path) -> bool:
+    """Whether an npz holds camera-to-world poses under the name ``c2w``; False if it cannot be read."""
+    return "c2w" in array_names(path)
+
+
+def read_dump(path: Path) -> CameraFile:
+    """Cameras and images of a ``views.npz``. SceneError if the file cannot be read, lacks an array, or one has another
+    shape than it should.
+    """
+    arrays = read_arrays(path, ("c2w", "K", "images", "order"))
+    missing = [name for name in ("c2w", "K", "images") if name not in arrays]
+    if missing:
+        raise _missing(path, missing, arrays)
+    poses, Ks = arrays["c2w"], arrays["K"]
+    _check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
+    images = _as_images(path, arrays["images"], len(poses))
+    order = str(arrays.get("order", "auto"))
+    if order not in ORDERS:
+        raise SceneError(path, f"expected 'order' to be one of {', '.join(ORDERS)}, found {order[:40]!r}")
+    views = _views(poses, Ks, (images.shape[2], images.shape[1]))
+    return replace(make_camera_file(path, "dump of a model", C2W_OPENCV, views, images), order=order)
 
 
 def holds_images(path: Path) -> bool:
@@ -70,40 +86,31 @@ def read_depths(path: Path) -> np.ndarray | None:
     return depths if usable else None
 
 
-def _load(path: Path) -> dict[str, np.ndarray]:
-    """The arrays that matter; depth only for its shape, so the confidence is never decompressed."""
-    shapes = () if holds_images(path) else _DEPTHS
-    return read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *shapes})
+def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
+    return next((arrays[name] for name in names if name in arrays), None)
 
 
-def check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str, str]) -> None:
-    """Refuse poses and intrinsics that are not as many matrices of finite numbers.
+def _missing(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> SceneError:
+    problem = f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}"
+    return SceneError(path, problem)
 
-    Args:
-        path: The file, for messages.
-        poses: What should be ``[c,3,4]`` or ``[c,4,4]``.
-        Ks: What should be ``[c,3,3]``.
-        names: What to call the two, with their shapes.
 
-    Raises:
-        SceneError: If they are not.
-    """
+def _views(poses: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> list[View]:
+    return [View(f"view {i}", pose, K, size) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
+
+
+def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray, names: tuple[str, str]) -> None:
+    """Refuse what is not as many poses as intrinsics ``[c,3,3]``, of finite numbers; ``names`` have the shapes, too."""
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
     if poses.ndim != 3 or len(poses) == 0 or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
-    if not (
-        np.isfinite(poses).all() and np.isfinite(Ks).all() and np.abs(Ks.astype(np.float64)).max() < _MAX_INTRINSIC
-    ):
+    if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < _MAX_INTRINSIC)):
         raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found others")
 
 
-def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:
-    return next((arrays[name] for name in names if name in arrays), None)
-
-
-def as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
+def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     """``[c,h,w,3]`` uint8 from images in any of the usual forms; what is not finite becomes black or white."""
     if images.ndim == 4 and images.shape[1] == 3 and images.shape[3] != 3:
         images = images.transpose(0, 2, 3, 1)
@@ -120,46 +127,13 @@ def as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Intrinsics at the given size: these networks keep the principal point in the middle."""
-    middle = np.maximum(Ks[:, :2, 2], _SMALL)
-    ratio_x, ratio_y = 2 * middle[:, 0] / width, 2 * middle[:, 1] / height
+    size = np.array([width, height])
+    ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
     # the same ratio on both axes, clearly: another size; otherwise a principal point that is not in the middle
-    other_size = (np.abs(ratio_x / ratio_y - 1) < 0.03) & (np.abs(ratio_x - 1) > 0.1)
+    other_size = (np.abs(ratio[:, 0] / ratio[:, 1] - 1) < 0.03) & (np.abs(ratio[:, 0] - 1) > 0.1)
     scaled = Ks.copy()
-    for i in range(len(Ks)):
-        if normalised[i]:
-            scaled[i, 0] *= width
-            scaled[i, 1] *= height
-        elif other_size[i]:
-            scaled[i, 0] /= ratio_x[i]
-            scaled[i, 1] /= ratio_y[i]
+    scaled[normalised, :2] *= size[:, None]
+    other_size &= ~normalised
+    scaled[other_size, :2] /= ratio[other_size, :, None]
     return scaled
-
-
-def is_dump(path: Path) -> bool:
-    """Whether an npz holds camera-to-world poses under the name ``c2w``; False if it cannot be read."""
-    return "c2w" in array_names(path)
-
-
-def read_dump(path: Path) -> CameraFile:
-    """Cameras and images of a ``views.npz``.
-
-    Raises:
-        SceneError: If the file cannot be read, lacks an array, or one has another shape than it should.
-    """
-    arrays = read_arrays(path, ("c2w", "K", "images", "order"))
-    missing = [name for name in ("c2w", "K", "images") if name not in arrays]
-    if missing:
-        raise SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
-    poses, Ks = arrays["c2w"], arrays["K"]
-    check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
-    images = as_images(path, arrays["images"], len(poses))
-    height, width = images.shape[1:3]
-    order = str(arrays["order"]) if "order" in arrays else "auto"
-    if order not in ORDERS:
-        raise SceneError(path, f"expected 'order' to be one of {', '.join(ORDERS)}, found {order[:40]!r}")
-    names = [f"view {i}" for i in range(len(poses))]
-    made = make_camera_file(
-        path, "dump of a model", C2W_OPENCV, poses, Ks, [(width, height)] * len(poses), names, images
-    )
-    return replace(made, order=order)

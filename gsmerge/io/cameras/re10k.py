@@ -13,8 +13,8 @@ import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
-from gsmerge.io.photos import decode_embedded
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
+from gsmerge.io.photos import decode_embedded, photo_size
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
@@ -23,28 +23,22 @@ _MAX_PHOTOS = 1 << 30  # bytes of the decoded photos
 
 
 def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
-    """Cameras and photos of one scene of a chunk.
+    """Cameras and photos of one scene of a chunk, by its key; where there is one scene only, it may be another or None.
 
     A chunk is a list of ``{key, cameras, images}``: ``cameras [v,18]`` are fx, fy, cx, cy divided by the image's size,
     two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes. Nothing in it is
-    executed: only tensors and plain containers are read.
-
-    Args:
-        path: The chunk.
-        scene: Key of the scene; may be missing or another one where there is one scene only.
-
-    Raises:
-        SceneError: If it cannot be read, has no such scene, or an array has another shape than it should.
+    executed: only tensors and plain containers are read. SceneError if it cannot be read, has no such scene, or an
+    array has another shape than it should.
     """
     entry = _chosen(path, _load(path), scene)
     rows = _rows(path, entry.get("cameras"))
-    Ks = np.tile(np.eye(3), (len(rows), 1, 1))
-    Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2] = rows[:, :4].T
     names = [f"view {i}" for i in range(len(rows))]
     photos = _photos(path, entry.get("images"), names)
-    size = (0, 0) if photos is None else (photos.shape[2], photos.shape[1])
-    poses = rows[:, 6:].reshape(-1, 3, 4)
-    return make_camera_file(path, "re10k chunk", W2C_OPENCV, poses, Ks, [size] * len(rows), names, photos)
+    size = photo_size(photos) or (0, 0)
+    views = [
+        View(name, row[6:].reshape(3, 4), make_pinhole(*row[:4]), size) for name, row in zip(names, rows, strict=True)
+    ]
+    return make_camera_file(path, "re10k chunk", W2C_OPENCV, views, photos)
 
 
 def _load(path: Path) -> list[Mapping[str, Any]]:
@@ -79,11 +73,8 @@ def _chosen(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> 
     if len(named) == 1:
         return named[0]
     keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
-    raise SceneError(
-        path,
-        f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)",
-        "name the .ply as its scene is named",
-    )
+    problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
+    raise SceneError(path, problem, "name the .ply as its scene is named")
 
 
 def _rows(path: Path, cameras: Any) -> np.ndarray:
@@ -104,10 +95,11 @@ def _has_values(tensor: torch.Tensor) -> bool:
 
 def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
     """``[v,h,w,3]`` uint8; None where the chunk has none."""
-    if images is None or (isinstance(images, list | tuple) and not images):
+    listed = isinstance(images, list | tuple)
+    if images is None or (listed and not images):
         return None
-    if not isinstance(images, list | tuple) or len(images) != len(names):
-        count = len(images) if isinstance(images, list | tuple) else type(images).__name__
+    if not listed or len(images) != len(names):
+        count = len(images) if listed else type(images).__name__
         raise SceneError(path, f"expected {len(names)} images, one per camera, found {count}")
     limit = path.stat().st_size
     for image in images:

@@ -8,7 +8,7 @@ import numpy as np
 from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, make_camera_file
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.formats.ply_file import open_ply
 
 SOURCE = "SHARP"
@@ -19,26 +19,21 @@ LAYERS = 2  # Gaussians per cell: a front and a back layer
 def read_sharp(path: Path) -> CameraFile | None:
     """The camera inside a ``.ply``, at the size of its grid; None where there is none.
 
-    The grid is square whatever the photo's shape: the photo was stretched to it.
-
-    Raises:
-        SceneError: If the numbers are damaged.
+    The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are damaged.
     """
     data = open_ply(path)
     if "vertex" not in data or not all(name in data for name in _ELEMENTS):
         return None
-    if any(data[name].count > 16 or len(data[name].properties) != 1 for name in _ELEMENTS):
-        return None
-    if any(isinstance(data[name].properties[0], PlyListProperty) for name in _ELEMENTS):
-        return None
+    for element in (data[name] for name in _ELEMENTS):
+        if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
+            return None
     extrinsic, intrinsic, size = (np.asarray([row[0] for row in data[name].data], np.float64) for name in _ELEMENTS)
     side = round((data["vertex"].count / LAYERS) ** 0.5)
     if LAYERS * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
     if len(extrinsic) not in (12, 16) or len(intrinsic) not in (4, 9):
         raise SceneError(path, f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}")
-    if len(intrinsic) == 4:
-        fx, fy, cx, cy = intrinsic
-        intrinsic = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
-    K = intrinsic.reshape(3, 3) * np.array([[side / size[0]], [side / size[1]], [1.0]])
-    return make_camera_file(path, SOURCE, W2C_OPENCV, [extrinsic.reshape(-1, 4)], [K], [(side, side)], [path.stem])
+    K = make_pinhole(*intrinsic) if len(intrinsic) == 4 else intrinsic.reshape(3, 3)
+    K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
+    view = View(path.stem, extrinsic.reshape(-1, 4), K, (side, side))
+    return make_camera_file(path, SOURCE, W2C_OPENCV, [view])

@@ -1,9 +1,8 @@
-"""Gaussians as float64 arrays in the units of most file formats, for the writers that quantise them."""
+"""Gaussians as float64 arrays in the units of most file formats: what all writers start from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -15,50 +14,57 @@ from gsmerge.types import Gaussians
 
 @dataclass(frozen=True)
 class Columns:
-    """n Gaussians: ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]`` in [0, 1],
-    ``colors [n,3]``, 0 to 1 in range, and ``harmonics [n,k-1,3]``.
+    """n Gaussians: ``means [n,3]``, unit ``quats [n,4]`` wxyz, ``log_scales [n,3]``, ``opacities [n]``,
+    ``sh0 [n,3]``, and ``harmonics [n,k-1,3]``.
     """
 
     means: np.ndarray
     quats: np.ndarray
     log_scales: np.ndarray
     opacities: np.ndarray
-    colors: np.ndarray
+    sh0: np.ndarray
     harmonics: np.ndarray
 
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def colors(self) -> np.ndarray:
+        """``[n,3]`` base colours, 0 to 1 in range."""
+        return sh0_to_rgb(self.sh0)
 
     def select(self, order: np.ndarray) -> Columns:
         """The rows in another order."""
         return Columns(*(column[order] for column in vars(self).values()))
 
 
-def to_columns(gaussians: Gaussians, max_degree: int) -> Columns:
-    """Finite Gaussians as arrays, without harmonics above a degree.
-
-    Raises:
-        ValueError: If there is NaN or inf.
+def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
+    """Finite Gaussians as arrays, without harmonics above a degree; ``first_row`` is the number of the first one.
+    ValueError if there is NaN or inf; says in which row.
     """
 
-    def array(tensor: Tensor) -> np.ndarray[Any, np.dtype[np.float64]]:
-        values = tensor.detach().cpu().double().numpy()
-        if not np.isfinite(values).all():
-            raise ValueError("expected finite Gaussians, got NaN or inf")
+    def check(values: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            bad = np.argwhere(~np.isfinite(values.astype(np.float32)))  # as no format holds larger numbers
+        if len(bad):
+            raise ValueError(f"expected finite Gaussians, got NaN or inf in row {first_row + int(bad[0, 0])}")
         return values
+
+    def array(tensor: Tensor) -> np.ndarray:
+        return check(tensor.detach().cpu().double().numpy())
 
     degree = min(max_degree, gaussians.sh_degree)
     quats = array(gaussians.quats)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
-    with np.errstate(divide="ignore"):  # scales of 0 are clipped
+    with np.errstate(all="ignore"):  # scales of 0 are clipped, negative ones refused
         log_scales = np.clip(np.log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     return Columns(
         means=array(gaussians.means),
         quats=quats,
-        log_scales=log_scales,
-        opacities=array(gaussians.opacities).clip(0, 1),
-        colors=sh0_to_rgb(array(gaussians.sh0)[:, 0]),
+        log_scales=check(log_scales),
+        opacities=array(gaussians.opacities),
+        sh0=array(gaussians.sh0)[:, 0],
         harmonics=array(gaussians.shN)[:, : (degree + 1) ** 2 - 1],
     )
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyListProperty
+from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import morton_codes, rgb_to_sh0
@@ -31,15 +31,13 @@ MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def is_compressed(data: PlyData) -> bool:
-    """Whether a PLY with an element ``chunk`` holds packed Gaussians."""
-    return "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
+    """Whether a PLY holds packed Gaussians."""
+    return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
 def unpack(path: Path, data: PlyData) -> np.ndarray:
-    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_file`, opacities as logits.
-
-    Raises:
-        SceneError: If chunks are missing or lack a column.
+    """The rows of an ordinary file: the columns of :mod:`gsmerge.io.formats.ply_file`, opacities as logits. SceneError
+    if chunks are missing or lack a column.
     """
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
@@ -48,25 +46,22 @@ def unpack(path: Path, data: PlyData) -> np.ndarray:
         if odd is not None:
             where, kind = f"in element '{element.name}' of a compressed file", dtypes.get(odd, "none")
             raise SceneError(path, f"expected {odd} {where} as {types[0]}, found {kind}")
-    count = vertex.count
+    count, num_chunks = vertex.count, -(-vertex.count // CHUNK)
     if count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices")
-    if chunk.count < -(-count // CHUNK):
-        raise SceneError(
-            path, f"expected {-(-count // CHUNK)} chunks for {count} Gaussians, found {chunk.count}", "export it again"
-        )
-    ids = np.arange(count) // CHUNK
-    colors = [p.name for p in chunk.properties if p.name in COLORS and p.val_dtype in ("f4", "f8")]
-    with np.errstate(all="ignore"):  # what is not finite is set aside later
-        ranges = {name: np.asarray(chunk[name], np.float32)[ids] for name in (*RANGES, *colors)}
+    if chunk.count < num_chunks:
+        problem = f"expected {num_chunks} chunks for {count} Gaussians, found {chunk.count}"
+        raise SceneError(path, problem, "export it again")
     num_rest = _num_rest(path, data, count)
-    names = [*REQUIRED, *(f"f_rest_{i}" for i in range(num_rest))]
-    rows = np.empty(count, [(name, "<f4") for name in names])
+    rows = np.empty(count, [(name, "<f4") for name in (*REQUIRED, *(f"f_rest_{i}" for i in range(num_rest)))])
     words = {name: np.asarray(vertex[name]).astype(np.uint32) for name in PACKED}
-    _fill_vectors(rows, MEANS, words["packed_position"], ranges, "")
-    _fill_vectors(rows, SCALES, words["packed_scale"], ranges, "scale_")
+    with np.errstate(all="ignore"):  # what is not finite is set aside later
+        _fill_between(rows, MEANS, _shares(words["packed_position"], (11, 10, 11)), chunk, RANGES[:6])
+        _fill_between(rows, SCALES, _shares(words["packed_scale"], (11, 10, 11)), chunk, RANGES[6:])
+        *colors, alpha = _shares(words["packed_color"], (8, 8, 8, 8))
+        _fill_between(rows, SH0, colors, chunk, COLORS)
+        rows["opacity"] = np.log(alpha) - np.log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
     _fill_rotations(rows, words["packed_rotation"])
-    _fill_colors(rows, words["packed_color"], ranges)
     for i in range(num_rest):
         stored = np.asarray(data["sh"][f"f_rest_{i}"], np.float32)
         share = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
@@ -84,75 +79,63 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
     return number
 
 
-def _fill_vectors(
-    rows: np.ndarray, names: tuple[str, ...], words: np.ndarray, ranges: dict[str, np.ndarray], prefix: str
+def _fill_between(
+    rows: np.ndarray, columns: tuple[str, ...], shares: list[np.ndarray], chunk: PlyElement, ranges: tuple[str, ...]
 ) -> None:
-    """Three numbers of 11, 10 and 11 bits, between the chunk's minimum and maximum."""
-    for name, axis, shift, bits in zip(names, "xyz", (21, 11, 0), (11, 10, 11), strict=True):
-        part = ((words >> np.uint32(shift)) & np.uint32(2**bits - 1)) / np.float32(2**bits - 1)
-        low, high = ranges[f"min_{prefix}{axis}"], ranges[f"max_{prefix}{axis}"]
-        with np.errstate(all="ignore"):
-            rows[name] = low * (1 - part) + high * part
+    """Three columns from shares between a chunk's minima and maxima, which older files do not have for colours."""
+    ids, dtype = np.arange(len(rows)) // CHUNK, chunk.data.dtype
+    has_ranges = all(name in dtype.names and dtype[name].kind == "f" for name in ranges)
+    for column, share, low, high in zip(columns, shares, ranges[:3], ranges[3:], strict=True):
+        if has_ranges:
+            least, most = (np.asarray(chunk[name], np.float32)[ids] for name in (low, high))
+            share = least * (1 - share) + most * share
+        rows[column] = rgb_to_sh0(share) if column in SH0 else share
 
 
 def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
     """Two bits name the largest component of wxyz; the others follow at 10 bits each, over +-sqrt(1/2)."""
     largest = (words >> np.uint32(30)).astype(np.int64)
-    norm = np.sqrt(2.0)
-    parts = [(((words >> np.uint32(s)) & np.uint32(1023)) / 1023.0 - 0.5) * norm for s in (20, 10, 0)]
-    missing = np.sqrt(np.clip(1 - sum(part**2 for part in parts), 0, None))
+    others = (np.stack(_shares(words, (10, 10, 10)), 1) - 0.5) * np.sqrt(2.0)
     quats = np.empty((len(words), 4))
-    for which in range(4):
-        own = largest == which
-        others = iter(parts)
-        for i in range(4):
-            quats[own, i] = missing[own] if i == which else next(others)[own]
+    is_largest = np.arange(4) == largest[:, None]
+    quats[~is_largest] = others.reshape(-1)
+    quats[is_largest] = np.sqrt(np.clip(1 - (others**2).sum(1), 0, None))
     for i, name in enumerate(QUATS):
         rows[name] = quats[:, i]
 
 
-def _fill_colors(rows: np.ndarray, words: np.ndarray, ranges: dict[str, np.ndarray]) -> None:
-    """Red, green, blue and opacity in [0, 1] at 8 bits each; newer files give colours a range per chunk."""
-    with np.errstate(divide="ignore"):
-        alpha = (words & np.uint32(255)) / 255.0
-        rows["opacity"] = np.log(alpha) - np.log1p(-alpha)  # infinite for 0 and 1, which the reader takes as such
-    for name, channel, shift in zip(SH0, "rgb", (24, 16, 8), strict=True):
-        color = ((words >> np.uint32(shift)) & np.uint32(255)) / 255.0
-        if all(key in ranges for key in COLORS):
-            low, high = ranges[f"min_{channel}"], ranges[f"max_{channel}"]
-            with np.errstate(all="ignore"):
-                color = low * (1 - color) + high * color
-        rows[name] = rgb_to_sh0(color)
+def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
+    """Numbers between 0 and 1 that stand side by side in the lowest bits of words, the last one at the bottom."""
+    out = []
+    for i, width in enumerate(bits):
+        shifted = words >> np.uint32(sum(bits[i + 1 :]))
+        out.append((shifted & np.uint32(2**width - 1)) / float(2**width - 1))
+    return out
 
 
 def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Content of a ``.compressed.ply``; rows along a space-filling curve, so that chunks are small.
-
-    Raises:
-        ValueError: If there is NaN or inf.
+    """Content of a ``.compressed.ply``; rows along a space-filling curve, so that chunks are small. ValueError if there
+    is NaN or inf.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
     columns = columns.select(np.argsort(morton_codes(columns.means), kind="stable"))
     count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
-    low_means, high_means, means = _ranged(columns.means)
-    low_scales, high_scales, scales = _ranged(columns.log_scales)
-    low_colors, high_colors, colors = _ranged(columns.colors)
-    chunks = np.concatenate([low_means, high_means, low_scales, high_scales, low_colors, high_colors], 1)
+    ranged = [_ranged(values) for values in (columns.means, columns.log_scales, columns.colors)]
+    chunks = np.concatenate([end for low, high, _ in ranged for end in (low, high)], 1)
+    means, scales, colors = (shares for _, _, shares in ranged)
     words = np.empty((count, 4), "<u4")
     words[:, 0], words[:, 2] = _packed(means, (11, 10, 11)), _packed(scales, (11, 10, 11))
     largest, others = smallest_three(columns.quats)
     words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others / np.sqrt(2.0) + 0.5, (10, 10, 10))
     words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
-    harmonics = to_bytes(
-        np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1).reshape(count, num_rest)
-    )
+    harmonics = np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element chunk {len(chunks)}", *(f"property float {name}" for name in (*RANGES, *COLORS))]
     header += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     if num_rest:
         header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]
     text = "\n".join([*header, "end_header", ""])
-    return text.encode("ascii") + chunks.astype("<f4").tobytes() + words.tobytes() + harmonics.tobytes()
+    return text.encode("ascii") + chunks.astype("<f4").tobytes() + words.tobytes() + to_bytes(harmonics).tobytes()
 
 
 def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -160,9 +143,7 @@ def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     starts = np.arange(0, len(values), CHUNK)
     if len(starts) == 0:
         return values, values, values
-    low, high = (
-        reduce.reduceat(values, starts).astype(np.float32).astype(np.float64) for reduce in (np.minimum, np.maximum)
-    )
+    low, high = (end.reduceat(values, starts).astype(np.float32).astype(float) for end in (np.minimum, np.maximum))
     ids, span = np.arange(len(values)) // CHUNK, high - low
     return low, high, (values - low[ids]) / np.where(span > 0, span, 1)[ids]
 

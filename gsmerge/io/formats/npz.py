@@ -7,7 +7,6 @@ import warnings
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -31,11 +30,8 @@ def array_names(path: Path) -> frozenset[str]:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Those of the named arrays that an ``.npz`` has, in its order.
-
-    Raises:
-        SceneError: If it cannot be read, an array holds anything but numbers and text, or one is larger than its
-            bytes in the archive allow.
+    """Those of the named arrays that an ``.npz`` has, in its order. SceneError if it cannot be read, an array holds
+    anything but numbers and text, or one is larger than its bytes in the archive allow.
     """
     check_file(path)
     if not zipfile.is_zipfile(path):
@@ -56,26 +52,17 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    name = info.filename
     if info.file_size > max(_FREE_BYTES, _MAX_RATIO * info.compress_size):
-        raise SceneError(
-            path, f"{info.filename}: found {info.file_size >> 20} MiB in {info.compress_size} packed bytes"
-        )
+        raise SceneError(path, f"{name}: found {info.file_size >> 20} MiB in {info.compress_size} packed bytes")
     with archive.open(info) as file:
-        shape, dtype = _header(file)
+        first = np.lib.format.read_magic(file) == (1, 0)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(file)
     if dtype.kind not in _KINDS:
-        raise SceneError(path, f"{info.filename}: expected numbers, found {_kind(dtype)}")
+        kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
+        raise SceneError(path, f"{name}: expected numbers, found {kind}")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > info.file_size:
-        raise SceneError(path, f"{info.filename}: expected as many bytes as shape {list(shape)} needs, found fewer")
+        raise SceneError(path, f"{name}: expected as many bytes as shape {list(shape)} needs, found fewer")
     with archive.open(info) as file:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
-    return shape, dtype
-
-
-def _kind(dtype: np.dtype) -> str:
-    return "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]

@@ -44,57 +44,37 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """What a PLY file holds.
-
-    Args:
-        path: The file.
-        layout: Name of the column layout, as "17-column export" or "INRIA, SH degree 3".
-        format: "ascii", "binary little-endian" or "binary big-endian".
-        count: Gaussians, the unusable ones included.
-        file_bytes: Size of the file.
-        bytes_by_attribute: Bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats,
-            extra); of the values' binary types for an ascii file.
-        columns: All columns of the vertex element, in the file's order.
-        extra_columns: Those that are ignored.
-        extra_elements: Elements besides ``vertex``.
-        byte_columns: Columns stored as bytes.
-        comments: Of the header.
-        sh_degree: 0 to 4.
-        opacity_encoding: "logit", or "raw" where the file holds opacities in [0, 1].
-        opacity_guessed: Whether the encoding was guessed from the values, not given by the caller or the file.
-        num_nonfinite: Rows with NaN or inf, set aside.
-        num_clipped_scales: Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped.
-        num_zero_quats: Gaussians without a rotation, read as the identity.
-    """
+    """What the PLY file at ``path`` holds."""
 
     path: str
-    layout: str
-    format: str
-    count: int
+    layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
+    format: str  # "ascii", "binary little-endian" or "binary big-endian"
+    count: int  # Gaussians, the unusable ones included
     file_bytes: int
+    # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
+    # types for an ascii file
     bytes_by_attribute: dict[str, int]
+    # all columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and ``byte_columns`` stored
+    # as bytes
     columns: tuple[str, ...]
     extra_columns: tuple[str, ...]
-    extra_elements: tuple[str, ...]
+    extra_elements: tuple[str, ...]  # elements besides ``vertex``
     byte_columns: tuple[str, ...]
-    comments: tuple[str, ...]
-    sh_degree: int
-    opacity_encoding: str
-    opacity_guessed: bool
-    num_nonfinite: int
-    num_clipped_scales: int
-    num_zero_quats: int
+    comments: tuple[str, ...]  # of the header
+    sh_degree: int  # 0 to 4
+    opacity_encoding: str  # "logit", or "raw" where the file holds opacities in [0, 1]
+    opacity_guessed: bool  # whether the encoding was guessed from the values, not given by the caller or the file
+    num_nonfinite: int  # rows with NaN or inf, set aside
+    num_clipped_scales: int  # Gaussians with a log scale beyond +-30 or a harmonic beyond +-1e6, clipped
+    num_zero_quats: int  # Gaussians without a rotation, read as the identity
 
 
 @dataclass(frozen=True)
 class PlyScene:
-    """The Gaussians of a PLY file, row by row.
+    """The n Gaussians of a PLY file, row by row; float32, means float64 where the file stores them so.
 
-    Args:
-        gaussians: n rows; float32, means float64 where the file stores them so. A row that was not finite is
-            fully transparent and grey, and has the position and scales of the finite row before it.
-        valid: ``[n]`` bool, False for the rows that were not finite.
-        info: What the file holds.
+    A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of
+    the finite row before it.
     """
 
     gaussians: Gaussians
@@ -138,22 +118,23 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     path = Path(path)
     data = open_ply(path)
-    compressed = "chunk" in data and is_compressed(data)
+    compressed = is_compressed(data)
     stored = unpack(path, data) if compressed else _vertex(path, data).data
     rows = np.asarray(stored)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
-    blocks = _convert_all(stored, out)
+    num_clipped, num_zero_quats = _convert_all(stored, out)
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     known = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
-    encoding = known or _likely_encoding(blocks)
+    encoding = known or _likely_encoding(out["opacities"])
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
     if byte_columns == NORMALS:
         spread_low_degree(out["shN"])
-    extra = _extra_columns(names, num_rest)
+    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
+    extra = tuple(name for name in names if name not in used)
     info = PlyInfo(
         path=str(path),
         layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
@@ -170,8 +151,8 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         opacity_encoding=encoding,
         opacity_guessed=known is None,
         num_nonfinite=num_bad,
-        num_clipped_scales=sum(b.num_clipped for b in blocks),
-        num_zero_quats=sum(b.num_zero_quats for b in blocks),
+        num_clipped_scales=num_clipped,
+        num_zero_quats=num_zero_quats,
     )
     tensors = {k: torch.from_numpy(v) for k, v in out.items()}
     return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
@@ -200,55 +181,38 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     return vertex
 
 
-def _convert_all(stored: np.ndarray, out: dict[str, np.ndarray]) -> list[_Converted]:
-    """Fill the arrays block by block, in parallel."""
-    rows = np.asarray(stored)
-    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
-
-    def convert(start: int) -> _Converted:
-        block = slice(start, min(start + size, len(rows)))
-        converted = _convert(rows[block], {name: column[block] for name, column in out.items()})
-        release_block(stored, block)
-        return converted
-
-    return parallel_map(convert, range(0, len(rows), size))
-
-
-def _extra_columns(names: tuple[str, ...], num_rest: int) -> tuple[str, ...]:
-    used = {*REQUIRED, *color_columns(names), *NORMALS, *(f"f_rest_{i}" for i in range(num_rest))}
-    return tuple(name for name in names if name not in used)
-
-
 def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
-    names = [name for name in columns if name.startswith("f_rest_")]
-    if len(names) not in (0, 9, 24, 45, 72) or set(names) != {f"f_rest_{i}" for i in range(len(names))}:
-        raise SceneError(
-            path,
-            "expected columns f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4) or none, "
-            f"found {len(names)} f_rest columns",
-        )
+    names = {name for name in columns if name.startswith("f_rest_")}
+    if len(names) not in (0, 9, 24, 45, 72) or names != {f"f_rest_{i}" for i in range(len(names))}:
+        numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
+        raise SceneError(path, f"expected columns {numbers} or none, found {len(names)} f_rest columns")
     return len(names)
 
 
 def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
     n = len(rows)
-    wide = any(rows.dtype[name] in (np.dtype("<f8"), np.dtype(">f8")) for name in MEANS)
+    wide = any(rows.dtype[name].kind == "f" and rows.dtype[name].itemsize == 8 for name in MEANS)
     shapes = {"quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, num_higher, 3)}
     out = {"means": np.empty((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
     return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
 
 
-@dataclass(frozen=True)
-class _Converted:
-    """What one block of rows contained."""
+def _convert_all(stored: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill the arrays block by block, in parallel; how many rows were clipped, and had no rotation."""
+    rows = np.asarray(stored)
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
 
-    num_clipped: int
-    num_zero_quats: int
-    any_finite_opacity: bool
-    unit_opacities: bool  # all finite ones in [0, 1]
+    def convert(start: int) -> tuple[int, int]:
+        block = slice(start, min(start + size, len(rows)))
+        counts = _convert(rows[block], {name: column[block] for name, column in out.items()})
+        release_block(stored, block)
+        return counts
+
+    counts = parallel_map(convert, range(0, len(rows), size))
+    return sum(clipped for clipped, _ in counts), sum(zero for _, zero in counts)
 
 
-def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
+def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill the arrays of one block of rows, column by column; opacities are only copied."""
     with np.errstate(all="ignore"):
         total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
@@ -292,13 +256,7 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> _Converted:
         doubtful = np.flatnonzero(~valid)
         if len(doubtful):
             valid[doubtful] = _exactly_valid(rows[doubtful], num_higher)
-    finite = out["opacities"][np.isfinite(out["opacities"])] if len(doubtful) else out["opacities"]
-    return _Converted(
-        num_clipped=int((clipped & valid).sum()),
-        num_zero_quats=int((zero & valid).sum()),
-        any_finite_opacity=len(finite) > 0,
-        unit_opacities=bool(len(finite) == 0 or (finite.min() >= 0 and finite.max() <= 1)),
-    )
+    return int((clipped & valid).sum()), int((zero & valid).sum())
 
 
 def _exactly_valid(rows: np.ndarray, num_higher: int) -> np.ndarray:
@@ -331,9 +289,11 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return zero
 
 
-def _likely_encoding(blocks: list[_Converted]) -> str:
-    finite = any(block.any_finite_opacity for block in blocks)
-    return "raw" if finite and all(block.unit_opacities for block in blocks) else "logit"
+def _likely_encoding(opacities: np.ndarray) -> str:
+    """Whether all finite opacities, of which there is one, lie in [0, 1]: "raw"; otherwise "logit"."""
+    finite = np.isfinite(opacities)
+    low, high = opacities.min(where=finite, initial=np.inf), opacities.max(where=finite, initial=-np.inf)
+    return "raw" if 0 <= low <= high <= 1 else "logit"
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import mmap
 import re
 import warnings
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -40,19 +41,16 @@ _SIZES = {
 
 
 def open_ply(path: Path) -> PlyData:
-    """A PLY file, mapped into memory where it is binary.
-
-    Raises:
-        SceneError: If it is no PLY file, is truncated or damaged, or its header asks for more than it holds.
+    """A PLY file, mapped into memory where it is binary. SceneError if it is no PLY file, is truncated or damaged, or
+    its header asks for more than it holds.
     """
     size = check_file(path)
     try:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
-        if start[:3] != b"ply" or start[3:4] not in (b"\n", b"\r"):
-            raise SceneError(
-                path, "expected a PLY file, found one that does not start with the line 'ply'", "name the .ply"
-            )
+        if start[:4] not in (b"ply\n", b"ply\r"):
+            problem = "expected a PLY file, found one that does not start with the line 'ply'"
+            raise SceneError(path, problem, "name the .ply")
         _check_header(path, start, size)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
@@ -62,11 +60,7 @@ def open_ply(path: Path) -> PlyData:
     except PlyElementParseError as error:
         element, row = error.element, error.row
         promise = f"element '{element.name}' with {element.count} rows" if element is not None else "more data"
-        raise SceneError(
-            path,
-            f"truncated or damaged: expected {promise}, found {row or 0} whole ones ({error.message})",
-            "copy or export it again",
-        ) from error
+        raise _truncated(path, promise, row or 0, error.message) from error
     except (PlyParseError, ValueError, ArithmeticError, MemoryError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
 
@@ -94,14 +88,8 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def _check_header(path: Path, start: bytes, size: int) -> None:
-    """Refuse a header that never ends, and elements with more rows than the rest of the file has bytes for.
-
-    Everything else is left to the parser.
-
-    Args:
-        path: The file, for messages.
-        start: Its first bytes.
-        size: Of the file, bytes.
+    """Refuse a header (``start`` has the first bytes of ``size``) that never ends, or elements that the rest of the
+    file has not bytes enough for. Everything else is left to the parser.
     """
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
@@ -113,7 +101,7 @@ def _check_header(path: Path, start: bytes, size: int) -> None:
     text = ["format", "ascii", "1.0"] in words
     elements: list[tuple[str, int, list[list[str]]]] = []
     for line in words:
-        if line[:1] == ["element"] and len(line) == 3 and _is_int(line[2]):
+        if line[:1] == ["element"] and len(line) == 3 and re.fullmatch(r"[+-]?\d[\d_]*", line[2]):
             elements.append((line[1], int(line[2]), []))
         elif line[:1] == ["property"] and len(line) > 2 and elements:
             elements[-1][2].append(line[1:-1])
@@ -131,20 +119,12 @@ def _check_header(path: Path, start: bytes, size: int) -> None:
         each = sum(2 if text else _SIZES.get((kind[1:2] or kind)[0], 1) for kind in properties)
         before, left = left, left - count * each
         if left < -1:  # the last row of a text may end without a new line
-            raise SceneError(
-                path,
-                f"truncated or damaged: expected element '{name}' with {count} rows, "
-                f"found {before // each} whole ones (early end-of-file)",
-                "copy or export it again",
-            )
+            raise _truncated(path, f"element '{name}' with {count} rows", before // each, "early end-of-file")
 
 
-def _is_int(word: str) -> bool:
-    try:
-        int(word)
-    except ValueError:
-        return False
-    return True
+def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneError:
+    problem = f"truncated or damaged: expected {promise}, found {num_whole} whole ones ({reason})"
+    return SceneError(path, problem, "copy or export it again")
 
 
 def sh_degree(num_rest: int) -> int:
@@ -158,12 +138,9 @@ def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def spread_low_degree(shN: np.ndarray) -> None:
-    """Put harmonics of a low degree in their places, where the columns are those of degree 3; in place.
+    """Put harmonics of a low degree in their places, where ``shN [n,15,3]`` has columns of degree 3; in place.
 
     Long-LRM writes 45 columns whatever the degree: those of degree 1 (or 2) are channel-major in the first 9 (or 24).
-
-    Args:
-        shN: ``[n,15,3]`` as read from columns of degree 3; others are left alone.
     """
     if shN.shape[1] != 15:
         return
@@ -190,10 +167,8 @@ def bytes_by_attribute(rows: np.ndarray, extra: tuple[str, ...]) -> dict[str, in
     """Bytes of all rows by attribute; ``extra`` are the columns that are ignored."""
     groups = {"means": MEANS, "normals": NORMALS, "sh0": color_columns(rows.dtype.names), "opacities": ("opacity",)}
     groups |= {"scales": SCALES, "quats": QUATS, "extra": extra}
-    of = {name: kind for kind, names in groups.items() for name in names}
-    sizes: dict[str, int] = {}
-    assert rows.dtype.names is not None
-    for name in rows.dtype.names:
-        kind = of.get(name, "shN")
-        sizes[kind] = sizes.get(kind, 0) + rows.dtype[name].itemsize * len(rows)
-    return sizes
+    kinds = {name: kind for kind, names in groups.items() for name in names}
+    sizes: Counter[str] = Counter()
+    for name in rows.dtype.names or ():
+        sizes[kinds.get(name, "shN")] += rows.dtype[name].itemsize * len(rows)
+    return dict(sizes)

@@ -15,7 +15,7 @@ import struct
 
 import numpy as np
 
-from gsmerge.io.formats.arrays import Columns, smallest_three, to_bytes, to_columns
+from gsmerge.io.formats.arrays import smallest_three, to_bytes, to_columns
 from gsmerge.types import SH_C0, Gaussians
 
 MAX_DEGREE = 3  # older readers do not know degree 4
@@ -27,17 +27,14 @@ COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 
 
 def spz_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.spz`` file.
-
-    Raises:
-        ValueError: If there is NaN or inf.
-    """
+    """Content of a ``.spz`` file. ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
     fraction = _fraction_bits(columns.means)
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(columns), degree, fraction, 0, 0)
+    fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
     parts = [
-        _positions(columns, fraction),
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),  # three little-endian bytes for each coordinate
         to_bytes(255 * columns.opacities).tobytes(),
         to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)).tobytes(),
         to_bytes(16 * (columns.log_scales + 10)).tobytes(),
@@ -55,12 +52,6 @@ def _fraction_bits(means: np.ndarray) -> int:
     fine = FINE - np.log2(max(size, 1e-6))
     left = np.log2(LARGEST / max(np.abs(means).max(), 1e-6))
     return int(np.clip(min(np.ceil(fine), np.floor(left)), 0, MAX_FRACTION))
-
-
-def _positions(columns: Columns, fraction: int) -> bytes:
-    """Three little-endian bytes for each coordinate."""
-    fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
-    return fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes()
 
 
 def _rotations(quats: np.ndarray) -> bytes:

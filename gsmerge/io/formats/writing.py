@@ -11,8 +11,8 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.formats import compressed, spz_writer
-from gsmerge.io.formats.arrays import to_bytes, to_columns
-from gsmerge.io.formats.ply_writer import write_ply
+from gsmerge.io.formats.arrays import Columns, to_bytes, to_columns
+from gsmerge.io.formats.ply_file import BLOCK_BYTES, LOGIT_COMMENT, MAX_LOGIT, MEANS, NORMALS, QUATS, SCALES, SH0
 from gsmerge.types import Gaussians
 
 # ``.splat``: 32 bytes per Gaussian and no header, the format of antimatter15/splat that most viewers read. Quaternions
@@ -20,12 +20,7 @@ from gsmerge.types import Gaussians
 SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
-OUTPUT_FORMATS = {
-    ".compressed.ply": compressed.MAX_DEGREE,
-    ".ply": 4,
-    ".spz": spz_writer.MAX_DEGREE,
-    ".splat": 0,
-}
+OUTPUT_FORMATS = {".compressed.ply": compressed.MAX_DEGREE, ".ply": 4, ".spz": spz_writer.MAX_DEGREE, ".splat": 0}
 
 
 def output_format(path: str | os.PathLike[str]) -> str:
@@ -43,11 +38,7 @@ def output_format(path: str | os.PathLike[str]) -> str:
 
 
 def lost_harmonics(path: str | os.PathLike[str], sh_degree: int) -> str | None:
-    """What a format has no room for, as a note; None if it holds everything.
-
-    Raises:
-        UsageError: As :func:`output_format`.
-    """
+    """What a format has no room for, as a note; None if it holds everything. Raises as :func:`output_format`."""
     ending = output_format(path)
     highest = OUTPUT_FORMATS[ending]
     return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
@@ -81,21 +72,109 @@ def write_gaussians(
     if ending == ".ply":
         write_ply(path, gaussians, overwrite=overwrite, comments=comments)
         return
-    if not all(comment.isascii() and comment.isprintable() for comment in comments):
-        raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
-    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+    _check_comments(comments)
+    with atomic_output(path, overwrite=overwrite) as temporary:
         if ending == ".compressed.ply":
-            file.write(compressed.compressed_bytes(gaussians, comments))
+            content = compressed.compressed_bytes(gaussians, comments)
         else:
-            file.write(spz_writer.spz_bytes(gaussians) if ending == ".spz" else splat_bytes(gaussians))
+            content = spz_writer.spz_bytes(gaussians) if ending == ".spz" else _splat_bytes(gaussians)
+        temporary.write_bytes(content)
 
 
-def splat_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.splat`` file.
+def write_ply(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    overwrite: bool = False,
+    sh_degree: int | None = None,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write Gaussians in INRIA's column order, binary little-endian float32.
+
+    Opacities become finite logits (within +-16), scales finite logarithms (within +-30), quaternions unit ones.
+
+    Args:
+        path: The file; complete or not there at all.
+        gaussians: Finite values.
+        overwrite: Replace an existing file.
+        sh_degree: Drop harmonics above this degree; None keeps all.
+        comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
 
     Raises:
-        ValueError: If there is NaN or inf.
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, fewer harmonics than asked for, or a comment is no line of ASCII.
     """
+    _check_comments(comments)
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not 0 <= degree <= gaussians.sh_degree:
+        raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
+    header, num_columns = _header(len(gaussians), degree, comments)
+    block = max(1, BLOCK_BYTES // (4 * num_columns))
+    with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
+        file.write(header)
+        for start in range(0, len(gaussians), block):
+            rows = _ply_rows(to_columns(gaussians[start : start + block], degree, start))
+            if not np.isfinite(rows).all():
+                raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
+            file.write(rows.data)
+
+
+def _check_comments(comments: Sequence[str]) -> None:
+    if not all(comment.isascii() and comment.isprintable() for comment in comments):
+        raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
+
+
+def _header(count: int, sh_degree: int, comments: Sequence[str] = ()) -> tuple[bytes, int]:
+    """The header of a ``.ply`` of that many Gaussians, and its number of columns, all of them float32."""
+    num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}"]
+    lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
+    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+    return "\n".join(lines).encode("ascii"), len(names)
+
+
+def _ply_rows(columns: Columns) -> np.ndarray:
+    """``[m,columns]`` float32 values in the order of the header."""
+    with np.errstate(all="ignore"):  # opacities 0 and 1 are clipped, impossible ones become NaN
+        logits = np.log(columns.opacities) - np.log1p(-columns.opacities)
+    parts = [
+        columns.means,
+        np.zeros_like(columns.means),  # normals
+        columns.sh0,
+        columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
+        np.clip(logits, -MAX_LOGIT, MAX_LOGIT)[:, None],
+        columns.log_scales,
+        columns.quats,
+    ]
+    return np.concatenate(parts, axis=1, dtype="<f4", casting="same_kind")
+
+
+def file_bytes(count: int, sh_degree: int) -> int:
+    """Size of the ``.ply`` of that many Gaussians, as :func:`write_ply` writes it without comments."""
+    header, num_columns = _header(count, sh_degree)
+    return len(header) + 4 * num_columns * count
+
+
+def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
+    """Largest number of Gaussians whose ``.ply`` has at most ``max_bytes``.
+
+    Raises:
+        ValueError: If the degree is not 0 to 4.
+        UsageError: If not even one fits.
+    """
+    if not 0 <= sh_degree <= 4:
+        raise ValueError(f"sh_degree: expected 0 to 4, got {sh_degree}")
+    least = file_bytes(1, sh_degree)
+    if max_bytes < least:
+        raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")
+    count = (max_bytes - file_bytes(0, sh_degree)) // (file_bytes(2, sh_degree) - least)
+    while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
+        count -= 1
+    return count
+
+
+def _splat_bytes(gaussians: Gaussians) -> bytes:
     columns = to_columns(gaussians, OUTPUT_FORMATS[".splat"])
     rows = np.empty(len(columns), SPLAT_ROW)
     rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)

@@ -47,10 +47,11 @@ def box_overlap(mean_a, cov_a, mean_b, cov_b):
 
 
 @kernel
-def edge_scores(neighbors, means, covars, colors, views, max_color, boxes, out):
+def edge_scores(neighbors, means, covars, colors, latents, views, max_color, similarity, boxes, out):
     """Overlap of every Gaussian with each of its ``neighbors [g,k]`` (below 0: none) -> ``out [g,k]``.
 
-    -1 where the two are of one view (views below 0 are of none) or their colours differ by more than ``max_color``.
+    -1 where the two are of one view (views below 0 are of none), where the cosine of their ``latents [g,d]`` of length
+    1 is below ``similarity``, or, where d is 0, their colours differ by more than ``max_color``.
     """
     half = np.empty(6)
     for i in range(neighbors.shape[0]):
@@ -59,11 +60,18 @@ def edge_scores(neighbors, means, covars, colors, views, max_color, boxes, out):
             out[i, k] = -1.0
             if j < 0 or (views[i] >= 0 and views[i] == views[j]):
                 continue
-            difference = 0.0
-            for c in range(3):
-                difference += (colors[i, c] - colors[j, c]) ** 2
-            if difference > max_color * max_color:
-                continue
+            if latents.shape[1] > 0:
+                cosine = 0.0
+                for c in range(latents.shape[1]):
+                    cosine += latents[i, c] * latents[j, c]
+                if cosine < similarity:
+                    continue
+            else:
+                difference = 0.0
+                for c in range(3):
+                    difference += (colors[i, c] - colors[j, c]) ** 2
+                if difference > max_color * max_color:
+                    continue
             if boxes:
                 out[i, k] = box_overlap(means[i], covars[i], means[j], covars[j])
             else:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
@@ -19,7 +21,10 @@ ALL = "all"  # word for all views
 SIZES = ("budget", "superpixels")
 ONE_SIZE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
-FITTED = ("unmerged-fit",)  # baselines that effort changes
+FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
+NUMBERS = ("k", "budgets", "superpixels", "views")  # lists whose values may be numbers
+# Settings whose lists are multiplied, and the lists' names:
+SETTINGS = {"k": "k", "segmentation": "segmentations", "fit": "fit", "effort": "efforts", "match": "matches"}
 
 
 @dataclass(frozen=True)
@@ -34,34 +39,19 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Grid:
-    """Lists whose product is run.
+    """Lists whose product is run; a ValueError if one is empty that must not be, or a value is impossible."""
 
-    Args:
-        methods: ``gsmerge`` and baselines.
-        k: Gaussians per superpixel: 1 to 8.
-        budgets: Gaussians in the result, such as 40000, "2%" or "auto".
-        superpixels: Superpixels per view, such as 3000 or "4.4%"; in addition to the budgets, not times them.
-        segmentations: Superpixel methods.
-        fit: ``full``, ``color``, ``none``.
-        efforts: ``draft``, ``fast``, ``default``, ``best``.
-        matches: Merging across views: ``overlap``, ``aabb``, ``none``.
-        views: Numbers of views; "all" for all.
-        fixed: Any other settings of ours, each "name=value", the same in all runs.
-
-    Raises:
-        ValueError: If a list is empty that must not be, or a value is impossible.
-    """
-
-    methods: tuple[str, ...] = (OURS,)
-    k: tuple[int, ...] = (1,)
-    budgets: tuple[int | str, ...] = ()
+    methods: tuple[str, ...] = (OURS,)  # ``gsmerge`` and baselines
+    k: tuple[int, ...] = (1,)  # Gaussians per superpixel: 1 to 8
+    budgets: tuple[int | str, ...] = ()  # Gaussians in the result, such as 40000, "2%" or "auto"
+    # superpixels per view, such as 3000 or "4.4%"; in addition to the budgets, not times them
     superpixels: tuple[int | str, ...] = ()
-    segmentations: tuple[str, ...] = ("rdseg",)
-    fit: tuple[str, ...] = ("full",)
-    efforts: tuple[str, ...] = ("default",)
-    matches: tuple[str, ...] = ("overlap",)
-    views: tuple[int | str, ...] = (ALL,)
-    fixed: tuple[str, ...] = ()
+    segmentations: tuple[str, ...] = ("rdseg",)  # superpixel methods
+    fit: tuple[str, ...] = ("full",)  # ``full``, ``color``, ``none``
+    efforts: tuple[str, ...] = ("default",)  # ``draft``, ``fast``, ``default``, ``best``
+    matches: tuple[str, ...] = ("overlap",)  # merging across views: ``overlap``, ``aabb``, ``none``
+    views: tuple[int | str, ...] = (ALL,)  # numbers of views; "all" for all
+    fixed: tuple[str, ...] = ()  # any other settings of ours, each "name=value", the same in all runs
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -76,11 +66,7 @@ class Grid:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The fixed settings by name.
-
-        Raises:
-            UsageError: If one is not "name=value", or a setting that cannot be fixed.
-        """
+        """The fixed settings by name; a UsageError if one is not "name=value", or a setting that cannot be fixed."""
         settings: dict[str, Any] = {}
         for text in self.fixed:
             name, sign, value = str(text).partition("=")
@@ -88,39 +74,22 @@ class Grid:
                 raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
             if name in OWN_OPTIONS:
                 raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
-            try:
+            settings[name] = value
+            with suppress(ValueError):  # a word
                 settings[name] = json.loads(value)
-            except ValueError:
-                settings[name] = value
             plain = settings[name] is None or isinstance(settings[name], str | int | float)
             if not plain or settings[name] != settings[name]:
                 raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")
         return settings
 
 
-_PARSERS: dict[str, Any] = {
-    "k": lambda text: int(text) if text.isdigit() else text,
-    "budgets": lambda text: int(text) if text.isdigit() else text,
-    "superpixels": lambda text: int(text) if text.isdigit() else text,
-    "views": lambda text: int(text) if text.isdigit() else text,
-}
-
-
 def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Grid:
-    """A grid from comma-separated lists of the command line; None leaves the base's.
-
-    Raises:
-        UsageError: If a value is impossible.
-    """
+    """A grid from comma-separated lists, None leaves the base's; a UsageError if a value is impossible."""
     values: dict[str, tuple[Any, ...]] = {}
     for name, text in lists.items():
-        if text is None:
-            continue
-        parts = [part.strip() for part in text.split(",") if part.strip()]
-        try:
-            values[name] = tuple(_PARSERS.get(name, str)(part) for part in parts)
-        except ValueError as error:
-            raise UsageError(f"{name}: expected numbers, got {text!r}") from error
+        if text is not None:
+            parts = [part.strip() for part in text.split(",") if part.strip()]
+            values[name] = tuple(int(part) if name in NUMBERS and part.isdecimal() else part for part in parts)
     try:
         return replace(base or Grid(), **values)
     except ValueError as error:
@@ -130,8 +99,7 @@ def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Gri
 def read_grid(path: Path) -> Grid:
     """A grid from a small TOML or JSON file whose keys are the fields of :class:`Grid`.
 
-    Raises:
-        SceneError: If the file cannot be read, or holds anything else.
+    A SceneError if the file cannot be read, or holds anything else.
     """
     values, known = read_table(path), {f.name for f in fields(Grid)}
     densities = values.pop("densities", None)  # the name and form of version 0.1.0
@@ -148,66 +116,52 @@ def read_grid(path: Path) -> Grid:
 
 
 def grid_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
-    """Method and settings of every run on one scene, for one number of views, and what was left out.
+    """Method and settings of every run on one scene, the unmerged input first, and notes on what was left out.
 
     Only settings that differ from the defaults are set. Left out are efforts that do not change a superpixel method,
     and for baselines all settings that only ours has: they run once per size.
-
-    Returns:
-        The combinations, the unmerged input first; one note per kind of combination that was left out.
     """
-    defaults = {"k": 1, "segmentation": "rdseg", "fit": "full", "effort": "default", "match": "overlap"}
     sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"superpixels": s} for s in grid.superpixels]
+    sizes = sizes or [{}]
     out: list[tuple[str, dict[str, Any]]] = [(INPUT, {})]
-    dropped: dict[str, int] = {}
-    for method in grid.methods:
-        for *values, size in product(grid.k, grid.segmentations, grid.fit, grid.efforts, grid.matches, sizes or [{}]):
-            chosen = dict(zip(defaults, values, strict=True))
-            why = _skip_reason(method, chosen, size, grid, sizes)
-            if why is not None:
-                dropped[why] = dropped.get(why, 0) + 1
-                continue
-            known = chosen if method == OURS else {"effort": chosen["effort"]} if method in FITTED else {}
-            changed = {name: value for name, value in known.items() if value != defaults[name]}
-            changed |= grid.settings if method == OURS else {}
-            out.append((method, changed if method in ONE_SIZE else size | changed))
+    dropped: Counter[str] = Counter()
+    for method, *values, size in product(grid.methods, *(getattr(grid, name) for name in SETTINGS.values()), sizes):
+        chosen = dict(zip(SETTINGS, values, strict=True))
+        why = _skip_reason(method, chosen, grid)
+        if method in ONE_SIZE and size != sizes[0]:
+            why = why or f"{method} keeps all Gaussians"
+        if why is not None:
+            dropped[why] += 1
+            continue
+        own = SETTINGS if method == OURS else FITTED.get(method, ())
+        changed = {name: chosen[name] for name in own if chosen[name] != getattr(Grid, SETTINGS[name])[0]}
+        changed |= grid.settings if method == OURS else {}
+        out.append((method, changed if method in ONE_SIZE else size | changed))
     return out, [f"{why}: {count} combination(s) left out" for why, count in dropped.items()]
 
 
-def _skip_reason(
-    method: str, chosen: Mapping[str, Any], size: Mapping[str, Any], grid: Grid, sizes: Sequence[Mapping[str, Any]]
-) -> str | None:
-    """Why a combination is left out; None if it is not."""
+def _skip_reason(method: str, chosen: Mapping[str, Any], grid: Grid) -> str | None:
+    """Why a combination of settings is left out for a method; None if it is not."""
+    first = {name: getattr(grid, field)[0] for name, field in SETTINGS.items()}
     if method != OURS:
-        first = {"k": grid.k[0], "segmentation": grid.segmentations[0], "fit": grid.fit[0], "effort": grid.efforts[0]}
-        first |= {"match": grid.matches[0]}
-        own = {"effort"} if method in FITTED else set()
-        if any(chosen[name] != value for name, value in first.items() if name not in own):
-            return f"{method} takes " + ("effort alone" if own else "a size alone")
-        return f"{method} keeps all Gaussians" if method in ONE_SIZE and sizes and size != sizes[0] else None
-    other = chosen["effort"] != grid.efforts[0] and "draft" not in (chosen["effort"], grid.efforts[0])
+        own = FITTED.get(method, ())
+        if any(chosen[name] != first[name] for name in SETTINGS if name not in own):
+            return f"{method} takes {' and '.join(own) or 'a size'} alone"
+        return None
+    other = chosen["effort"] != first["effort"] and "draft" not in (chosen["effort"], first["effort"])
     if chosen["segmentation"] != "rdseg" and chosen["fit"] != "full" and other:
         return "effort changes nothing for other superpixels than rdseg without a full fit"
     return None
 
 
 def make_experiments(scenes: Sequence[Path], grid: Grid) -> tuple[list[Experiment], list[str]]:
-    """All runs, scene by scene, and notes on what was left out.
-
-    Raises:
-        UsageError: If a setting is unknown to the library.
-    """
+    """All runs, scene by scene, and notes on what was left out; a UsageError if the library does not take a setting."""
     combinations, notes = grid_settings(grid)
     for method, settings in combinations:
         _check(method, settings)
     views = [None if count == ALL else int(count) for count in grid.views]
-    made = [
-        Experiment(scene, method, settings, count)
-        for scene in scenes
-        for count in views
-        for method, settings in combinations
-    ]
-    return made, notes
+    runs = product(scenes, views, combinations)
+    return [Experiment(scene, method, settings, count) for scene, count, (method, settings) in runs], notes
 
 
 def _check(method: str, settings: Mapping[str, Any]) -> None:

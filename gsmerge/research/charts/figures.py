@@ -3,35 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.measure.comparison import break_even
+from gsmerge.research.charts import series
 from gsmerge.research.charts.experiment import OURS
 from gsmerge.research.charts.proxies import SEGMENTATIONS, Proxy
 from gsmerge.research.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord
 from gsmerge.research.charts.run import SCORING
-from gsmerge.research.charts.series import (
-    METRIC_LABELS,
-    PART_LABELS,
-    Getter,
-    Line,
-    Point,
-    by_size,
-    by_views,
-    choose_part,
-    input_mean,
-    is_typical,
-    line_key,
-    line_names,
-    list_metrics,
-    scene_points,
-    score_getter,
-    successful,
-    typical_size,
-    typical_views,
-)
+from gsmerge.research.charts.series import Getter, Line, Point
 from gsmerge.research.charts.statistics import Verdict, judge, paired_intervals
 from gsmerge.runtime.run_log import STAGES
 
@@ -43,6 +25,8 @@ INTERVAL_NOTE = (
     "Means over {scenes}; bands, from three scenes on: 95 % t intervals of the differences between"
     " settings, without those between scenes."
 )
+
+DIGITS = {"psnr": 2, "ssim": 3, "lpips_vgg": 3, "lpips_alex": 3}  # decimals that are shown of a metric
 
 
 @dataclass(frozen=True)
@@ -98,18 +82,11 @@ Figure = Curves | Bars | BreakEven
 
 def make_figures(records: Sequence[RunRecord], proxies: Sequence[Proxy] = ()) -> list[Figure]:
     """All figures that the records have data for."""
-    done = successful(records)
-    part = choose_part(done)
-    makers: tuple[Callable[[], Figure | None], ...] = (
-        lambda: _against(done, part, "seconds"),
-        lambda: _against(done, part, "ratio"),
-        lambda: _stages(done),
-        lambda: _proxy(proxies),
-        lambda: _counts(done),
-        lambda: _over_views(done, part),
-        lambda: _break_even(done),
-    )
-    return [figure for make in makers if (figure := make()) is not None]
+    done = series.successful(records)
+    part = series.choose_part(done)
+    figures: list[Figure | None] = [_against(done, part, "seconds"), _against(done, part, "ratio"), _stages(done)]
+    figures += [_proxy(proxies), _counts(done), _over_views(done, part), _break_even(done)]
+    return [figure for figure in figures if figure is not None]
 
 
 def _cost(name: str) -> Getter:
@@ -128,19 +105,25 @@ def _over(lines: Sequence[Line]) -> str:
     return INTERVAL_NOTE.format(scenes=f"{len(scenes)} scenes ({names})")
 
 
+def _panels(records: Sequence[RunRecord], part: str, lines_of: Callable[[Getter], list[Line]]) -> list[Panel]:
+    """One for each metric that was measured, with its level for the input at the typical number of views."""
+    panels = []
+    for metric in series.list_metrics(records, part):
+        value = series.score_getter(metric, part)
+        lines = lines_of(value)
+        level = series.input_mean(records, value, _scenes(lines))
+        reference = None if level is None else ("input", level)
+        panels.append(Panel(series.METRIC_LABELS[metric], HIGHER_IS_BETTER[metric], tuple(lines), reference))
+    return panels
+
+
 def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | None:
     """Quality against seconds or against the share of Gaussians that is kept."""
-    panels = []
-    for metric in list_metrics(records, part):
-        value = score_getter(metric, part)
-        lines = by_size(records, _cost(cost), value)
-        level = input_mean(records, value, _scenes(lines))
-        reference = None if level is None else ("input", level)
-        panels.append(Panel(METRIC_LABELS[metric], HIGHER_IS_BETTER[metric], tuple(lines), reference))
+    panels = _panels(records, part, lambda value: series.by_size(records, _cost(cost), value))
     panels = [panel for panel in panels if panel.lines]
     if not panels:
         return None
-    words = f"Measured on {PART_LABELS[part]}. Rings: the Pareto front. {_over(panels[0].lines)}"
+    words = f"Measured on {series.PART_LABELS[part]}. Rings: the Pareto front. {_over(panels[0].lines)}"
     if cost == "seconds":
         caption = f"Quality against the wall time of the merge (reading and writing not counted). {words}"
         return Curves("quality-seconds", "Quality against time", caption, "Seconds", tuple(panels), front=True)
@@ -152,28 +135,18 @@ def _against(records: Sequence[RunRecord], part: str, cost: str) -> Curves | Non
 
 def _typical_runs(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
     """Runs of the typical size and number of views by the name of their line, ours first, all over the same scenes."""
-    size, views = typical_size(records), typical_views(records)
-    chosen = [r for r in records if is_typical(r, size) and r.views_asked == views]
-    names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
-    rows: dict[str, list[RunRecord]] = {}
-    for record in sorted(chosen, key=lambda r: (r.method != OURS, len(line_key(r)[1]))):
-        rows.setdefault(names[line_key(record)], []).append(record)
-    return _over_common(rows)
-
-
-def _over_common(rows: dict[str, list[RunRecord]]) -> dict[str, list[RunRecord]]:
-    """Rows that have at least half of the scenes, over their common scenes; unchanged if there are none."""
-    scenes = {name: {record.scene for record in group} for name, group in rows.items()}
-    fewest = 0.5 * len(set().union(*scenes.values()))
-    kept = {name: own for name, own in scenes.items() if len(own) >= fewest}
-    common = set.intersection(*kept.values()) if kept else set()
-    if not common:
-        return rows
-    return {name: [record for record in rows[name] if record.scene in common] for name in kept}
+    size, views = series.typical_size(records), series.typical_views(records)
+    chosen = [r for r in records if series.is_typical(r, size) and r.views_asked == views]
+    names, rows = series.names_of(records), dict[str, list[RunRecord]]()
+    for record in series.ours_first(chosen):
+        rows.setdefault(names[series.line_key(record)], []).append(record)
+    kept = series.keep_common({name: {record.scene for record in group} for name, group in rows.items()}, 0.5)
+    common = {name: [record for record in rows[name] if record.scene in scenes] for name, scenes in kept.items()}
+    return common or rows
 
 
 def _size_words(records: Sequence[RunRecord]) -> str:
-    size = typical_size(records)
+    size = series.typical_size(records)
     return f"Size: {size}." if size else "Size: the default superpixels."
 
 
@@ -207,17 +180,14 @@ def _proxy(proxies: Sequence[Proxy]) -> Curves | None:
         for p in proxies:
             if p.segmentation == name:
                 by_share.setdefault(p.share, {})[p.scene] = (float(p.superpixels), p.psnr)
-        shares = sorted(share for share, by_scene in by_share.items() if len(by_scene) == len(complete))
-        if not shares:
-            continue
-        values = np.array([[by_share[share][scene][1] for share in shares] for scene in complete])
-        points = tuple(
-            Point(
-                f"{100 * share:g}%", float(np.mean([x for x, _ in by_share[share].values()])), interval, by_share[share]
+        columns = {share: by_share[share] for share in sorted(by_share) if len(by_share[share]) == len(complete)}
+        if columns:
+            values = np.array([[by_scene[scene][1] for by_scene in columns.values()] for scene in complete])
+            points = tuple(
+                Point(f"{100 * share:g}%", float(np.mean([x for x, _ in by_scene.values()])), interval, by_scene)
+                for (share, by_scene), interval in zip(columns.items(), paired_intervals(values), strict=True)
             )
-            for share, interval in zip(shares, paired_intervals(values), strict=True)
-        )
-        lines.append(Line(name, name == SEGMENTATIONS[0], points))
+            lines.append(Line(name, name == SEGMENTATIONS[0], points))
     if not lines:
         return None
     caption = (
@@ -229,7 +199,8 @@ def _proxy(proxies: Sequence[Proxy]) -> Curves | None:
 
 
 def _counts(records: Sequence[RunRecord]) -> Curves | None:
-    lines = by_views([r for r in records if r.method in (OURS, INPUT)], lambda record: record.count, with_input=True)
+    own = [record for record in records if record.method in (OURS, INPUT)]
+    lines = series.by_views(own, lambda record: record.count, with_input=True)
     lines = [line for i, line in enumerate(lines) if not any(_coincide(line, other) for other in lines[:i])]
     if not any(line.ours for line in lines):
         return None
@@ -246,16 +217,13 @@ def _coincide(one: Line, other: Line) -> bool:
 
 
 def _over_views(records: Sequence[RunRecord], part: str) -> Curves | None:
-    panels = []
-    for metric in list_metrics(records, part):
-        lines = by_views(records, score_getter(metric, part), with_input=True)
-        panels.append(Panel(METRIC_LABELS[metric], HIGHER_IS_BETTER[metric], tuple(lines)))
-    panels = [panel for panel in panels if any(line.ours for line in panel.lines)]
+    panels = _panels(records, part, lambda value: series.by_views(records, value, with_input=True))
+    panels = [replace(panel, reference=None) for panel in panels if any(line.ours for line in panel.lines)]
     if not panels:
         return None
     caption = (
         f"Quality against the number of input views, evenly spread; held-out views lie midway between them where their"
-        f" order is known. Measured on {PART_LABELS[part]}. {_size_words(records)} {_over(panels[0].lines)}"
+        f" order is known. Measured on {series.PART_LABELS[part]}. {_size_words(records)} {_over(panels[0].lines)}"
     )
     return Curves("quality-views", "Quality against views", caption, "Input views", tuple(panels), "linear")
 
@@ -263,7 +231,7 @@ def _over_views(records: Sequence[RunRecord], part: str) -> Curves | None:
 def _break_even(records: Sequence[RunRecord]) -> BreakEven | None:
     rows = _typical_runs(records)
     scenes = sorted({r.scene for group in rows.values() for r in group})
-    before = input_mean(records, lambda record: record.render_ms, scenes)
+    before = series.input_mean(records, lambda record: record.render_ms, scenes)
     if before is None or not rows:
         return None
     table = []
@@ -290,20 +258,19 @@ class VerdictTable:
 
 def make_verdict_tables(records: Sequence[RunRecord]) -> list[VerdictTable]:
     """Points of baselines compared with ours at equal seconds, and at an equal share of the Gaussians."""
-    done = successful(records)
-    part = choose_part(done)
+    done = series.successful(records)
+    part = series.choose_part(done)
     tables = []
     for cost, words in (("seconds", "at equal time"), ("ratio", "at equal size")):
-        for metric in list_metrics(done, part):
-            value = score_getter(metric, part)
-            ours = scene_points(done, _cost(cost), value)
+        for metric in series.list_metrics(done, part):
+            value = series.score_getter(metric, part)
+            ours = series.scene_points(done, _cost(cost), value)
             rows = [
                 (point.label, judge(line.name, point.by_scene, ours, higher=HIGHER_IS_BETTER[metric]))
-                for line in by_size(done, _cost(cost), value)
+                for line in series.by_size(done, _cost(cost), value)
                 for point in line.points
                 if not line.ours and (cost != "ratio" or RATIOS[0] <= point.x <= RATIOS[1])
             ]
             if rows and ours:
-                decimals = 2 if metric == "psnr" else 3
-                tables.append(VerdictTable(f"{METRIC_LABELS[metric]} {words}", tuple(rows), decimals))
+                tables.append(VerdictTable(f"{series.METRIC_LABELS[metric]} {words}", tuple(rows), DIGITS[metric]))
     return tables

@@ -30,29 +30,18 @@ def text(value: object) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Row], *, texts: Sequence[int] = (0,), ours: Sequence[int] = ()) -> str:
-    """A table.
-
-    Args:
-        head: Names of the columns.
-        rows: Cells of each row.
-        texts: Columns of text, aligned left; the rest are numbers.
-        ours: Rows that are ours.
-    """
-    words = set(texts)
-    top = "".join(
-        f'<th scope="col"{_class(["text"] if i in words else [])}>{text(name)}</th>' for i, name in enumerate(head)
-    )
+    """A table; ``texts`` are the columns of text, aligned left, and ``ours`` the rows that are ours."""
+    kinds = ["text" if i in texts else "" for i in range(len(head))]
+    top = "".join(f'<th scope="col"{_class(kind)}>{text(name)}</th>' for kind, name in zip(kinds, head, strict=True))
     body = []
     for number, row in enumerate(rows):
-        cells = []
-        for i, cell in enumerate(row):
-            content, kind = (cell.text, cell.kind) if isinstance(cell, Cell) else (cell, "")
-            cells.append(f"<td{_class([*(['text'] if i in words else []), kind])}>{text(content)}</td>")
-        body.append(f"<tr{_class(['ours'] if number in ours else [])}>{''.join(cells)}</tr>")
+        cells = [cell if isinstance(cell, Cell) else Cell(cell) for cell in row]
+        tags = (f"<td{_class(kind, c.kind)}>{text(c.text)}</td>" for kind, c in zip(kinds, cells, strict=True))
+        body.append(f"<tr{_class('ours' if number in ours else '')}>{''.join(tags)}</tr>")
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
 
 
-def _class(names: Sequence[str]) -> str:
+def _class(*names: str) -> str:
     joined = " ".join(name for name in names if name)
     return f' class="{text(joined)}"' if joined else ""
 
@@ -68,12 +57,9 @@ def data_uri(path: Path) -> str:
 
 
 def inline_svg(svg: str, name: str, label: str) -> str:
-    """A drawing as part of the page: without prologue, metadata and addresses, with unique ids, scalable.
+    """A drawing of matplotlib's as part of the page: without prologue, metadata and addresses, scalable.
 
-    Args:
-        svg: As matplotlib writes it.
-        name: Put before every id, because a page has several drawings.
-        label: Alternative text.
+    ``name`` is put before every id, because a page has several drawings; ``label`` is the alternative text.
     """
     drawing = svg[svg.index("<svg") :]
     drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,49 +10,35 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from gsmerge.io import SceneLoad, atomic_output, read_held_out
+from gsmerge.io import HeldOutViews, atomic_output
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plane
-from gsmerge.measure.preview import Picture, to_picture
+from gsmerge.measure.preview import Picture, heat_map, to_picture
 from gsmerge.render import render
 from gsmerge.research.charts.record import picture_path
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import even_views, midpoint_views, pick_views, subset
 
 Scene = PixelScene | UnalignedScene
-TargetPlaces = tuple[tuple[int, ...], tuple[int, ...]]  # positions along the trajectory: context views, targets
 MAX_PICTURES = 2  # views of a run whose pictures are stored
 MAX_WIDTH = 640  # pixels of a stored picture
-MAX_TIMED = 4  # views that are rendered for the time
 MAX_ERROR = 0.25  # mean absolute error over the channels at the top of the error maps' scale
 QUALITY = 88  # of the JPEG files
 MAX_DB = 100.0  # PSNR of equal pictures, since JSON has no infinity
 
 
-def read_target_views(
-    load: SceneLoad, cameras: Path | None, images: Path | None
-) -> tuple[Views | None, TargetPlaces | None]:
-    """The target views of a scene, and their places along the trajectory if those are known."""
-    if cameras is None:
-        return None, None
-    targets = read_held_out(load, cameras, images)
-    places = None if targets.context_places is None else (targets.context_places, targets.places)
-    return Views(targets.cameras, targets.images, targets.names), places
+def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:
+    """``count`` of the scene's views, evenly spread, and the held-out ones nearest the middle between them.
 
-
-def choose_views(
-    scene: Scene, targets: Views | None, places: TargetPlaces | None, count: int | None
-) -> tuple[Scene, Views | None]:
-    """``count`` of the scene's views, evenly spread, and the targets nearest the middle between them.
-
-    Without ``count`` all views and targets are kept, and without ``places`` all targets.
+    Without ``count`` all views are kept, and where their places along the trajectory are not known all held-out ones.
     """
+    targets = None if held_out is None else Views(held_out.cameras, held_out.images, held_out.names)
     if count is None or count >= len(scene):
         return scene, targets
     ids = even_views(len(scene), count)
-    if targets is not None and places is not None:
-        chosen = midpoint_views([places[0][i] for i in ids], places[1])
-        names = tuple(targets.names[i] for i in chosen)
-        targets = Views(targets.cameras[chosen], targets.images[chosen], names) if chosen else None
+    if held_out is not None and held_out.context_places is not None:
+        chosen = midpoint_views([held_out.context_places[i] for i in ids], held_out.places)
+        names = tuple(held_out.names[i] for i in chosen)
+        targets = Views(held_out.cameras[chosen], held_out.images[chosen], names) if chosen else None
     return subset(scene, ids), targets
 
 
@@ -64,10 +49,8 @@ def measure(
 
     Without ``gaussians`` the scene's own are measured.
     """
-    if gaussians is None:
-        evaluation = evaluate(scene, {}, targets, options)
-    else:
-        evaluation = evaluate(scene, {"result": gaussians}, targets, replace(options, own=False))
+    results = {} if gaussians is None else {"result": gaussians}
+    evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None))
     scores: dict[str, float] = {}
     for split in evaluation.num_views:
         full, masked = evaluation.results[-1].mean(split)
@@ -78,31 +61,13 @@ def measure(
     return scores
 
 
-def time_render(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Milliseconds to render one view: the median over a few views; ``near`` in world units."""
-    seconds = []
-    for view in pick_views(len(cameras), MAX_TIMED):
-        start = time.perf_counter()
-        render(gaussians, cameras[[view]], near=near)
-        seconds.append(time.perf_counter() - start)
-    return 1000 * float(np.median(seconds))
-
-
 def keep_pictures(
-    folder: Path, key: str, scene_sha256: str, gaussians: Gaussians, scene: Scene, targets: Views | None
+    folder: Path, key: str, scene_sha256: str, gaussians: Gaussians, scene: Scene, targets: Views | HeldOutViews | None
 ) -> tuple[str, ...]:
-    """Write renders and error maps of a few views of a result, and once per scene the photos.
+    """Write renders and error maps of a few views of a run, and once per scene the photos; returns the views' names.
 
-    Args:
-        folder: The results folder.
-        key: Of the run.
-        scene_sha256: Of the scene.
-        gaussians: What is rendered.
-        scene: With all its views, so that all runs of a scene have pictures of the same ones.
-        targets: All held-out views, used instead of the scene's; None without any.
-
-    Returns:
-        Names of the views.
+    The views are the held-out ones, or the scene's without any; ``scene`` and ``targets`` have all of them, so that all
+    runs of a scene have pictures of the same ones.
     """
     views = scene if targets is None else targets
     photos, names = views.images, views.names
@@ -122,8 +87,7 @@ def keep_pictures(
 def error_map(image: Tensor, photo: Tensor) -> Picture:
     """Mean absolute error over the channels as a heat map, on the same scale for all pictures."""
     error = (image - photo).abs().mean(2).numpy() / MAX_ERROR
-    colored = cv2.applyColorMap((error.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLORMAP_INFERNO)
-    return np.ascontiguousarray(colored[..., ::-1], np.uint8)
+    return heat_map(error.clip(0, 1))
 
 
 def _write(path: Path, picture: Picture) -> None:

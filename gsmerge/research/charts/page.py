@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from importlib.resources import files
 from pathlib import Path
 
 from gsmerge.report import human_bytes
+from gsmerge.research.charts import series
 from gsmerge.research.charts.experiment import OURS
-from gsmerge.research.charts.figures import Curves, Figure, VerdictTable
+from gsmerge.research.charts.figures import DIGITS, Curves, Figure, VerdictTable
 from gsmerge.research.charts.markup import Cell, Row, details, inline_svg, table, text
-from gsmerge.research.charts.pictures import error_section, slider_section
-from gsmerge.research.charts.record import INPUT, RunRecord
+from gsmerge.research.charts.pictures import error_section, find_pictures, slider_section
+from gsmerge.research.charts.record import RunRecord
 from gsmerge.research.charts.run import describe
-from gsmerge.research.charts.series import (
-    PART_LABELS,
-    by_size,
-    choose_part,
-    line_key,
-    line_names,
-    list_metrics,
-    score_getter,
-    size_label,
-    successful,
-    typical_views,
-)
+from gsmerge.research.charts.series import PART_LABELS
 from gsmerge.research.charts.statistics import Interval
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 HEADS = {"psnr": "PSNR", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS Alex"}
-DIGITS = {"psnr": 2, "ssim": 3, "lpips_vgg": 3, "lpips_alex": 3}
+KINDS = {"ours above": "above", "baseline above": "below"}  # of verdicts, as CSS classes
 
 
 def make_page(
@@ -45,24 +36,23 @@ def make_page(
 
     ``drawings`` are the SVG of each figure by name; ``command`` is the command line that draws the page again.
     """
-    done = successful(records)
+    done = series.successful(records)
     scenes = list(dict.fromkeys(record.scene for record in records))
     failed = [record for record in records if record.error is not None]
+    pictures = find_pictures(done, folder)
     sections = [
         ("results", "Results", _results(done)),
         ("verdicts", "At equal cost", _verdicts(verdicts)),
         *((figure.name, figure.title, _figure(figure, drawings[figure.name], done, command)) for figure in figures),
-        ("compare", "Side by side", slider_section(done, folder)),
-        ("errors", "Error maps", error_section(done, folder)),
+        ("compare", "Side by side", slider_section(pictures)),
+        ("errors", "Error maps", error_section(pictures)),
         ("failures", "Failed runs", _failures(failed)),
         ("runs", "All runs", _runs(done)),
         ("environment", "Environment", _environment(records, command)),
     ]
     sections = [section for section in sections if section[2]]
     links = " ".join(f'<a href="#{text(name)}">{text(title)}</a>' for name, title, _ in sections)
-    body = "".join(
-        f'<section id="{text(name)}"><h2>{text(title)}</h2>{content}</section>' for name, title, content in sections
-    )
+    body = "".join(f'<section id="{text(one)}"><h2>{text(title)}</h2>{html}</section>' for one, title, html in sections)
     names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
     words = f"{len(records)} runs on {len(scenes)} scene(s): {names}" + (f"; {len(failed)} failed" if failed else "")
     package = files("gsmerge.research.charts")
@@ -86,27 +76,18 @@ def _results(records: Sequence[RunRecord]) -> str:
     """Means over the scenes by method, settings and size."""
     if not records:
         return ""
-    part = choose_part(records)
-    metrics = list_metrics(records, part)
-    views = typical_views(records)
-    scores = {
-        metric: {
-            (line.name, point.label): point.y
-            for line in by_size(records, lambda record: record.ratio, score_getter(metric, part))
-            for point in line.points
-        }
-        for metric in metrics
-    }
-    merged = [r for r in records if r.method != INPUT]
-    ours_first = sorted(merged, key=lambda r: (r.method != OURS, len(line_key(r)[1])))
-    names = line_names(list(dict.fromkeys(map(line_key, ours_first))))
-    groups: dict[tuple[str, str], list[RunRecord]] = {}
+    part = series.choose_part(records)
+    metrics = series.list_metrics(records, part)
+    views = series.typical_views(records)
+    scores: dict[str, dict[tuple[str, str], Interval]] = {metric: {} for metric in metrics}
+    for metric, means in scores.items():
+        for line in series.by_size(records, lambda record: record.ratio, series.score_getter(metric, part)):
+            means |= {(line.name, point.label): point.y for point in line.points}
+    names, groups = series.names_of(records), dict[tuple[str, str], list[RunRecord]]()
     lines = list(names)
-    order = sorted(records, key=lambda r: (-1 if r.method == INPUT else lines.index(line_key(r)), r.ratio or 0.0))
-    for record in order:
+    for record in sorted(records, key=lambda r: (lines.index(series.line_key(r)), r.ratio or 0.0)):
         if record.views_asked == views:
-            name = INPUT if record.method == INPUT else names[line_key(record)]
-            groups.setdefault((name, size_label(record)), []).append(record)
+            groups.setdefault((names[series.line_key(record)], series.size_label(record)), []).append(record)
     rows = []
     for (name, size), group in groups.items():
         cells = [
@@ -146,33 +127,25 @@ def _costs(group: Sequence[RunRecord]) -> list[str]:
     ]
 
 
-_KINDS = {"ours above": "above", "baseline above": "below"}
-
-
 def _verdicts(tables: Sequence[VerdictTable]) -> str:
     """Whether any baseline's point lies above ours, in a sentence, and the points."""
     parts = []
     for compared in tables:
         words = [verdict.words for _, verdict in compared.rows]
-        above, undecided = words.count("baseline above"), words.count("undecided")
-        outside = words.count("ours has none so cheap")
+        above, digits = words.count("baseline above"), compared.decimals
         answer = f"{above} baseline point(s) lie above ours" if above else "no baseline's point lies above ours"
         sentence = (
-            f"{compared.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours, {undecided}"
-            f" undecided, {outside} cheaper than anything of ours, so not compared)."
+            f"{compared.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours,"
+            f" {words.count('undecided')} undecided, {words.count('ours has none so cheap')} cheaper than anything of"
+            " ours, so not compared)."
         )
-        rows: list[Row] = [
-            [
-                verdict.baseline,
-                label,
-                f"{verdict.cost:.4g}",
-                f"{verdict.quality:.{compared.decimals}f}",
-                "" if verdict.ours is None else f"{verdict.ours:.{compared.decimals}f}",
-                "" if verdict.ahead is None else _interval(verdict.ahead, compared.decimals),
-                Cell(verdict.words, f"text {_KINDS.get(verdict.words, '')}"),
-            ]
-            for label, verdict in compared.rows
-        ]
+        rows: list[Row] = []
+        for label, verdict in compared.rows:
+            ours = "" if verdict.ours is None else f"{verdict.ours:.{digits}f}"
+            ahead = "" if verdict.ahead is None else _interval(verdict.ahead, digits)
+            last = Cell(verdict.words, f"text {KINDS.get(verdict.words, '')}")
+            cells = f"{verdict.cost:.4g}", f"{verdict.quality:.{digits}f}", ours, ahead
+            rows.append([verdict.baseline, label, *cells, last])
         head = ["Baseline", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict"]
         parts.append(f"<p>{text(sentence)}</p>" + details("the points", table(head, rows, texts=(0, 1, 6))))
     if not parts:
@@ -200,15 +173,7 @@ def _commands(records: Sequence[RunRecord], command: str) -> str:
 def _points(figure: Curves) -> str:
     """The numbers of a figure."""
     rows: list[Row] = [
-        [
-            panel.y_label,
-            line.name,
-            point.label,
-            f"{point.x:.4g}",
-            f"{point.y.mean:.5g}",
-            f"{point.y.low:.5g}",
-            f"{point.y.high:.5g}",
-        ]
+        [panel.y_label, line.name, point.label, f"{point.x:.4g}", *(f"{y:.5g}" for y in astuple(point.y)[:3])]
         for panel in figure.panels
         for line in panel.lines
         for point in line.points

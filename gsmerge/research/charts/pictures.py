@@ -10,7 +10,7 @@ from gsmerge.research.charts.experiment import OURS
 from gsmerge.research.charts.markup import data_uri, text
 from gsmerge.research.charts.measure import MAX_ERROR
 from gsmerge.research.charts.record import INPUT, RunRecord, picture_path
-from gsmerge.research.charts.series import is_typical, line_key, line_names, typical_size, typical_views
+from gsmerge.research.charts.series import is_typical, line_key, names_of, ours_first, typical_size, typical_views
 
 MAX_SCENES = 6  # with pictures on the page
 MAX_RESULTS = 5  # pictures of a view in addition to the photo and the input
@@ -29,37 +29,30 @@ class PictureSet:
 def find_pictures(records: Sequence[RunRecord], folder: Path) -> list[PictureSet]:
     """Views with pictures of the input and of results of the typical size, scene by scene, ours first."""
     size, views = typical_size(records), typical_views(records)
-    names = line_names(list(dict.fromkeys(line_key(r) for r in records if r.method != INPUT)))
-    sets: list[PictureSet] = []
+    names, sets = names_of(records), list[PictureSet]()
     for scene in list(dict.fromkeys(record.scene for record in records))[:MAX_SCENES]:
         own = [r for r in records if r.scene == scene and r.views_asked == views and r.pictures]
         inputs = [r for r in own if r.method == INPUT][-1:]
-        results = [r for r in own if is_typical(r, size)]
-        results.sort(key=lambda r: (r.method != OURS, len(line_key(r)[1])))
-        chosen = [*inputs, *results[:MAX_RESULTS]]
+        chosen = [*inputs, *ours_first(r for r in own if is_typical(r, size))[:MAX_RESULTS]]
         for i, view in enumerate(chosen[0].pictures if chosen else ()):
             photo = picture_path(folder, chosen[0].scene_sha256, i, "photo")
             layers = [("photo", photo)] if photo.exists() else []
             errors: list[tuple[str, Path]] = []
             for record in chosen:
-                name = INPUT if record.method == INPUT else names[line_key(record)]
                 for kind, pictures in (("render", layers), ("error", errors)):
                     path = picture_path(folder, record.key, i, kind)
                     if path.exists():
-                        pictures.append((name, path))
+                        pictures.append((names[line_key(record)], path))
             if len(layers) > 1:
                 sets.append(PictureSet(scene, view, tuple(layers), tuple(errors)))
     return sets
 
 
-def slider_section(records: Sequence[RunRecord], folder: Path) -> str:
+def slider_section(sets: Sequence[PictureSet]) -> str:
     """Sliders between photo, input and results; the arrow keys move them."""
-    sets = find_pictures(records, folder)
-    if not sets:
-        return ""
     how = "Left and right of the line; drag it, or move the slider with the arrow keys."
     sliders = "".join(_slider(one, number) for number, one in enumerate(sets))
-    return f'<p class="muted">{how}</p><div class="pairs">{sliders}</div>'
+    return f'<p class="muted">{how}</p><div class="pairs">{sliders}</div>' if sets else ""
 
 
 def _slider(pictures: PictureSet, number: int) -> str:
@@ -87,17 +80,16 @@ def _slider(pictures: PictureSet, number: int) -> str:
     )
 
 
-def error_section(records: Sequence[RunRecord], folder: Path) -> str:
+def error_section(sets: Sequence[PictureSet]) -> str:
     """Error maps side by side, with their scale."""
-    sets = [one for one in find_pictures(records, folder) if one.errors]
-    if not sets:
+    if not any(one.errors for one in sets):
         return ""
     parts = [
         "<p>Mean absolute error over the colour channels, the same scale for all.</p>"
         '<div class="scale"></div>'
         f'<div class="scale-words"><span>0</span><span>{MAX_ERROR:g} and more</span></div>'
     ]
-    for one in sets:
+    for one in (one for one in sets if one.errors):
         maps = "".join(
             f'<figure><img src="{data_uri(path)}" alt="{text(f"error of {name}")}">'
             f"<figcaption>{text(name)}</figcaption></figure>"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -15,7 +14,7 @@ from torch import Tensor
 from gsmerge.io.content_hash import digest
 from gsmerge.measure.preview import draw_means
 from gsmerge.render.metrics import psnr
-from gsmerge.research.charts.record import PROXIES
+from gsmerge.research.charts.record import PROXIES, known_fields
 from gsmerge.runtime.jsonl import append_line, read_lines
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.segment import superpixels
@@ -67,29 +66,19 @@ def measure_proxies(
     pixels = images.shape[1] * images.shape[2]
     for key, (name, share) in points.items():
         count = max(1, round(share * pixels))
-        values = parallel_map(partial(_one_view, images, count, name), views)
+        values = parallel_map(partial(proxy_psnr, count=count, segmentation=name), images[views])
         finite = [min(value, 100.0) for value in values]  # a flat photo is reproduced exactly
         point = Proxy(key, scene, name, count, share, len(views), float(np.mean(finite)))
         append_line(folder / PROXIES, asdict(point))
         progress()
 
 
-def _one_view(images: Tensor, count: int, segmentation: str, view: int) -> float:
-    return proxy_psnr(images[view], count, segmentation)
-
-
 def read_proxies(folder: Path) -> tuple[dict[str, Proxy], Sequence[str]]:
     """All points of a results folder by key, and notes on lines that were left out."""
     lines = read_lines(folder / PROXIES)
-    points = [point for value in lines.values if (point := _parse_proxy(value)) is not None]
-    return {point.key: point for point in points}, lines.notes
-
-
-def _parse_proxy(value: Mapping[str, Any]) -> Proxy | None:
-    try:
-        point = Proxy(**value)
-    except TypeError:
-        return None
-    texts = all(isinstance(text, str) for text in (point.key, point.scene, point.segmentation))
-    numbers = (point.superpixels, point.share, point.views, point.psnr)
-    return point if texts and all(isinstance(n, int | float) and math.isfinite(n) for n in numbers) else None
+    points = {}
+    for value in lines.values:
+        with suppress(TypeError, ValueError):  # a line of another version
+            point = Proxy(**known_fields(Proxy, value))
+            points[point.key] = point
+    return points, lines.notes

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +16,43 @@ from gsmerge.runtime.jsonl import append_line, read_lines
 
 SCHEMA_VERSION = 1
 INPUT = "input"  # the method of a run that merges nothing
-METRICS = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
-SPLITS = ("context", "target")
-SCORES = tuple(f"{metric}_{split}{part}" for metric in METRICS for split in SPLITS for part in ("", "_visible"))
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "lpips_alex": False}
+SCORES = tuple(map("".join, product(HIGHER_IS_BETTER, ("_context", "_target"), ("", "_visible"))))
 
 
-_TEXTS = ("key", "scene", "scene_sha256", "method", "command")
-_TABLES = {  # and the types of their values
-    "settings": (str, int, float, bool, type(None)),
-    "environment": (str,),
-    "stages": (int, float),
+def _holds(container: type | tuple[type, ...], *kinds: type) -> Callable[[Any], bool]:
+    """Whether a value is a container of values of some types alone."""
+
+    def check(given: Any) -> bool:
+        values = given.values() if isinstance(given, Mapping) else given
+        return isinstance(given, container) and all(isinstance(value, kinds) for value in values)
+
+    return check
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+CHECKS: dict[str, Callable[[Any], bool]] = {  # of values read from JSON, by the type of their field
+    "str": lambda value: isinstance(value, str),
+    "str | None": lambda value: value is None or isinstance(value, str),
+    **dict.fromkeys(("int", "float"), _is_number),
+    **dict.fromkeys(("int | None", "float | None"), lambda value: value is None or _is_number(value)),
+    "tuple[str, ...]": _holds((list, tuple), str),
+    "Mapping[str, Any]": _holds(Mapping, str, int, float, bool, type(None)),
+    "Mapping[str, str]": _holds(Mapping, str),
+    "Mapping[str, float]": _holds(Mapping, int, float),
 }
-_LISTS = ("pictures", "notes")
 
 
-def _fits(name: str, value: object) -> bool:
-    """Whether a value read from JSON is of the kind that a field has."""
-    if name in _TEXTS:
-        return isinstance(value, str)
-    if name in _TABLES:
-        return isinstance(value, Mapping) and all(isinstance(inner, _TABLES[name]) for inner in value.values())
-    if name in _LISTS:
-        return isinstance(value, list | tuple) and all(isinstance(inner, str) for inner in value)
-    if name == "error":
-        return value is None or isinstance(value, str)
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return value is None or number
+def known_fields(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that a dataclass has fields for; a ValueError if one is of another type than its field."""
+    known = {f.name: values[f.name] for f in fields(kind) if f.name in values}
+    wrong = next((f.name for f in fields(kind) if f.name in known and not CHECKS[str(f.type)](known[f.name])), None)
+    if wrong is not None:
+        raise ValueError(f"expected a run record, got one with another {wrong}")
+    return known
 
 
 @dataclass(frozen=True)
@@ -102,18 +113,11 @@ class RunRecord:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> RunRecord:
-        """The record that :meth:`to_dict` gave, through JSON.
-
-        Raises:
-            ValueError: If it is of another schema version, or a field is missing or of another kind.
-        """
+        """The record that :meth:`to_dict` gave, through JSON; a ValueError if it is of another version or damaged."""
         version = values.get("schema_version")
         if version != SCHEMA_VERSION:
             raise ValueError(f"expected a run record of schema version {SCHEMA_VERSION}, got {version!r}")
-        known = {f.name: values[f.name] for f in fields(RunRecord) if f.name in values}
-        wrong = next((name for name, value in known.items() if not _fits(name, value)), None)
-        if wrong is not None:
-            raise ValueError(f"expected a run record, got one with another {wrong}")
+        known = known_fields(RunRecord, values)
         for name in ("pictures", "notes"):
             known[name] = tuple(known.get(name, ()))
         known["settings"] = new_settings(known.get("settings", {}))
@@ -127,14 +131,7 @@ RUNS, PROXIES, PICTURES, CHARTS, PAGE = "runs.jsonl", "proxies.jsonl", "pictures
 
 
 def experiment_key(scene_sha256: str, method: str, settings: Mapping[str, Any], views: int | None) -> str:
-    """The key of a run: a hash of the scene's content, all settings, and the versions.
-
-    Args:
-        scene_sha256: Of all files that the run reads.
-        method: Name of the method.
-        settings: By flat name.
-        views: Number of views that was asked for; None: all.
-    """
+    """The key of a run: a hash of the scene's content, all settings, the number of views asked for, and versions."""
     return digest(
         {
             "scene": scene_sha256,

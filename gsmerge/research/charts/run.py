@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -15,73 +17,45 @@ from typing import Any
 
 from gsmerge import __version__
 from gsmerge.errors import error_line
-from gsmerge.io import AUTO, ReadHints, load_files
+from gsmerge.io import AUTO, HeldOutViews, ReadHints, load_files, read_held_out
 from gsmerge.io.formats.ply import OpacityChoice
-from gsmerge.io.formats.ply_writer import file_bytes
-from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
+from gsmerge.io.formats.writing import file_bytes
+from gsmerge.measure.evaluate import EvaluateOptions, near_plane
+from gsmerge.measure.speed import time_render
+from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
-from gsmerge.research.charts.experiment import OURS, Experiment, run_settings
-from gsmerge.research.charts.measure import (
-    TargetPlaces,
-    choose_views,
-    keep_pictures,
-    measure,
-    read_target_views,
-    time_render,
-)
+from gsmerge.research.charts.experiment import Experiment, run_settings
+from gsmerge.research.charts.measure import choose_views, keep_pictures, measure
 from gsmerge.research.charts.proxies import measure_proxies, proxy_points, read_proxies
 from gsmerge.research.charts.record import INPUT, RunRecord, append_run, experiment_key, read_runs
 from gsmerge.research.charts.scenes import SceneSource
-from gsmerge.runtime.estimate import (
-    COST_BASELINES,
-    COST_COLOR_FIT,
-    COST_FIT_RENDERS,
-    COST_FULL_FIT,
-    COST_MERGE,
-    COST_OTHER_BASELINE,
-    COST_READ,
-    COST_ROBUST,
-    COST_SEGMENT,
-    COST_UNMERGED_STEP,
-    score_cost,
-)
+from gsmerge.runtime.estimate import work_seconds
 from gsmerge.runtime.threads import available_threads, use_threads
-from gsmerge.stages.fit.options import STEPS
 from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.views import pick_views
 
 Progress = Callable[[str, int, int], None]
 SCORING = ("score", "input")  # stages of a run that only measure
 PACKAGES = ("torch", "numpy", "numba", "opencv-contrib-python-headless")
 BYTES_PER_GAUSSIAN = 68  # of a .ply without higher harmonics
+MAX_TIMED = 4  # views that are rendered for the time
 COST_EVALUATE = 2.5  # seconds per million pixels of all views, to score input and result
 COST_LPIPS = 12.0  # the same for each network
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a grid is run.
+    """How a grid is run."""
 
-    Args:
-        lpips: Networks of the perceptual distance; slow.
-        lpips_views: Views of each split that are measured with them; None: all.
-        seed: Seed of all random numbers.
-        threads: Threads; None: all processors.
-        proxy_views: Photos of each scene whose superpixels alone are measured; 0: none.
-        rerun: Repeat what is done already.
-        command: The command line, for the record.
-        hints: Facts about the scenes that are given instead of detected.
-        opacity: The same of their opacities.
-    """
-
-    lpips: tuple[str, ...] = ()
-    lpips_views: int | None = None
-    seed: int = 0
-    threads: int | None = None
-    proxy_views: int = 2
-    rerun: bool = False
-    command: str = ""
-    hints: ReadHints = AUTO
-    opacity: OpacityChoice = "auto"
+    lpips: tuple[str, ...] = ()  # networks of the perceptual distance; slow
+    lpips_views: int | None = None  # views of each split that are measured with them; None: all
+    seed: int = 0  # seed of all random numbers
+    threads: int | None = None  # threads; None: all processors
+    proxy_views: int = 2  # photos of each scene whose superpixels alone are measured; 0: none
+    rerun: bool = False  # repeat what is done already
+    command: str = ""  # the command line, for the record
+    hints: ReadHints = AUTO  # facts about the scenes that are given instead of detected
+    opacity: OpacityChoice = "auto"  # the same of their opacities
 
     def key_of(self, experiment: Experiment, source: SceneSource) -> str:
         """Key of a run with these options."""
@@ -113,8 +87,7 @@ class _LoadedScene:
     """A scene in memory with its held-out views."""
 
     scene: PixelScene | UnalignedScene
-    targets: Views | None
-    places: TargetPlaces | None
+    held_out: HeldOutViews | None
     notes: tuple[str, ...]
 
 
@@ -126,14 +99,14 @@ def make_plan(
     done_proxies, more = read_proxies(folder)
     by_path = {source.path: source for source in sources}
     runs: dict[str, tuple[str, Experiment, SceneSource]] = {}
-    too_few: dict[str, int] = {}
+    too_few: Counter[str] = Counter()
     for experiment in experiments:
         source = by_path[experiment.scene]
         if experiment.views is not None and source.num_views is not None and experiment.views > source.num_views:
-            too_few[source.name] = too_few.get(source.name, 0) + 1
-            continue
-        key = options.key_of(experiment, source)
-        runs.setdefault(key, (key, experiment, source))
+            too_few[source.name] += 1
+        else:
+            key = options.key_of(experiment, source)
+            runs.setdefault(key, (key, experiment, source))
     skipped = [f"{name} has fewer views than asked for: {count} run(s) left out" for name, count in too_few.items()]
     pending = {k for k in runs if options.rerun or k not in stored or stored[k].error is not None}
     proxies: dict[str, Mapping[str, tuple[str, float]]] = {}
@@ -145,18 +118,10 @@ def make_plan(
 
 
 def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) -> tuple[list[RunRecord], list[str]]:
-    """Run what is pending, scene by scene.
+    """Run what is pending, scene by scene; returns the records of what was run, and notes.
 
-    A run that fails gives a record with the reason, and the others go on.
-
-    Args:
-        plan: From :func:`make_plan`.
-        folder: The results folder.
-        options: How.
-        progress: Called with (step, done, total), before each run and after the last.
-
-    Returns:
-        The records of the runs that were done, and notes.
+    A run that fails gives a record with the reason, and the others go on. ``progress`` is called with (step, done,
+    total) before each run and after the last.
     """
     done: list[RunRecord] = []
     notes: list[str] = []
@@ -178,10 +143,14 @@ def run_plan(plan: Plan, folder: Path, options: RunOptions, progress: Progress) 
             loaded = _read(source, options)
             for key, experiment in runs:
                 step(f"{source.name}: {describe(experiment)}")
-                record = _try_experiment(key, source, experiment, loaded, folder, options, warm)
+                record = _start_record(key, source, experiment, options)
+                try:
+                    record = _run(record, loaded, folder, options, warm)
+                except Exception as error:  # one bad run must not end the grid; Ctrl-C does
+                    record = replace(record, error=error_line(error))
                 append_run(folder, record)
                 done.append(record)
-            if isinstance(loaded, _LoadedScene) and loaded.scene.images is not None and proxies:
+            if proxies and isinstance(loaded, _LoadedScene) and loaded.scene.images is not None:
                 photos, report = loaded.scene.images, partial(step, f"{source.name}: superpixels")
                 measure_proxies(folder, source.name, photos, proxies, max_views=options.proxy_views, progress=report)
             elif proxies:
@@ -199,27 +168,19 @@ def describe(run: Experiment | RunRecord) -> str:
     return ", ".join([run.method, *settings, *([] if count is None else [f"{count} views"])])
 
 
-def _read(source: SceneSource, options: RunOptions) -> _LoadedScene | str:
-    """The scene with its targets, or why it cannot be read."""
+def _read(source: SceneSource, options: RunOptions) -> _LoadedScene | Exception:
+    """The scene with its held-out views, or why it cannot be read."""
     try:
         load = load_files(source.files, opacity=options.opacity, hints=options.hints)
-        targets, places = read_target_views(load, source.targets, source.target_images)
-        return _LoadedScene(load.scene, targets, places, tuple(load.notes))
+        held_out = None if source.targets is None else read_held_out(load, source.targets, source.target_images)
+        return _LoadedScene(load.scene, held_out, tuple(load.notes))
     except Exception as error:
-        return error_line(error)
+        return error
 
 
-def _try_experiment(
-    key: str,
-    source: SceneSource,
-    experiment: Experiment,
-    loaded: _LoadedScene | str,
-    folder: Path,
-    options: RunOptions,
-    warm: set[tuple[Any, ...]],
-) -> RunRecord:
-    """The record of a run, which says why it failed if it did."""
-    record = RunRecord(
+def _start_record(key: str, source: SceneSource, experiment: Experiment, options: RunOptions) -> RunRecord:
+    """What is known of a run beforehand."""
+    return RunRecord(
         key=key,
         scene=source.name,
         scene_sha256=source.sha256,
@@ -229,44 +190,29 @@ def _try_experiment(
         command=options.command,
         environment=environment(options.threads),
     )
-    if isinstance(loaded, str):
-        return replace(record, error=loaded)
-    try:
-        return run_experiment(record, experiment, loaded, folder, options, warm)
-    except Exception as error:  # one bad run must not end the grid; Ctrl-C does
-        return replace(record, error=error_line(error))
 
 
-def run_experiment(
-    record: RunRecord,
-    experiment: Experiment,
-    loaded: _LoadedScene,
-    folder: Path,
-    options: RunOptions,
-    warm: set[tuple[Any, ...]],
+def _run(
+    record: RunRecord, loaded: _LoadedScene | Exception, folder: Path, options: RunOptions, warm: set[tuple[Any, ...]]
 ) -> RunRecord:
-    """One run: merge, score, time, store pictures.
+    """Merge, score, time, store pictures.
 
-    Args:
-        record: With what is known beforehand.
-        experiment: What to run.
-        loaded: The scene and its targets.
-        folder: The results folder, for pictures.
-        options: How.
-        warm: Kinds of runs that this process has done before, added to. The first of a kind is tried on two views, so
-            that compiling and loading of kernels does not count as its time.
+    ``warm`` has the kinds of runs that this process has done before, and is added to. The first of a kind is tried on
+    two views, so that compiling and loading of kernels does not count as its time.
     """
-    if experiment.views is not None and experiment.views > len(loaded.scene):
-        raise ValueError(f"expected at most {len(loaded.scene)} views, got {experiment.views}")
-    scene, targets = choose_views(loaded.scene, loaded.targets, loaded.places, experiment.views)
-    settings = run_settings(experiment.method, experiment.settings) | {"seed": options.seed, "threads": options.threads}
+    if isinstance(loaded, Exception):
+        raise loaded
+    if record.views_asked is not None and record.views_asked > len(loaded.scene):
+        raise ValueError(f"expected at most {len(loaded.scene)} views, got {record.views_asked}")
+    scene, targets = choose_views(loaded.scene, loaded.held_out, record.views_asked)
+    settings = run_settings(record.method, record.settings) | {"seed": options.seed, "threads": options.threads}
     seconds: dict[str, float] = {}
     notes: tuple[str, ...] = loaded.notes
     result = None
-    if experiment.method != INPUT:
-        kind = (experiment.method, *(experiment.settings.get(name) for name in ("fit", "segmentation", "k")))
+    if record.method != INPUT:
+        kind = (record.method, *(record.settings.get(name) for name in ("fit", "segmentation", "k")))
         if kind not in warm:
-            compact(choose_views(scene, None, None, 2)[0], **settings)
+            compact(choose_views(scene, None, 2)[0], **settings)
             warm.add(kind)
         done = compact(scene, **settings)
         result, seconds = done.gaussians, done.report.seconds
@@ -275,7 +221,8 @@ def run_experiment(
     scores: dict[str, Any] = {**measure(scene, result, targets, evaluation)}
     gaussians = scene.file_gaussians if result is None else result
     count = scene.num_gaussians if result is None else len(result)
-    cameras = scene.cameras if targets is None else targets.cameras
+    cameras, near = scene.cameras if targets is None else targets.cameras, near_plane(scene)
+    views = pick_views(len(cameras), MAX_TIMED)
     return replace(
         record,
         views=len(scene),
@@ -285,67 +232,37 @@ def run_experiment(
         bytes=file_bytes(count, gaussians.sh_degree),
         seconds=sum(value for name, value in seconds.items() if name not in SCORING),
         stages=dict(seconds),
-        render_ms=time_render(gaussians, cameras, near_plane(scene)),
-        pictures=keep_pictures(folder, record.key, record.scene_sha256, gaussians, loaded.scene, loaded.targets),
+        render_ms=1000 * median(time_render(gaussians, cameras[[view]], near) for view in views),
+        pictures=keep_pictures(folder, record.key, record.scene_sha256, gaussians, loaded.scene, loaded.held_out),
         notes=notes,
         **scores,
     )
 
 
 def estimate_seconds(
-    runs: Sequence[tuple[str, Experiment, SceneSource]],
-    stored: Mapping[str, RunRecord],
-    *,
-    threads: int,
-    lpips: Sequence[str] = (),
-    lpips_views: int | None = None,
+    runs: Sequence[tuple[str, Experiment, SceneSource]], stored: Mapping[str, RunRecord], options: RunOptions
 ) -> float:
     """Wall time of runs, within a factor of about two; from times of the same scene and method in ``stored`` if any."""
+    threads = options.threads or available_threads()
     known: dict[tuple[str, str], list[float]] = {}
     for record in stored.values():
         if record.seconds is not None and record.error is None:
             known.setdefault((record.scene, record.method), []).append(record.seconds)
     total = 0.0
     for _, experiment, source in runs:
-        pixels = source.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6
         views = source.num_views or 1
         share = min(1.0, (experiment.views or views) / views)
-        lpips_share = min(1.0, (lpips_views or views) / max(share * views, 1.0))
-        total += share * pixels * (COST_EVALUATE + lpips_share * COST_LPIPS * len(lpips)) / threads
+        gaussians = share * source.files.ply.stat().st_size / BYTES_PER_GAUSSIAN
+        lpips_share = min(1.0, (options.lpips_views or views) / max(share * views, 1.0))
+        total += gaussians / 1e6 * (COST_EVALUATE + lpips_share * COST_LPIPS * len(options.lpips)) / threads
         times = known.get((source.name, experiment.method))
-        total += share * median(times) if times else _merge_seconds(experiment, share * pixels, views * share, threads)
-    sources = {source.path: source for _, _, source in runs}
-    return total + sum(COST_READ * p.files.ply.stat().st_size / BYTES_PER_GAUSSIAN / 1e6 for p in sources.values())
-
-
-def _merge_seconds(experiment: Experiment, pixels: float, views: float, threads: int) -> float:
-    """Of one merge; ``pixels`` in millions."""
-    if experiment.method == INPUT:
-        return 0.0
-    settings = experiment.settings
-    if experiment.method != OURS:
-        return _baseline_seconds(experiment.method, STEPS[settings.get("effort", "default")], pixels, views, threads)
-    work = pixels * (COST_MERGE + score_cost(views) + COST_SEGMENT[settings.get("segmentation", "rdseg")])
-    fit = settings.get("fit", "full")
-    if fit == "full":
-        work += COST_FULL_FIT * STEPS[settings.get("effort", "default")] * pixels / max(views, 1.0)
-        work += pixels * COST_FIT_RENDERS
-    else:
-        work += pixels * (COST_ROBUST + COST_COLOR_FIT * (fit == "color"))
-    return work / threads
-
-
-def _baseline_seconds(method: str, steps: int, pixels: float, views: float, threads: int) -> float:
-    """The same of a baseline."""
-    work = (
-        COST_BASELINES.get(method, COST_OTHER_BASELINE)
-        + score_cost(views)
-        + COST_COLOR_FIT * (method == "unmerged-color")
-    )
-    work *= pixels
-    if method == "unmerged-fit":
-        work += steps * pixels * (COST_FULL_FIT / max(views, 1.0) + COST_UNMERGED_STEP)
-    return work / threads
+        if times:
+            total += share * median(times)
+        elif experiment.method != INPUT:
+            settings = CompactOptions().with_settings(run_settings(experiment.method, experiment.settings))
+            flat, steps, of_view = settings.resolved(photos=True), settings.fit.steps, gaussians / max(share * views, 1)
+            total += work_seconds(round(gaussians), of_view, flat, photos=True, fit_steps=steps) / threads
+    return total
 
 
 def environment(threads: int | None) -> dict[str, str]:
@@ -358,19 +275,14 @@ def environment(threads: int | None) -> dict[str, str]:
         "python": platform.python_version(),
     }
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):  # installed under another name
             values[name] = version(name)
-        except PackageNotFoundError:
-            continue  # installed under another name
     return values
 
 
 def _processor() -> str:
     """Its model, and the number of processors."""
     name = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
-    except OSError:
-        pass  # only Linux has it
+    with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
+        name = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), name)
     return f"{name}, {os.cpu_count() or 1} processors"

@@ -29,30 +29,20 @@ class SceneSource:
 def find_scenes(
     scenes: Sequence[Path], targets: str | None = None, target_images: str | None = None
 ) -> list[SceneSource]:
-    """The files of all scenes.
+    """The files of all scenes: ``.ply`` files, or the folders that they are in.
 
-    Args:
-        scenes: ``.ply`` files, or the folders that they are in.
-        targets: Cameras of the held-out views: one path for all scenes, or a template with ``{scene}`` (as given),
-            ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it.
-        target_images: The same for the folder of their photos.
-
-    Raises:
-        SceneError: If a file is missing.
-        UsageError: If a scene is given twice or a template holds another name.
+    ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
+    template with ``{scene}`` (as given), ``{parent}`` (its folder) and ``{stem}`` (its name without extension) in it. A
+    SceneError if a file is missing, a UsageError if a scene is given twice or a template holds another name.
     """
-    names = scene_names(scenes)
-    return [
-        _make_source(scene, name, filled(targets, scene), filled(target_images, scene))
-        for scene, name in zip(scenes, names, strict=True)
-    ]
+    named = zip(scenes, scene_names(scenes), strict=True)
+    return [_make_source(one, name, filled(targets, one), filled(target_images, one)) for one, name in named]
 
 
 def scene_names(scenes: Sequence[Path]) -> list[str]:
     """A short name for every scene: its own, with as many folders before it as it takes to distinguish them.
 
-    Raises:
-        UsageError: If a scene is given twice.
+    A UsageError if a scene is given twice.
     """
     parts = [(*scene.absolute().parent.parts, stem_of(scene.absolute())) for scene in scenes]
     for depth in range(1, max(map(len, parts), default=0) + 1):

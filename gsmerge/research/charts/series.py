@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,13 +16,7 @@ from gsmerge.research.charts.statistics import Interval, paired_intervals
 MIN_SHARE = 0.5  # of the scenes that a point of a line must have
 MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
 TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes
-PARTS = (
-    "target_visible",
-    "target",
-    "context_visible",
-    "context",
-)  # what scores are means over, the most meaningful first
-PART_LABELS = {
+PART_LABELS = {  # what scores are means over, the most meaningful first
     "target_visible": "held-out views, pixels that the input views see",
     "target": "held-out views",
     "context_visible": "input views, pixels that they see",
@@ -31,6 +25,7 @@ PART_LABELS = {
 METRIC_LABELS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS (VGG)", "lpips_alex": "LPIPS (AlexNet)"}
 LineKey = tuple[str, tuple[tuple[str, Any], ...]]  # method, settings without the size
 Getter = Callable[[RunRecord], float | None]
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
@@ -73,10 +68,8 @@ def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
     names = {}
     for method, settings in keys:
         others = [dict(other) for name, other in keys if name == method]
-        shared = {
-            name for name, value in settings if all(other.get(name) == value for other in others) and len(others) > 1
-        }
-        labels = [_setting_label(name, value) for name, value in settings if name not in shared]
+        alone = len(others) == 1
+        labels = [_setting_label(n, v) for n, v in settings if alone or any(other.get(n) != v for other in others)]
         names[method, settings] = ", ".join([method, *labels])
     return names
 
@@ -87,14 +80,22 @@ def _setting_label(name: str, value: Any) -> str:
     return f"K = {value}" if name == "k" else str(value) if name == "segmentation" else f"{name} {value}"
 
 
+def names_of(records: Sequence[RunRecord]) -> dict[LineKey, str]:
+    """The name of the line of every run; that of the input is its method."""
+    merged = line_names(list(dict.fromkeys(line_key(r) for r in ours_first(records) if r.method != INPUT)))
+    return {line_key(r): INPUT for r in records if r.method == INPUT} | merged
+
+
+def ours_first(records: Iterable[RunRecord]) -> list[RunRecord]:
+    """Runs of ours, then those of baselines, those with the fewest settings first."""
+    return sorted(records, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
+
+
 def newest(records: Sequence[RunRecord]) -> tuple[list[RunRecord], list[str]]:
     """The last record for each scene, method, settings and number of views, so that no scene counts twice in a mean.
 
     A folder has several where the files of a scene changed, other scenes of the same name were run by another command,
-    or LPIPS or seed were set differently.
-
-    Returns:
-        The records, and a note for each name of scenes with records that were left out.
+    or LPIPS or seed were set differently. With a note for each name of scenes with records that were left out.
     """
     content = {record.scene: record.scene_sha256 for record in records}
     foreign: dict[str, int] = {}
@@ -118,8 +119,8 @@ def successful(records: Sequence[RunRecord]) -> list[RunRecord]:
 
 def choose_part(records: Sequence[RunRecord]) -> str:
     """What scores are means over: the most meaningful that nine of ten runs have."""
-    known = {part: sum(record.score(f"psnr_{part}") is not None for record in records) for part in PARTS}
-    return next((part for part in PARTS if records and known[part] >= 0.9 * len(records)), PARTS[-1])
+    known = {part: sum(record.score(f"psnr_{part}") is not None for record in records) for part in PART_LABELS}
+    return next((part for part in known if records and known[part] >= 0.9 * len(records)), "context")
 
 
 def list_metrics(records: Sequence[RunRecord], part: str) -> list[str]:
@@ -164,9 +165,7 @@ def by_views(records: Sequence[RunRecord], y: Getter, *, with_input: bool = Fals
     """Lines over the number of views, at the typical size; empty where there is only one number."""
     size = typical_size(records)
     chosen = [r for r in records if (r.method == INPUT and with_input) or is_typical(r, size)]
-    lines = _lines(
-        chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, min_share=MIN_SHARE_VIEWS
-    )
+    lines = _lines(chosen, lambda r: str(r.views), lambda r: r.views or 0, lambda r: r.views, y, MIN_SHARE_VIEWS)
     return [line for line in lines if len(line.points) > 1]
 
 
@@ -179,40 +178,35 @@ def _lines(
     min_share: float = MIN_SHARE,
 ) -> list[Line]:
     """Lines of points that have at least a share of the scenes, all over the same scenes."""
-    cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]] = {}
+    cells: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}
     for record in sorted(records, key=order):
         at, value = x(record), y(record)
         if at is not None and value is not None:
-            cells.setdefault(line_key(record), {}).setdefault(label(record), {})[record.scene] = (float(at), value)
-    _keep_common(cells, min_share)
-    columns = [points for line in cells.values() for points in line.values()]
-    intervals = dict(zip(map(id, columns), _intervals(columns), strict=True))
-    names = line_names(list(cells))
-    lines = []
-    for key, sizes in sorted(cells.items(), key=lambda cell: (cell[0][0] != OURS, len(cell[0][1]))):
-        points = [
-            Point(name, _mean_cost(by_scene), intervals[id(by_scene)], by_scene) for name, by_scene in sizes.items()
-        ]
-        lines.append(Line(names[key], key[0] == OURS, tuple(points)))
-    return lines
+            cells.setdefault((line_key(record), label(record)), {})[record.scene] = float(at), value
+    kept = keep_common({cell: set(points) for cell, points in cells.items()}, min_share)
+    keys = list(dict.fromkeys(key for key, _ in kept))
+    by_cell = {
+        cell: {scene: xy for scene, xy in cells[cell].items() if scene in kept[cell]}
+        for cell in sorted(kept, key=lambda cell: keys.index(cell[0]))
+    }
+    intervals = dict(zip(by_cell, _intervals(list(by_cell.values())), strict=True))
+    points: dict[LineKey, list[Point]] = {key: [] for key in keys}
+    for (key, name), by_scene in by_cell.items():
+        points[key].append(Point(name, _mean_cost(by_scene), intervals[key, name], by_scene))
+    names = line_names(keys)
+    keys.sort(key=lambda key: (key[0] != OURS, len(key[1])))
+    return [Line(names[key], key[0] == OURS, tuple(points[key])) for key in keys]
 
 
-def _keep_common(cells: dict[LineKey, dict[str, dict[str, tuple[float, float]]]], min_share: float) -> None:
-    """Leave only scenes that every point has, so that all means are over the same scenes; all, if that leaves none.
+def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
+    """The scenes that all have, so that all means are over the same scenes; each its own, if there are none.
 
-    Points that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
+    Those that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
     """
-    num_scenes = len({scene for line in cells.values() for points in line.values() for scene in points})
-    for key in list(cells):
-        cells[key] = {name: points for name, points in cells[key].items() if len(points) >= min_share * num_scenes}
-        if not cells[key]:
-            del cells[key]
-    columns = [points for line in cells.values() for points in line.values()]
-    common = set.intersection(*map(set, columns)) if columns else set()
-    if common:
-        for points in columns:
-            for scene in points.keys() - common:
-                del points[scene]
+    fewest = min_share * len(set().union(*scenes.values()))
+    kept = {name: own for name, own in scenes.items() if len(own) >= fewest}
+    common = set.intersection(*kept.values()) if kept else set()
+    return {name: common or own for name, own in kept.items()}
 
 
 def _mean_cost(points: Mapping[str, tuple[float, float]]) -> float:

@@ -35,16 +35,15 @@ class Verdict:
     words: str  # ours above, baseline above, undecided or ours has none so cheap
 
 
-def t_factor(count: int, level: float = LEVEL) -> float:
+def t_factor(count: int) -> float:
     """Half-width of a t interval in standard errors, for ``count`` samples."""
-    return float(stdtrit(count - 1, 0.5 + level / 2))
+    return float(stdtrit(count - 1, 0.5 + LEVEL / 2))
 
 
-def mean_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
-    """The mean with its two-sided t interval (Student 1908), which few scenes make wide: 12.7 standard errors for two.
+def mean_interval(values: Sequence[float]) -> Interval:
+    """The mean of at least one value with its two-sided t interval (Student 1908).
 
-    Raises:
-        ValueError: If there are no values.
+    Few scenes make it wide: 12.7 standard errors for two.
     """
     if not len(values):
         raise ValueError("expected at least one value, got none")
@@ -52,47 +51,35 @@ def mean_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
     mean = float(array.mean())
     if len(array) == 1:
         return Interval(mean, mean, mean, 1)
-    half = t_factor(len(array), level) * float(array.std(ddof=1)) / math.sqrt(len(array))
+    half = t_factor(len(array)) * float(array.std(ddof=1)) / math.sqrt(len(array))
     return Interval(mean, mean - half, mean + half, len(array))
 
 
-def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float], level: float = LEVEL) -> Interval:
-    """Ours minus theirs over the scenes that both have, so that the difficulty of a scene cancels.
-
-    Raises:
-        ValueError: If no scene is in both.
-    """
-    return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs], level)
+def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Interval:
+    """Ours minus theirs over the scenes that both have, at least one, so that the difficulty of a scene cancels."""
+    return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
 
 
-def paired_intervals(values: NDArray[np.float64], level: float = LEVEL) -> list[Interval]:
-    """Intervals of ``values [scenes, conditions]`` without the differences between scenes.
+def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
+    """Intervals of ``values [scenes, conditions]``, neither of them 0, without the differences between scenes.
 
     Scenes differ by several dB and conditions by tenths, so plain intervals would hide the conditions. Here every
     scene's own mean is subtracted first (Cousineau 2005), with the correction for it (Morey 2008).
-
-    Raises:
-        ValueError: If there are no scenes or no conditions.
     """
     num_scenes, num_conditions = values.shape
     if num_conditions == 1 or num_scenes == 1:
-        return [mean_interval(column, level) for column in values.T.tolist()]
+        return [mean_interval(column) for column in values.T.tolist()]
     centred = values - values.mean(1, keepdims=True) + values.mean()
     factor = math.sqrt(num_conditions / (num_conditions - 1))
-    plain = [mean_interval(column, level) for column in centred.T.tolist()]
-    return [Interval(i.mean, *_widened(i, factor), i.count) for i in plain]
-
-
-def _widened(interval: Interval, factor: float) -> tuple[float, float]:
-    half = factor * (interval.high - interval.mean)
-    return interval.mean - half, interval.mean + half
+    plain = [mean_interval(column) for column in centred.T.tolist()]
+    halves = [factor * (one.high - one.mean) for one in plain]
+    return [Interval(i.mean, i.mean - half, i.mean + half, i.count) for i, half in zip(plain, halves, strict=True)]
 
 
 def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
-    """Points that no other dominates: none is as cheap and better (a higher quality), or cheaper and as good.
+    """Indices, by ascending cost, of the points that no other dominates; of equal points the first.
 
-    Returns:
-        Indices by ascending cost; of equal points the first.
+    A point dominates one that is as cheap and worse (a lower quality), or dearer and no better.
     """
     best, front = -math.inf, []
     for i in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i], i)):
@@ -103,12 +90,9 @@ def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int
 
 
 def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
-    """Quality of a method at a cost: its front, linear over the logarithm of the cost between two points.
+    """Quality of a method at a cost: its front, linear over the logarithm of the cost; None below its cheapest point.
 
     Costs are positive, and a higher quality is better. Beyond the most expensive point the quality is constant.
-
-    Returns:
-        None below the cheapest point.
     """
     front = pareto_front(costs, qualities)
     if not front or cost < costs[front[0]]:
@@ -126,18 +110,8 @@ def judge(
 ) -> Verdict:
     """Whether a baseline's point lies above our curve at equal cost, scene by scene.
 
-    Args:
-        baseline: Its name.
-        points: (cost, quality) of the point by scene.
-        ours: All (cost, quality) of ours by scene.
-        higher: Whether higher quality is better.
-
-    Returns:
-        A verdict that names a side only where zero lies outside the interval of the difference, or the baseline has
-        only one scene.
-
-    Raises:
-        ValueError: If the baseline has no point.
+    ``points`` has the (cost, quality) of the baseline's point by scene, at least one, ``ours`` all those of ours. A
+    side is named only where zero lies outside the interval of the difference, or the baseline has only one scene.
     """
     sign = 1.0 if higher else -1.0
     our_quality: dict[str, float] = {}

@@ -199,12 +199,11 @@ def _normal(kind, s, waves, x, y, z):
             return 0.0, b, 0.0
         radius = 0.5 * (1.0 + s[3]) + 0.5 * (s[3] - 1.0) * b
         return a / s[0], -radius * 0.5 * (s[3] - 1.0) / s[1], c / s[2]
-    nx, ny, nz = 0.0, 0.0, 1.0
-    if kind != SHEET:
+    if kind == SHEET:
+        a, b, c, nx, ny, nz = x, y, 0.0, 0.0, 0.0, 1.0
+    else:
         length = math.sqrt(a * a + b * b + c * c)
         nx, ny, nz = a / length, b / length, c / length
-    if kind == SHEET:
-        a, b, c = x, y, 0.0
     if kind in (BLOB, SHEET):
         for k in range(waves.shape[0]):
             swing = waves[k, 4] * math.cos(waves[k, 0] * a + waves[k, 1] * b + waves[k, 2] * c + waves[k, 3])

@@ -111,10 +111,8 @@ def pixel_gaussians(seen: TrueView, lens: Lens, noise: Noise, rng: np.random.Gen
     rays = np.stack([(u - width / 2) / lens.focal, (v - height / 2) / lens.focal, np.ones(n)], 1)
     means = (rays * depth[:, None]) @ seen.c2w[:3, :3].T + seen.c2w[:3, 3]
     normals = seen.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    quats = quats_facing(
-        np.where(length < 1e-6, rays, normals) / np.where(length < 1e-6, np.linalg.norm(rays, axis=1)[:, None], length)
-    )
+    normals = np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 1e-6, rays, normals)
+    quats = quats_facing(normals / np.linalg.norm(normals, axis=1, keepdims=True))
     shape = np.array([1.0, 1.0, noise.flatness]) * np.exp(rng.normal(0, noise.scale_jitter, (n, 3)))
     scales = noise.scale * (depth / lens.focal)[:, None] * shape
     oversized = rng.random(n) < noise.oversized

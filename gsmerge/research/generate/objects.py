@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,18 +23,15 @@ from gsmerge.research.generate.shapes import (
     quad,
     rod,
 )
-from gsmerge.research.generate.stage import Palette
+from gsmerge.research.generate.textures import Palette
 
 Shapes = list[Shape]
 
 
 def table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     """A table with four legs, or a round one with one."""
-    rng, top, legs = (
-        pal.rng,
-        pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8),
-        pal.material("wood", "plain"),
-    )
+    rng, top = pal.rng, pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8)
+    legs = pal.material("wood", "plain")
     thick = rng.uniform(0.02, 0.06)
     if rng.random() < 0.35:
         disc = column((0, -height + thick, 0), thick, width / 2, top)
@@ -72,9 +70,9 @@ def shelf(pal: Palette, width: float, height: float) -> Shapes:
         if y + 0.3 > height:
             break
         if rng.random() < 0.7:
-            left, right = (
-                np.sort(rng.uniform(-width / 2, width / 2, 2)) if rng.random() < 0.5 else (-width / 2, width / 2)
-            )
+            left, right = -width / 2, width / 2
+            if rng.random() < 0.5:
+                left, right = np.sort(rng.uniform(left, right, 2))
             top, front = y + rng.uniform(0.18, 0.26), -depth * rng.uniform(0.6, 0.95)
             out.append(box((left, -top, front), (max(right, left + 0.1), -y - 0.02, -0.02), pal.material("spines")))
         else:
@@ -100,13 +98,8 @@ def carton(pal: Palette) -> Shapes:
 def can(pal: Palette) -> Shapes:
     """A can, a jar or a mug."""
     rng, r, h = pal.rng, pal.rng.uniform(0.025, 0.05), pal.rng.uniform(0.07, 0.16)
-    body = column(
-        (0, 0, 0),
-        h,
-        r,
-        pal.material("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8)),
-        top=rng.uniform(0.9, 1.15),
-    )
+    wrapping = pal.material("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8))
+    body = column((0, 0, 0), h, r, wrapping, top=rng.uniform(0.9, 1.15))
     return [body, column((0, -h, 0), 0.004, r * 0.85, pal.material("plain", gloss=0.8))]
 
 
@@ -164,8 +157,7 @@ def paper(pal: Palette) -> Shapes:
 def laptop(pal: Palette) -> Shapes:
     """A computer with a page on its screen."""
     case, lid = pal.material("plain", gloss=0.4), axis_rotation(0, pal.rng.uniform(-0.5, -0.1))
-    screen = quad((0, -0.11, -0.006), (0.15, 0.1), pal.material("printed", "label"))
-    screen = Shape(screen.kind, screen.size, screen.material, screen.centre, screen.rotation, glow=True)
+    screen = replace(quad((0, -0.11, -0.006), (0.15, 0.1), pal.material("printed", "label")), glow=True)
     keys = quad((0, -0.019, -0.02), (0.14, 0.07), pal.material("printed", "tiles"), LYING)
     cover = place([screen, box((-0.16, -0.22, -0.004), (0.16, 0, 0.004), case)], (0, -0.015, 0.11), rotation=lid)
     return [box((-0.16, -0.018, -0.11), (0.16, 0, 0.11), case), keys, *cover]
@@ -253,9 +245,7 @@ def fence(pal: Palette, width: float, height: float) -> Shapes:
 
 def window(pal: Palette, width: float, height: float, material: Material, *, glow: bool) -> Shapes:
     """A pane with a frame and bars, in the plane z = 0, its foot at the origin."""
-    pane = quad((0, -height / 2, -0.01), (width / 2, height / 2), material)
-    if glow:
-        pane = Shape(pane.kind, pane.size, pane.material, pane.centre, pane.rotation, shell=True, glow=True)
+    pane = replace(quad((0, -height / 2, -0.01), (width / 2, height / 2), material), shell=glow, glow=glow)
     frame, t = pal.material("plain", "wood"), pal.rng.uniform(0.03, 0.07)
     w, h = width / 2, height
     bars = [((-w - t, -h - t), (w + t, -h)), ((-w - t, 0), (w + t, t)), ((-w - t, -h), (-w, 0)), ((w, -h), (w + t, 0))]

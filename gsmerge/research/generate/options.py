@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,12 @@ from gsmerge.research.generate.styles import STYLES
 
 Range = tuple[float, float]
 MIXED = "mixed"
-ERRORS = (
+ERRORS = (  # ranges that --noise scales; the others are habits of the exporter
     *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
     *("exposure", "tint", "oversized", "tilt"),
-)  # ranges that --noise scales; the others are habits of the exporter
-SPREAD = ("view_bias", "drift", "grain", "turn", "shift")  # drawn uniformly in their logarithm
+)
+SPREAD = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # drawn uniformly in their logarithm
+POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
 
 
 @dataclass(frozen=True)
@@ -28,78 +29,42 @@ class NoiseOptions:
     """Ranges of every error and habit of an exporter, from which each scene draws its values.
 
     Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/internals/generator.md
-    compares them with real exports.
-
-    Args:
-        view_bias: Scale error of a view.
-        drift: Slow error across a view.
-        patches: Share of a view whose depth is wrong.
-        patch_error: Error of these patches.
-        grain: Independent error of each pixel.
-        blank: Factor of additional errors where the photo has no texture.
-        bleed: Blend towards a smoothed inverse depth at edges, 0 to 1.
-        bleed_width: Deviation of that smoothing, pixels.
-        far: Largest depth that the network predicts, in medians of the depth.
-        floaters: Share of the pixels that float in front of their surface; eleven times as many at edges.
-        turn: Rotation error of a pose, degrees.
-        shift: Translation error of a pose, in median depths.
-        exposure: Deviation of the logarithm of a photo's brightness.
-        tint: The same for each colour.
-        blur: Deviation of the lens's blur, pixels.
-        offset: Largest distance of a mean from its pixel's centre, pixels.
-        scale: Scale of a Gaussian across its normal, in footprints of its pixel.
-        scale_jitter: Deviation of the scales' logarithms.
-        flatness: Thickness along the normal, relative to the other axes.
-        tilt: Error of the normals, radians.
-        oversized: Share of the Gaussians that are far too large.
-        oversize: Largest factor of their size, at least 2.
-        trust: Confidence of pixels without errors.
-        constant_opacity: Chance that all opacities are the same.
-        opacity_low: Opacity where the confidence is 0.
-        opacity_high: Opacity where the confidence is 1.
-        opacity_grain: Independent deviation of each opacity.
-        color_grain: Error of each colour.
-        color_blur: Deviation of the smoothing of colours, pixels; below 0.2: none.
-        sh_degrees: Degrees of the spherical harmonics, drawn with equal chances.
-        harmonics: Deviation of the higher coefficients.
-        unit: World units per metre.
-
-    Raises:
-        ValueError: If a range is empty or impossible.
+    compares them with real exports. A ValueError if a range is empty or impossible.
     """
 
-    view_bias: Range = (0.0002, 0.02)
-    drift: Range = (0.0003, 0.02)
-    patches: Range = (0.0, 0.3)
-    patch_error: Range = (0.02, 0.5)
-    grain: Range = (0.0007, 0.003)
-    blank: Range = (0.0, 3.0)
-    bleed: Range = (0.1, 1.0)
-    bleed_width: Range = (0.6, 1.8)
-    far: Range = (4.0, 12.0)
+    view_bias: Range = (0.0002, 0.02)  # scale error of a view
+    drift: Range = (0.0003, 0.02)  # slow error across a view
+    patches: Range = (0.0, 0.3)  # share of a view whose depth is wrong
+    patch_error: Range = (0.02, 0.5)  # error of these patches
+    grain: Range = (0.0007, 0.003)  # independent error of each pixel
+    blank: Range = (0.0, 3.0)  # factor of additional errors where the photo has no texture
+    bleed: Range = (0.1, 1.0)  # blend towards a smoothed inverse depth at edges, 0 to 1
+    bleed_width: Range = (0.6, 1.8)  # deviation of that smoothing, pixels
+    far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
+    # share of the pixels that float in front of their surface; eleven times as many at edges
     floaters: Range = (0.0, 0.004)
-    turn: Range = (0.005, 0.3)
-    shift: Range = (0.0001, 0.004)
-    exposure: Range = (0.0, 0.12)
-    tint: Range = (0.0, 0.03)
-    blur: Range = (0.3, 0.75)
-    offset: Range = (0.0, 0.3)
-    scale: Range = (0.5, 1.5)
-    scale_jitter: Range = (0.05, 0.35)
-    flatness: Range = (0.15, 1.0)
-    tilt: Range = (0.02, 0.4)
-    oversized: Range = (0.0, 0.006)
-    oversize: Range = (3.0, 12.0)
-    trust: Range = (0.25, 1.0)
-    constant_opacity: float = 0.2
-    opacity_low: Range = (0.05, 0.4)
-    opacity_high: Range = (0.75, 0.99)
-    opacity_grain: Range = (0.0, 0.08)
-    color_grain: Range = (0.0, 0.02)
-    color_blur: Range = (0.0, 0.6)
-    sh_degrees: tuple[int, ...] = (0, 0, 0, 1, 2)
-    harmonics: Range = (0.0, 0.06)
-    unit: Range = (0.2, 5.0)
+    turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
+    shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
+    exposure: Range = (0.0, 0.12)  # deviation of the logarithm of a photo's brightness
+    tint: Range = (0.0, 0.03)  # the same for each colour
+    blur: Range = (0.3, 0.75)  # deviation of the lens's blur, pixels
+    offset: Range = (0.0, 0.3)  # largest distance of a mean from its pixel's centre, pixels
+    scale: Range = (0.5, 1.5)  # scale of a Gaussian across its normal, in footprints of its pixel
+    scale_jitter: Range = (0.05, 0.35)  # deviation of the scales' logarithms
+    flatness: Range = (0.15, 1.0)  # thickness along the normal, relative to the other axes
+    tilt: Range = (0.02, 0.4)  # error of the normals, radians
+    oversized: Range = (0.0, 0.006)  # share of the Gaussians that are far too large
+    oversize: Range = (3.0, 12.0)  # largest factor of their size, at least 2
+    trust: Range = (0.25, 1.0)  # confidence of pixels without errors
+    constant_opacity: float = 0.2  # chance that all opacities are the same
+    opacity_low: Range = (0.05, 0.4)  # opacity where the confidence is 0
+    opacity_high: Range = (0.75, 0.99)  # opacity where the confidence is 1
+    opacity_grain: Range = (0.0, 0.08)  # independent deviation of each opacity
+    color_grain: Range = (0.0, 0.02)  # error of each colour
+    color_blur: Range = (0.0, 0.6)  # deviation of the smoothing of colours, pixels; below 0.2: none
+    sh_degrees: tuple[int, ...] = (0, 0, 0, 1, 2)  # degrees of the spherical harmonics, drawn with equal chances
+    harmonics: Range = (0.0, 0.06)  # deviation of the higher coefficients
+    unit: Range = (0.2, 5.0)  # world units per metre
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -110,18 +75,15 @@ class NoiseOptions:
                 ok = len(value) > 0 and all(degree in (0, 1, 2, 3) for degree in value)
             else:
                 ok = len(value) == 2 and 0 <= value[0] <= value[1] < float("inf")
-                ok = ok and not (
-                    f.name in (*SPREAD, "unit", "far", "scale", "bleed_width", "flatness", "blur") and value[0] == 0
-                )
+                ok = ok and (value[0] > 0 or f.name not in POSITIVE)
             if not ok:
-                raise ValueError(f"{f.name}: expected a range of what its docstring says, got {value!r}")
+                raise ValueError(f"{f.name}: expected a range of possible values, got {value!r}")
 
 
 def read_ranges(path: Path) -> NoiseOptions:
     """Ranges from a TOML or JSON file: a table with some of the names, and two numbers for each.
 
-    Raises:
-        SceneError: If the file cannot be read, or holds an unknown name or an impossible range.
+    A SceneError if the file cannot be read, or holds an unknown name or an impossible range.
     """
     table = read_table(path)
     unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
@@ -177,10 +139,8 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
     for f in fields(Noise):
         if f.name == "sh_degree":
             continue
-        low, high = getattr(options, f.name)
-        drawn[f.name] = float(
-            np.exp(rng.uniform(np.log(low), np.log(high))) if f.name in (*SPREAD, "unit") else rng.uniform(low, high)
-        )
+        bounds = getattr(options, f.name)
+        drawn[f.name] = float(np.exp(rng.uniform(*np.log(bounds))) if f.name in SPREAD else rng.uniform(*bounds))
     for name in ERRORS:
         drawn[name] *= factor
     for name in ("bleed", "patches", "floaters", "oversized"):
@@ -193,28 +153,15 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
 
 @dataclass(frozen=True)
 class GenerateOptions:
-    """Settings of synthetic scenes.
+    """Settings of synthetic scenes; a ValueError if one is out of range."""
 
-    Args:
-        views: Range of the number of views of a scene; there is one target between any two neighbours.
-        width: Pixels.
-        height: Pixels.
-        style: One of :data:`gsmerge.research.generate.styles.STYLES`, or "mixed": each in turn.
-        path: One of :data:`gsmerge.research.generate.paths.PATHS`, or "mixed": any.
-        noise: Factor on the errors of :class:`NoiseOptions`.
-        ranges: The errors and habits.
-
-    Raises:
-        ValueError: If a setting is out of range.
-    """
-
-    views: tuple[int, int] = (6, 6)
-    width: int = 320
-    height: int = 240
-    style: str = MIXED
-    path: str = MIXED
-    noise: float = 1.0
-    ranges: NoiseOptions = field(default_factory=NoiseOptions)
+    views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours
+    width: int = 320  # of the views, pixels: 16 to 2048
+    height: int = 240  # the same
+    style: str = MIXED  # one of STYLES, or "mixed": each in turn
+    path: str = MIXED  # one of PATHS, or "mixed": any
+    noise: float = 1.0  # factor on the errors: 0 to 10
+    ranges: NoiseOptions = field(default_factory=NoiseOptions)  # the errors and habits
 
     def __post_init__(self) -> None:
         low, high = self.views
@@ -231,11 +178,5 @@ class GenerateOptions:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as JSON types."""
-        return _lists(asdict(self))
-
-
-def _lists(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: _lists(value) if isinstance(value, Mapping) else list(value) if isinstance(value, tuple) else value
-        for name, value in values.items()
-    }
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return plain

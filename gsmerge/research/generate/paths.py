@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
-from gsmerge.research.generate.photograph import FAR, Hits
+from gsmerge.research.generate.photograph import FAR, Hits, Stage
 from gsmerge.research.generate.shapes import Array
-from gsmerge.research.generate.stage import Stage
 
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
 MAX_TURN = 50  # degrees between neighbouring views
@@ -31,16 +31,14 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 
 def _orbit_point(stage: Stage, angle: float, distance: float, height: float) -> Array:
     """``[3]`` position at an angle (degrees, 0 towards -z) and distance from the focus, and above the ground."""
-    return np.array([
-        stage.focus[0] + distance * np.sin(np.deg2rad(angle)),
-        -height,
-        stage.focus[2] - distance * np.cos(np.deg2rad(angle)),
-    ])  # fmt: skip
+    x, _, z = stage.focus
+    return np.array([x + distance * np.sin(np.deg2rad(angle)), -height, z - distance * np.cos(np.deg2rad(angle))])
 
 
-def _arc_path(stage: Stage, rng: np.random.Generator, low: float, high: float) -> Pose:
-    """Around the focus by ``low`` to ``high`` degrees, moving up and down a little."""
-    span = min(rng.uniform(low, high), 2 * stage.swing)
+def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high: float) -> Pose:
+    """Along an arc of ``low`` to ``high`` degrees about the focus, or as far as there is room, up and down a little."""
+    limit = MAX_TURN * max(1, num_views - 1)
+    span = min(rng.uniform(min(low, limit), min(high, limit)), 2 * stage.swing)
     start = rng.uniform(-stage.swing, stage.swing - span) if span < 2 * stage.swing else -span / 2
     distance, height = rng.uniform(*stage.distance), rng.uniform(*stage.height)
     swing = rng.uniform(0, 0.4) * (stage.height[1] - stage.height[0])
@@ -51,26 +49,6 @@ def _arc_path(stage: Stage, rng: np.random.Generator, low: float, high: float) -
         return look_at(eye, stage.focus, 0.03 * np.sin(5 * s + phase))
 
     return pose
-
-
-def _limit_span(low: float, high: float, num_views: int) -> tuple[float, float]:
-    limit = MAX_TURN * max(1, num_views - 1)
-    return min(low, limit), min(high, limit)
-
-
-def arc(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Along an arc, aimed at the focus."""
-    return _arc_path(stage, rng, *_limit_span(15, 60, num_views))
-
-
-def wide(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Along a wide arc, views far apart."""
-    return _arc_path(stage, rng, *_limit_span(60, 110, num_views))
-
-
-def orbit(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """All around, or as far as there is room."""
-    return _arc_path(stage, rng, *_limit_span(200, 340, num_views))
 
 
 def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
@@ -102,7 +80,13 @@ def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
     return pose
 
 
-PATHS: dict[str, Path] = {"arc": arc, "forward": forward, "walk": walk, "orbit": orbit, "wide": wide}
+PATHS: dict[str, Path] = {
+    "arc": partial(arc, low=15, high=60),
+    "forward": forward,
+    "walk": walk,
+    "orbit": partial(arc, low=200, high=340),
+    "wide": partial(arc, low=60, high=110),
+}
 
 
 def is_usable(hits: Hits) -> bool:

@@ -25,14 +25,10 @@ def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
 def noise(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Octaves of random cells, each ``fade`` times as strong as the previous one.
+    """Octaves of random cells, each ``fade`` times as strong as the previous one: 0.3 gives clouds, 0.9 grit.
 
-    Args:
-        size: Side, pixels.
-        first: Cells of the coarsest octave along a side.
-        fade: 0.3 gives clouds, 0.9 grit.
-        stretch: Ratio of length to height of the cells.
-        ridged: Sharp crests, as of rock and bark.
+    ``first`` is the number of cells of the coarsest octave along a side, ``stretch`` the ratio of their length to their
+    height; ``ridged`` gives sharp crests, as of rock and bark.
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
@@ -62,14 +58,10 @@ def warp(picture: Grey, dx: Grey, dy: Grey, amount: float) -> Grey:
 def courses(
     rng: np.random.Generator, size: int, rows: int, columns: int, *, joint: float, offset: float
 ) -> tuple[Grey, Grey]:
-    """Bricks or tiles: a random tone for each, and 1 on the joints.
+    """Bricks or tiles, ``rows`` courses of ``columns`` stones: a random tone for each, and 1 on the joints.
 
-    Args:
-        size: Side, pixels.
-        rows: Courses.
-        columns: Stones in a course.
-        joint: Width of the joints, as a share of a stone's height.
-        offset: Offset of each second course, as a share of a stone's width.
+    ``joint`` is the width of the joints, as a share of a stone's height, and ``offset`` that of each second course, as
+    a share of a stone's width.
     """
     x, y = grid(size)
     row = np.floor(y * rows).astype(int)

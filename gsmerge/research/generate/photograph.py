@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
-from gsmerge.research.generate.shapes import Array, ShapeArrays, bounds, pack
-from gsmerge.research.generate.stage import Stage
+from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, pack
 from gsmerge.research.generate.textures import Picture, pyramid
 
 FAR = 1e6  # depth of pixels without a surface
@@ -25,6 +24,30 @@ GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full lig
 FROM_BELOW = 0.5  # light from below, relative to that from above
 
 Float: TypeAlias = NDArray[Any]  # float32
+
+
+@dataclass(frozen=True)
+class Light:
+    """The lights of a scene."""
+
+    towards: Array  # [3] unit vector to the light
+    lamp: Array | None  # [3] position, near which surfaces are brighter; None: far away, as the sun
+    key: Array  # [3] linear colour of the direct light
+    ambient: Array  # [3] linear colour of the light from all sides
+    softness: float  # half width of the light, radians
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene before it is photographed; y points down, the middle of the views is along +z."""
+
+    shapes: tuple[Shape, ...]
+    textures: tuple[Picture, ...]  # indexed by the shapes' materials
+    light: Light
+    focus: Array  # [3] point at which cameras are aimed
+    distance: tuple[float, float]  # range of the distance of cameras from the focus
+    height: tuple[float, float]  # range of the height of cameras above the ground
+    swing: float  # largest angle of cameras to either side of -z, seen from the focus, degrees
 
 
 @dataclass(frozen=True)
@@ -89,12 +112,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> N
 def trace(shapes: ShapeArrays, c2w: Array, lens: Lens, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
-    hits = Hits(
-        np.full((h, w), FAR),
-        np.full((h, w), -1, np.int32),
-        np.zeros((h, w, 3), np.float32),
-        np.zeros((h, w, 3), np.float32),
-    )
+    hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()

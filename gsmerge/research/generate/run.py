@@ -37,9 +37,7 @@ def plan(
 ) -> list[SceneFolder]:
     """The folders that :func:`generate` would write; nothing is written.
 
-    Raises:
-        ValueError: If ``count`` or ``seed`` is out of range.
-        UsageError: If a folder holds something else.
+    A ValueError if ``count`` or ``seed`` is out of range, a UsageError if a folder holds something else.
     """
     if count < 1 or seed < 0:
         raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
@@ -57,9 +55,7 @@ def generate_scene(
 ) -> Path:
     """Make scene ``index`` of the series of ``seed`` in a folder, as :func:`generate` does, and return the folder.
 
-    Raises:
-        UsageError: If the folder holds something else.
-        SceneError: If the folder cannot be written.
+    A UsageError if the folder holds something else, a SceneError if it cannot be written.
     """
     options = options or GenerateOptions()
     key = scene_key(seed, index, options)
@@ -83,23 +79,12 @@ def generate(
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
     ``generated.json`` with the random settings. A folder that holds the same scene already is left as it is, so an
-    interrupted call can be repeated, and a call with a larger ``count`` adds scenes.
-
-    Args:
-        out: Folder of the scenes, created if it does not exist.
-        count: Number of scenes, at least 1.
-        options: Settings of the scenes.
-        seed: Random numbers depend only on it and on the scene's number.
-        overwrite: Replace scenes of other options.
-        threads: Threads; None: all processors.
-        progress: Called with scenes done and scenes in all.
-
-    Returns:
-        The scenes in order.
+    interrupted call can be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on
+    ``seed`` and the scene's number; ``progress`` is called with scenes done and scenes in all.
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
-        UsageError: If a folder holds something else.
+        UsageError: If a folder holds a scene of other options and ``overwrite`` is False, or no synthetic scene.
         SceneError: If a folder cannot be written.
     """
     options = options or GenerateOptions()
@@ -137,29 +122,20 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
 
 
 def check_replaceable(folder: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a folder that holds something else.
-
-    Raises:
-        UsageError: If it holds a scene of other options and ``overwrite`` is False, or no synthetic scene.
-    """
+    """A UsageError where a folder holds no synthetic scene, or one of other options and ``overwrite`` is False."""
     if not os.path.lexists(folder):
         return
     if not (folder / RECORD).is_file():
-        raise UsageError(
-            f"{folder}: expected no folder, or a synthetic scene, found something else; choose another OUT"
-        )
-    if not overwrite:
-        raise UsageError(
-            f"{folder}: holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
-        )
+        problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
+    elif not overwrite:
+        problem = "holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
+    else:
+        return
+    raise UsageError(f"{folder}: {problem}")
 
 
-def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a scene, in place of an existing one, and return its record.
-
-    Raises:
-        SceneError: If the folder cannot be written.
-    """
+def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> None:
+    """Write a scene, in place of an existing one; a SceneError if it cannot be written."""
     record = {
         **key,
         "style": scene.style,
@@ -173,7 +149,6 @@ def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> 
         _write_views(temporary / "targets", scene.targets, scene.target_images)
         write_ply(temporary / "scene.ply", scene.gaussians)
         (temporary / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return record
 
 
 @contextmanager
@@ -198,9 +173,7 @@ def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> Non
     frames = []
     for i, image in enumerate(images):
         name = f"images/view_{i:03d}.png"
-        ok, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
-        if not ok:
-            raise RuntimeError("the image library could not write a PNG")
+        _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
         (folder / name).write_bytes(data.tobytes())
         c2w = np.linalg.inv(cameras.viewmats[i].numpy()) @ FLIP
         frames.append({"file_path": name, "transform_matrix": c2w.tolist()})

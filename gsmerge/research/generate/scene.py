@@ -25,8 +25,8 @@ from gsmerge.research.generate.photograph import (
     trace,
 )
 from gsmerge.research.generate.shapes import Array
-from gsmerge.research.generate.stage import Palette
 from gsmerge.research.generate.styles import STYLES
+from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
 
@@ -70,7 +70,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         estimate = _perturb_pose(true_pose, noise, float(np.median(depth)), rng)
         rotated = (normals @ world[:3, :3].T).astype(np.float32)
         seen.append((TrueView(image, depth, rotated, estimate), int(rng.integers(2**63))))
-    parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, _rng(given[1])), seen)
+    parts = parallel_map(lambda given: pixel_gaussians(given[0], lens, noise, np.random.default_rng(given[1])), seen)
     return SyntheticScene(
         gaussians=Gaussians.concat(parts),
         cameras=_cameras([view.c2w for view, _ in seen], lens),
@@ -81,10 +81,6 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         path=path,
         noise=noise,
     )
-
-
-def _rng(seed: int) -> np.random.Generator:
-    return np.random.default_rng(int(seed))
 
 
 def _shrink(lens: Lens) -> Lens:
@@ -109,7 +105,7 @@ def _photo(
 ) -> tuple[Float, Array, Float]:
     """The photo from a pose, with the errors of lens, sensor and exposure, and exact depth and normals."""
     pose, seed = given
-    rng = _rng(seed)
+    rng = np.random.default_rng(seed)
     linear, _ = radiance(view, pose, lens, SAMPLES)
     gains = gain * np.exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5

@@ -13,6 +13,7 @@ from gsmerge.research.generate.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUA
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
+Pair: TypeAlias = tuple[float, float]
 NUM_WAVES = 4
 NO_WAVES = np.zeros((NUM_WAVES, 5))
 
@@ -24,7 +25,7 @@ class Material:
     texture: int  # index into the scene's textures
     repeat: float = 1.0  # repeats of the texture per world unit; 0: once over every face
     gloss: float = 0.0  # strength of highlights, 0 to 1
-    shift: tuple[float, float] = (0.0, 0.0)  # offset into the texture, repeats
+    shift: Pair = (0.0, 0.0)  # offset into the texture, repeats
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def box(low: Vector, high: Vector, material: Material) -> Shape:
     return Shape(BOX, (*half, 1.0), material, (a + b) / 2)
 
 
-def quad(centre: Vector, half: tuple[float, float], material: Material, rotation: Array = UPRIGHT) -> Shape:
+def quad(centre: Vector, half: Pair, material: Material, rotation: Array = UPRIGHT) -> Shape:
     """A rectangle."""
     return Shape(QUAD, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
@@ -87,7 +88,7 @@ def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
     return Shape(CONE, (radius, length / 2, radius, 1.0), material, (a + b) / 2, np.stack([x, y, np.cross(x, y)], 1))
 
 
-def leaf(centre: Vector, half: tuple[float, float], material: Material, rotation: Array) -> Shape:
+def leaf(centre: Vector, half: Pair, material: Material, rotation: Array) -> Shape:
     """A pointed leaf, its tips along local y."""
     return Shape(LEAF, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
@@ -100,21 +101,14 @@ def blob(centre: Vector, radii: Vector, material: Material, rng: np.random.Gener
 
 
 def sheet(
-    centre: Vector,
-    half: tuple[float, float],
-    material: Material,
-    rng: np.random.Generator,
-    height: float,
-    *,
-    length: float,
-    rotation: Array = LYING,
+    centre: Vector, half: Pair, material: Material, rng: np.random.Generator, height: float, *, length: float
 ) -> Shape:
-    """An uneven rectangle that with waves of about ``length`` and amplitude ``height``, shorter ones lower."""
+    """An uneven lying rectangle, with waves of about ``length`` and amplitude ``height``, shorter ones lower."""
     waves = np.zeros((NUM_WAVES, 5))
     for k in range(NUM_WAVES):
         angle, number = rng.uniform(0, 2 * np.pi), 2 * np.pi / length * 1.7**k
         waves[k] = number * np.cos(angle), number * np.sin(angle), 0, rng.uniform(0, 6.28), 0.5 * height / 1.9**k
-    return Shape(SHEET, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation, waves)
+    return Shape(SHEET, (*half, 0.0, 1.0), material, np.asarray(centre, float), LYING, waves)
 
 
 def place(

@@ -6,6 +6,7 @@ Every function of ``KINDS`` is ``(rng, size) -> [size,size,3]`` float32 sRGB in 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.research.generate.patterns import Grey, cells, courses, enlarge, glyphs, grid, noise, text_line, warp
+from gsmerge.research.generate.shapes import Material
 
 Picture: TypeAlias = NDArray[Any]  # float32
 Color: TypeAlias = NDArray[Any]
@@ -45,8 +47,8 @@ def mix(low: Color, high: Color, amount: Grey) -> Picture:
 
 def plain(rng: np.random.Generator, size: int) -> Picture:
     """Paint: almost no texture."""
-    low, high = shades(rng, color(rng, light=(0.35, 0.95), strength=(0, 0.5)), rng.uniform(0.01, 0.05))
-    return mix(low, high, noise(rng, size, first=2, fade=0.5))
+    base = color(rng, light=(0.35, 0.95), strength=(0, 0.5))
+    return mix(*shades(rng, base, rng.uniform(0.01, 0.05)), noise(rng, size, first=2, fade=0.5))
 
 
 def plaster(rng: np.random.Generator, size: int) -> Picture:
@@ -59,8 +61,7 @@ def plaster(rng: np.random.Generator, size: int) -> Picture:
 def granite(rng: np.random.Generator, size: int) -> Picture:
     """Speckles of three colours."""
     base = color(rng, strength=(0, 0.25))
-    low, high = shades(rng, base, 0.3)
-    out = mix(low, high, noise(rng, size, first=64, fade=0.9))
+    out = mix(*shades(rng, base, 0.3), noise(rng, size, first=64, fade=0.9))
     speck = noise(rng, size, first=128, fade=0.7)[..., None]
     dark, pale = (base + rng.uniform(0.2, 0.8) * (color(rng, light=v) - base) for v in ((0.05, 0.25), (0.75, 1)))
     return np.where(speck > 0.75, pale, np.where(speck < 0.22, dark, out)).astype(np.float32)
@@ -129,8 +130,8 @@ def cloth(rng: np.random.Generator, size: int) -> Picture:
 
 def carpet(rng: np.random.Generator, size: int) -> Picture:
     """Pile, or an ornament of a few colours."""
-    low, high = shades(rng, color(rng, strength=(0.1, 0.7), light=(0.2, 0.6)), 0.4)
-    out = mix(low, high, noise(rng, size, first=32, fade=0.95))
+    base = color(rng, strength=(0.1, 0.7), light=(0.2, 0.6))
+    out = mix(*shades(rng, base, 0.4), noise(rng, size, first=32, fade=0.95))
     if rng.random() < 0.5:
         motif = enlarge(np.pad(rng.uniform(0, 1, (4, 4)), ((0, 4), (0, 4)), mode="symmetric"), size)
         mask = np.mod(3 * motif, 1)[..., None] > 0.5
@@ -156,9 +157,8 @@ def grass(rng: np.random.Generator, size: int) -> Picture:
 
 def bark(rng: np.random.Generator, size: int) -> Picture:
     """Furrows along y."""
-    low, high = shades(rng, color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55)), 0.6)
-    furrows = noise(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T
-    return mix(low, high, furrows)
+    base = color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55))
+    return mix(*shades(rng, base, 0.6), noise(rng, size, first=32, fade=0.75, stretch=4, ridged=True).T)
 
 
 def foliage(rng: np.random.Generator, size: int) -> Picture:
@@ -179,11 +179,8 @@ def crown(rng: np.random.Generator, size: int) -> Picture:
     tone, edge = cells(rng, size, int(rng.integers(24, 56)))
     base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
-    clumps = noise(rng, size, first=4, fade=0.75)
-    return (
-        mix(low, high, np.clip(0.5 * tone + 0.6 * clumps - 0.1, 0, 1))
-        * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
-    )
+    leaves = np.clip(0.5 * tone + 0.6 * noise(rng, size, first=4, fade=0.75) - 0.1, 0, 1)
+    return mix(low, high, leaves) * (0.25 + 0.75 * np.clip(4 * edge, 0, 1))[..., None]
 
 
 def gradient(rng: np.random.Generator, size: int) -> Picture:
@@ -276,3 +273,31 @@ def pyramid(texture: Picture) -> list[Picture]:
         half = len(out[-1]) // 2
         out.append(cv2.resize(out[-1], (half, half), interpolation=cv2.INTER_AREA))
     return out
+
+
+MAX_TEXTURES = {"label": 8, "printed": 6, "plain": 6, "foliage": 4, "cloth": 4}  # in a scene; other kinds 3
+
+
+@dataclass
+class Palette:
+    """The textures of a scene, created on demand."""
+
+    rng: np.random.Generator
+    size: int  # side of the textures, pixels
+    textures: list[Picture] = field(default_factory=list)
+    by_kind: dict[str, list[int]] = field(default_factory=dict)  # their indices
+
+    def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
+        """A material of one of the kinds: with a new texture, or an old one if the scene has enough of the kind.
+
+        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` is at random if None, mostly none.
+        """
+        kind = kinds[self.rng.integers(len(kinds))]
+        known = self.by_kind.setdefault(kind, [])
+        if len(known) < MAX_TEXTURES.get(kind, 3):
+            known.append(len(self.textures))
+            self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))
+        texture = known[self.rng.integers(len(known))] if len(known) == MAX_TEXTURES.get(kind, 3) else known[-1]
+        shift = self.rng.uniform(0, 1, 2) if repeat else np.zeros(2)
+        gloss = max(0.0, float(self.rng.uniform(-0.5, 0.5))) if gloss is None else gloss
+        return Material(texture, repeat, gloss, (float(shift[0]), float(shift[1])))

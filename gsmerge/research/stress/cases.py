@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -95,19 +96,14 @@ def perturb_poses(given: StressScene, degrees: float) -> StressScene:
     means = scene.gaussians.means.double().clone().reshape(len(scene), -1, 3)
     viewmats = scene.cameras.viewmats.double().clone()
     for view in range(len(scene)):
-        turn = torch.from_numpy(_rotation(rng.normal(size=3), np.deg2rad(degrees)))
+        axis = rng.normal(size=3)
+        turn = torch.from_numpy(cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0])
         old = viewmats[view].clone()
         viewmats[view, :3] = turn @ old[:3]
         camera = means[view] @ old[:3, :3].T + old[:3, 3]
         means[view] = (camera - viewmats[view, :3, 3]) @ viewmats[view, :3, :3]
     gaussians = replace(scene.gaussians, means=means.reshape(-1, 3))
     return replace(given, scene=replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats)))
-
-
-def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
 def change_exposure(given: StressScene, share: float) -> StressScene:
@@ -130,15 +126,9 @@ def break_rows(given: StressScene) -> StressScene:
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
     if isinstance(scene, UnalignedScene):
         return replace(given, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
-    opacities = torch.where(chosen, torch.zeros(()), scene.gaussians.opacities)
-    return replace(
-        given,
-        scene=replace(
-            scene,
-            gaussians=replace(scene.gaussians, opacities=opacities),
-            valid=scene.valid & ~chosen.reshape(scene.valid.shape),
-        ),
-    )
+    gaussians = replace(scene.gaussians, opacities=torch.where(chosen, torch.zeros(()), scene.gaussians.opacities))
+    valid = scene.valid & ~chosen.reshape(scene.valid.shape)
+    return replace(given, scene=replace(scene, gaussians=gaussians, valid=valid))
 
 
 def throw_away(given: StressScene) -> StressScene:
@@ -166,25 +156,17 @@ def _choose(count: int, share: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Case:
-    """One bad condition.
+    """One bad condition."""
 
-    Args:
-        name: On the command line.
-        words: The change in words.
-        check: Which property must hold, see ``PROPERTIES``.
-        needs: "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file.
-        change: Returns the changed scene; None: the scene stays, the run differs.
-        threads: Threads of the run; None: as in the options.
-        convention: Pose convention to write, in the terms of camera files.
-    """
-
-    name: str
-    words: str
-    check: Check
+    name: str  # on the command line
+    words: str  # the change in words
+    check: Check  # which property must hold, see ``PROPERTIES``
+    # "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file
     needs: Needs = "anything"
+    # returns the changed scene; None: the scene stays, the run differs
     change: Callable[[StressScene], StressScene] | None = None
-    threads: int | None = None
-    convention: tuple[str, str] | None = None
+    threads: int | None = None  # threads of the run; None: as in the options
+    convention: tuple[str, str] | None = None  # pose convention to write, in the terms of camera files
 
 
 def _rewrite_poses(direction: str, axes: str) -> Case:

@@ -34,23 +34,14 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class StressOutcome:
-    """The outcome of one case.
+    """The outcome of one case."""
 
-    Args:
-        case: Its name.
-        change: How the scene was changed, in words.
-        expected: The property that must hold.
-        passed: Whether it does; None where the case does not apply to the scene.
-        measured: The figures, or why the case does not apply.
-        seconds: Wall time.
-    """
-
-    case: str
-    change: str
-    expected: str
-    passed: bool | None
-    measured: str
-    seconds: float
+    case: str  # its name
+    change: str  # how the scene was changed, in words
+    expected: str  # the property that must hold
+    passed: bool | None  # whether it does; None where the case does not apply to the scene
+    measured: str  # the figures, or why the case does not apply
+    seconds: float  # wall time
 
     def to_dict(self) -> dict[str, Any]:
         """The outcome under the keys of the report."""
@@ -66,10 +57,6 @@ class _Result:
     before: float
     after: float
 
-    @property
-    def count(self) -> int:
-        return len(self.gaussians)
-
 
 def stress(
     load: SceneLoad,
@@ -80,16 +67,11 @@ def stress(
     hints: ReadHints = AUTO,
     progress: Progress | None = None,
 ) -> tuple[StressOutcome, ...]:
-    """Compact a scene under bad conditions.
+    """Compact a scene under bad conditions: all ``CASES``, or those with some names.
 
-    Args:
-        load: The scene, with views.
-        options: Settings of every run.
-        targets: Held-out views that results are compared with; None: the input views with their photos, or with renders
-            of the input where there are none.
-        cases: Names of ``CASES``; None: all.
-        hints: Given when the scene was read.
-        progress: Called with (case, done, total).
+    Results are compared on held-out views (``targets``), or on the input views with their photos, or with renders of
+    the input where there are none. ``hints`` are those that the scene was read with; ``progress`` is called with (case,
+    done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -101,28 +83,22 @@ def stress(
     if len(load.scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
+    report = progress or (lambda *_: None)
     given = StressScene(load.scene, targets)
     base = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
-        if progress:
-            progress(case.words, i, len(names))
+        report(case.words, i, len(names))
         passed, measured = _check_case(case, load, given, base, options, hints)
         seconds = time.perf_counter() - start
         out.append(StressOutcome(name, case.words, _property_text(case, options), passed, measured, seconds))
-    if progress:
-        progress("done", len(names), len(names))
+    report("done", len(names), len(names))
     return tuple(out)
 
 
 def _check_case(
-    case: Case,
-    load: SceneLoad,
-    given: StressScene,
-    base: _Result | None,
-    options: CompactOptions,
-    hints: ReadHints,
+    case: Case, load: SceneLoad, given: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
 ) -> tuple[bool | None, str]:
     """Whether the case's property holds, and the figures."""
     problem = _inapplicable(case, load)
@@ -181,8 +157,9 @@ def _property_text(case: Case, options: CompactOptions) -> str:
 
 
 def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> tuple[bool, str]:
-    figures = f"{result.count:,} Gaussians, {result.after:.2f} dB"
-    both = f"{figures}; unchanged {base.count:,}, {base.after:.2f} dB"
+    count, former = len(result.gaussians), len(base.gaussians)
+    figures = f"{count:,} Gaussians, {result.after:.2f} dB"
+    both = f"{figures}; unchanged {former:,}, {base.after:.2f} dB"
     if case.check == "better":
         if math.isinf(result.before):
             return True, f"{figures} against renders of the input"
@@ -194,15 +171,15 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
         return result.after >= base.after - MAX_NEAR - slack, both
     near = result.after >= base.after - MAX_SAME - slack
     if case.check == "once":
-        return near and result.count <= ONCE_COUNT * base.count, both
-    return near and abs(result.count - base.count) <= max(1, SAME_COUNT * base.count), both
+        return near and count <= ONCE_COUNT * former, both
+    return near and abs(count - former) <= max(1, SAME_COUNT * former), both
 
 
 def _check_again(given: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:
     """The result as a scene of its own, compacted to as many Gaussians as it has."""
     scene = given.scene
     unaligned = UnalignedScene(base.gaussians, scene.cameras, scene.images, scene.names)
-    once = replace(options, budget=BudgetOptions(budget=base.count), decode=replace(options.decode, k=1))
+    once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
     after = _quality(given, compact(unaligned, once).gaussians)[1]
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
@@ -214,19 +191,15 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
     stored = from_viewmats(load.cameras.viewmats.numpy(), case.convention)
     wrong = replace(load.cameras, viewmats=torch.from_numpy(to_viewmats(stored, load.cameras.convention)))
     try:
-        ply = read_ply_with_hints(load.files.ply, opacity=_encoding(load), hints=hints)
+        opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
+        ply = read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints)
         read = align_scene(ply, load.files, wrong, hints=hints).scene
     except SceneError as error:
         return True, f"refused: {error.problem}"
     expected, viewmats = load.scene.cameras.viewmats.numpy(), read.cameras.viewmats.numpy()
-    same = expected.shape == viewmats.shape and np.allclose(
-        expected, viewmats, atol=1e-3 * (1 + np.abs(expected).max())
-    )
+    tolerance = 1e-3 * (1 + np.abs(expected).max())
+    same = expected.shape == viewmats.shape and np.allclose(expected, viewmats, atol=tolerance)
     return bool(same), "recognised" if same else "taken for something else"
-
-
-def _encoding(load: SceneLoad) -> OpacityChoice:
-    return "raw" if load.ply.opacity_encoding == "raw" else "logit"
 
 
 def _find_defect(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:

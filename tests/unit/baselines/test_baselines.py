@@ -22,7 +22,7 @@ from gsmerge.stages.segment import grid_labels
 COUNT = 200
 KEEPERS = ("unmerged", "unmerged-color", "unmerged-fit")
 PRUNERS = ("opacity", "contribution", "random")
-EXACT = (*PRUNERS, "paper", "blocks", "greedy")
+EXACT = (*PRUNERS, "moment-matching", "blocks", "greedy")
 OWN = sorted(set(BASELINES) - {"splat-transform"})  # which need no program
 
 
@@ -145,7 +145,7 @@ def test_only_its_stages_are_timed(scene: PixelScene) -> None:
     around = {"prepare", "score", "input"}
     assert set(made(scene, "unmerged").report.seconds) == around
     assert set(made(scene, "opacity").report.seconds) == around | {"reduce"}
-    assert set(made(scene, "paper").report.seconds) == around | {"segment", "encode", "decode"}
+    assert set(made(scene, "moment-matching").report.seconds) == around | {"segment", "encode", "decode"}
     assert set(made(scene, "unmerged-color").report.seconds) == around | {"fit"}
 
 
@@ -225,7 +225,7 @@ def test_blocks_are_about_equal() -> None:
 def test_one_gaussian_for_each_superpixel_has_their_mean_opacity() -> None:
     """The paper's rule: the spread of the means, the mean opacity."""
     flat = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.7, 0.7))
-    found = made(flat, "paper").gaussians
+    found = made(flat, "moment-matching").gaussians
     torch.testing.assert_close(found.opacities, torch.full((COUNT,), 0.7), atol=1e-4, rtol=0)
 
 

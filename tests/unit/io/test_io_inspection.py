@@ -12,8 +12,7 @@ from tiny_scene import Tiny
 from gsmerge import compact, read_scene
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
-from gsmerge.measure.extents import extents
-from gsmerge.measure.inspect import inspect
+from gsmerge.measure.inspect import extents, inspect
 from gsmerge.measure.inspection_lines import inspection_lines
 
 

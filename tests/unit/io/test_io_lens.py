@@ -14,8 +14,7 @@ from tiny_scene import Tiny, frames_of, write_colmap_binary, write_colmap_text, 
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
-from gsmerge.io.cameras import select_views
-from gsmerge.io.cameras.camera_file import fisheye, perspective
+from gsmerge.io.cameras.camera_file import make_lens, select_views
 from gsmerge.io.cameras.lens import undistort_photos
 from gsmerge.measure.inspect import inspect
 
@@ -53,7 +52,7 @@ def test_a_pinhole_s_pixel_shows_what_the_lens_puts_elsewhere(model: str, coeffi
     width, height = 200, 150
     y, x = np.mgrid[:height, :width].astype(np.float64)
     photo = np.stack([x, y, 0 * x], -1).astype(np.uint8)  # every pixel says where it is
-    lens = perspective("A", coefficients) if model == "perspective" else fisheye("B", coefficients)
+    lens = make_lens("A", model, coefficients)
     (straight,) = undistort_photos([photo], K[None], [lens])
     u, v = bent((x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], model, coefficients)
     expected = np.stack([u * K[0, 0] + K[0, 2] - 0.5, v * K[1, 1] + K[1, 2] - 0.5], -1)
@@ -62,8 +61,10 @@ def test_a_pinhole_s_pixel_shows_what_the_lens_puts_elsewhere(model: str, coeffi
 
 
 def test_zero_coefficients_are_a_pinhole_but_not_of_a_fisheye() -> None:
-    assert perspective("A", [0, 0.0, 0]) is None
-    assert fisheye("B", [0, 0]).coefficients == (0, 0)
+    assert make_lens("A", "perspective", [0, 0.0, 0]) is None
+    lens = make_lens("B", "fisheye", [0, 0])
+    assert lens is not None
+    assert lens.coefficients == (0, 0)
     photo = np.zeros((2, 3, 3), np.uint8)
     assert undistort_photos([photo], K[None], [None])[0] is photo
 

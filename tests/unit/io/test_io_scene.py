@@ -19,8 +19,9 @@ from tiny_scene import (
 )
 
 from gsmerge.errors import SceneError
-from gsmerge.io import find_scene_files, load_scene, read_photos, read_scene
-from gsmerge.io.cameras import read_cameras
+from gsmerge.io import find_scene_files, load_scene, read_scene
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.views import stored_photos
 from gsmerge.runtime.threads import use_threads
 
 
@@ -81,7 +82,7 @@ def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
     assert np.array_equal((read_scene(tmp_path).images.numpy() * 255).round(), tiny.images)
     files = find_scene_files(tmp_path)
     assert files.images is None
-    assert read_photos(files, read_cameras(files.cameras)) is not None
+    assert stored_photos(files, read_cameras(files.cameras)) is not None
 
 
 def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:

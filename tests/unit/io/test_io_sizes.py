@@ -15,9 +15,9 @@ from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, to_cameras
 from gsmerge.io.alignment.grid import grids_of_count, patch_grids
-from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, View, from_viewmats, make_camera_file
 from gsmerge.io.photos import PhotoTransform, resize_and_crop, resize_to
-from gsmerge.types import PixelScene
+from gsmerge.types import Cameras, PixelScene
 
 SMOOTH = smooth_scene(48, 36)
 
@@ -166,7 +166,7 @@ def test_mappings_move_a_point_and_its_photo_alike() -> None:
         y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
                 ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
         K = torch.tensor([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], dtype=torch.float64)
-        moved = mapping.intrinsics(K)[0]
+        (moved,) = mapping.cameras(Cameras(torch.eye(4)[None], K, 100, 60)).Ks
         assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
 
 
@@ -204,7 +204,7 @@ def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
 
 def test_short_intrinsics_in_pixels_stay() -> None:
     for K, size in (([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))):
-        read = make_camera_file("x", "x", W2C_OPENCV, [np.eye(4)], [np.array(K)], [size], ["a"])
+        read = make_camera_file("x", "x", W2C_OPENCV, [View("a", np.eye(4), np.array(K), size)])
         assert np.array_equal(read.Ks[0], np.array(K))
         assert (int(read.widths[0]), int(read.heights[0])) == size
 

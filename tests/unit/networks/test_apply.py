@@ -8,6 +8,7 @@ import pytest
 import torch
 from learned import SMALL, Made, made, noisy
 
+from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import (
     NetworkContext,
@@ -147,18 +148,24 @@ def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
     assert_close(alone, mixed_counts[before : before + 3], 2e-6)
 
 
-def test_many_children_and_the_backing_layer_stay_as_they_are(scene: Made) -> None:
+def test_many_children_are_corrected_in_halves(scene: Made) -> None:
+    """Six like three and three of groups of their own."""
     context = scene.networks(noisy())
     encoded = encode_features(scene.features, context)
     large = torch.nonzero(encoded.starts.diff() >= 30)[:, 0]
-    few, options = take(encoded, large), DecodeOptions(k=6, min_opacity=0)
-    children = decode(few, scene.members, options)
-    sizes = torch.bincount(torch.cdist(children.means, few.means).argmin(1))
-    assert int(sizes.max()) >= 5
-    many = np.full(len(few), 6)
-    parents = np.repeat(np.arange(len(few)), 6)
-    if len(children) == len(parents):
-        assert_close(decode(few, scene.members, options, many, networks=context), children)
+    few = take(encoded, large)
+    children, parents = divide(few, scene.members, np.full(len(few), 6))
+    assert np.bincount(parents).tolist() == [6] * len(few)
+    together = decode_gaussians(children, parents, few, context)
+    for half in (np.arange(len(parents)) % 6 < 3, np.arange(len(parents)) % 6 >= 3):
+        rows = torch.from_numpy(np.flatnonzero(half))
+        assert_close(together[rows], decode_gaussians(children[rows], parents[half], few, context))
+    assert not torch.equal(together.means, children.means)
+
+
+def test_the_backing_layer_stays_as_it_is(scene: Made) -> None:
+    context, options = scene.networks(noisy()), DecodeOptions(k=6, min_opacity=0)
+    encoded = encode_features(scene.features, context)
     behind = replace(scene.features, backing=torch.ones(len(encoded), dtype=torch.bool))
     encoded = encode_features(behind, context)
     assert torch.equal(encoded.means, behind.means)
@@ -282,7 +289,7 @@ def test_sizes_are_checked() -> None:
 
 
 def test_absolute_heads_know_no_children(scene: Made) -> None:
-    """Whatever the children are, what is decoded is the same; untrained, a round grey Gaussian at the group's place."""
+    """Whatever the children are, what is decoded is the same; untrained, a round Gaussian in the group's place."""
     absolute = replace(SMALL, outputs="absolute")
     plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.networks(Networks(absolute).requires_grad_(False))
     encoded = encode_features(scene.features, untrained)
@@ -292,9 +299,13 @@ def test_absolute_heads_know_no_children(scene: Made) -> None:
     torch.testing.assert_close(found.means, feature_to_gaussians(encoded).means[parents])
     assert torch.equal(found.scales, found.scales[:, :1].expand(-1, 3))
     assert torch.equal(found.opacities, torch.full((len(found),), 0.5))
-    assert not found.sh0.any()
-    assert match_geometry(encoded, untrained) is encoded
+    torch.testing.assert_close(found.sh0, encoded.sh0[parents])
     context = scene.networks(noisy(absolute))
+    ones = decode(encoded, scene.members, DecodeOptions(min_opacity=0.0), networks=context)
+    geometry, axes = match_geometry(encoded, context), quat_to_rotmat(ones.quats) * ones.scales[:, None]
+    torch.testing.assert_close(geometry.means, ones.means)
+    torch.testing.assert_close(geometry.covars, axes @ axes.transpose(1, 2), rtol=1e-4, atol=1e-9)
+    assert torch.equal(geometry.latents, encoded.latents)
     rows = np.repeat(np.arange(len(encoded)), 2)
     both = analytic[: 2 * len(encoded)] if len(analytic) >= 2 * len(encoded) else None
     for start in (feature_to_gaussians(encoded)[torch.from_numpy(rows)], both):

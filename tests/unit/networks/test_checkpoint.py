@@ -129,6 +129,5 @@ def test_what_ships_says_what_it_is() -> None:
     assert SHIPPED.stat().st_size < 8e6
     facts = checkpoint.facts()
     assert facts["checkpoint"] == "shipped"  # no path of the machine in a report
-    assert facts["training"]["figures"]["psnr_learned"] > facts["training"]["figures"]["psnr_analytic"] + 3
     assert {"options", "data", "validation", "step"} <= facts["training"].keys()
     assert "/" not in json.dumps(facts["training"])

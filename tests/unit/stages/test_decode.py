@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from gsmerge import Gaussians, PixelScene
 from gsmerge.geometry import covariances
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.decode import DecodeOptions, decode, mixed_counts, split_counts
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -78,6 +79,39 @@ def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k:
     np.testing.assert_allclose(found.opacities, 0.5, rtol=1e-3)
     if k > 1:
         assert (decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).abs().max() > 0.1
+
+
+def test_mixed_k_goes_by_the_saliency(features: FeatureGaussians, members: Members) -> None:
+    """Half of the groups one, a third two, the rest four: those whose pixels are the most salient."""
+    saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
+    options = DecodeOptions(k="mixed", k_low=50, k_high=80)
+    counts = mixed_counts(features, members, saliency, options)
+    ids, starts = features.members.numpy(), features.starts.numpy()
+    means = [saliency[ids[a:b]].mean() for a, b in pairwise(starts)]
+    ranks = np.argsort(np.argsort(means)) / (len(means) - 1) * 100
+    assert counts.tolist() == [1 if rank <= 50 else 2 if rank <= 80 else 4 for rank in ranks]
+    assert options.mean_k == pytest.approx(1.9)
+
+
+def test_mixed_k_by_distortion_has_as_many(features: FeatureGaussians, members: Members) -> None:
+    saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
+    by_saliency = mixed_counts(features, members, saliency, DecodeOptions(k="mixed"))
+    by_distortion = mixed_counts(features, members, saliency, DecodeOptions(k="mixed", k_rule="distortion"))
+    assert by_distortion.sum() == by_saliency.sum()
+    assert by_distortion.max() <= 4
+    np.testing.assert_array_equal(by_distortion, split_counts(features, members, (by_saliency - 1).sum(), 4))
+
+
+def test_mixed_k_of_the_backing_layer_is_one(features: FeatureGaussians, members: Members) -> None:
+    saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
+    behind = replace(features, backing=torch.ones(len(features), dtype=torch.bool))
+    assert (mixed_counts(behind, members, saliency, DecodeOptions(k="mixed")) == 1).all()
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1, 50), (101, 101), (60, 50), (50, 101), (float("nan"), 50)])
+def test_percentiles_out_of_range_are_refused(low: float, high: float) -> None:
+    with pytest.raises(ValueError, match=r"k_low|k_high: expected"):
+        DecodeOptions(k="mixed", k_low=low, k_high=high)
 
 
 def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -> None:
@@ -151,5 +185,5 @@ def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
 
 @pytest.mark.parametrize("k", [0, -1, 9])
 def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
-    with pytest.raises(ValueError, match=f"k: expected 1 to 8, got {k}"):
+    with pytest.raises(ValueError, match=f"k: expected 1 to 8 or mixed, got {k}"):
         decode(features, members, DecodeOptions(k=k))

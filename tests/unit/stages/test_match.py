@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import make_features
 
-from gsmerge.stages.match import MatchOptions, match
+from gsmerge.stages.match import MatchOptions, match, nearest_of_other_views
 from gsmerge.types import FeatureGaussians
 
 METHODS = ["overlap", "aabb"]
@@ -54,8 +54,40 @@ def test_threshold_is_the_bhattacharyya_coefficient() -> None:
 def test_threshold_is_the_box_overlap() -> None:
     """Boxes of 2 x 2 x 2, half a side apart: 4 shared of 12."""
     pair = make_features([[0, 0, 0], [0.01, 0, 0]])
-    assert len(sets(pair, match="aabb", overlap=1 / 3 - 1e-3)) == 1
-    assert len(sets(pair, match="aabb", overlap=1 / 3 + 1e-3)) == 2
+    assert len(sets(pair, match="aabb", iou=1 / 3 - 1e-3)) == 1
+    assert len(sets(pair, match="aabb", iou=1 / 3 + 1e-3)) == 2
+
+
+def test_threshold_is_the_cosine_of_the_latents() -> None:
+    """With latents these decide in place of the colours, for boxes alone."""
+    colors = np.array([[0.2, 0.2, 0.2], [0.9, 0.9, 0.9]])
+    pair = replace(make_features(np.zeros((2, 3)), colors=colors), latents=torch.tensor([[3.0, 0.0], [0.4, 0.3]]))
+    assert len(sets(pair, match="aabb", similarity=0.8 - 1e-3)) == 1
+    assert len(sets(pair, match="aabb", similarity=0.8 + 1e-3)) == 2
+    assert len(sets(pair, match="overlap", similarity=-1)) == 2
+    assert len(sets(replace(pair, latents=torch.zeros(2, 2)), match="aabb", similarity=0.1)) == 2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_crowd_of_the_own_view_hides_nobody(method: str) -> None:
+    """Sixteen neighbours of the own view lie nearer than the twin of the other."""
+    crowd = np.random.default_rng(0).normal(size=(40, 3)) * 1e-5
+    features = make_features(np.concatenate([crowd, [[0, 0, 1e-3]]]), views=[0] * 40 + [1])
+    assert max(map(len, sets(features, match=method))) == (2 if method == "overlap" else 41)
+
+
+@pytest.mark.parametrize("views", [1, 2, 5])
+@pytest.mark.parametrize("num", [1, 3, 40, 200])
+def test_neighbours_of_other_views(num: int, views: int) -> None:
+    """As a search through all of them."""
+    generator = np.random.default_rng(num)
+    means, owners, count = generator.normal(size=(num, 3)), generator.integers(-1, views, num), 4
+    neighbors = nearest_of_other_views(means, owners, count)
+    assert neighbors.shape == (num, count)
+    for i, row in enumerate(neighbors):
+        near = np.argsort(np.linalg.norm(means - means[i], axis=1))[: 16 * count]
+        others = [j for j in near if j != i and (owners[i] < 0 or owners[j] != owners[i])][:count]
+        assert row.tolist() == others + [-1] * (count - len(others))
 
 
 def test_none_leaves_everything_alone() -> None:
@@ -117,6 +149,12 @@ def test_far_twins_are_found_among_many(method: str) -> None:
     means = rng.uniform(0, 10, (300, 3))
     features = make_features(np.concatenate([means, means[::-1]]), views=[0] * 300 + [1] * 300)
     assert sets(features, match=method) == {frozenset([i, 599 - i]) for i in range(300)}
+
+
+@pytest.mark.parametrize("setting", [{"iou": 1.1}, {"similarity": -1.1}, {"overlap": float("nan")}])
+def test_thresholds_out_of_range_are_refused(setting: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(setting))}: expected"):
+        MatchOptions(**setting)  # type: ignore[arg-type]
 
 
 def test_unknown_method_is_refused() -> None:

@@ -16,24 +16,15 @@ INSTALL_HINT = 'pip install "gsmerge[chart]"'
 
 
 def require_matplotlib() -> None:
-    """Say how to install matplotlib where it is missing.
-
-    Raises:
-        GsmergeError: If it is.
-    """
+    """Raise a GsmergeError that says how to install matplotlib where it is missing."""
     if find_spec("matplotlib") is None:
         raise GsmergeError(f"charts need matplotlib, which is not installed: {INSTALL_HINT}")
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, str]:
-    """Draw figures into a folder, each as ``NAME.png`` and ``NAME.svg``; the same numbers give the same bytes.
+    """Draw figures into a folder, each as ``NAME.png`` and ``NAME.svg``, and return the SVG of each by name.
 
-    Returns:
-        The SVG of each by name.
-
-    Raises:
-        GsmergeError: If matplotlib is not installed.
-        SceneError: If a file cannot be written.
+    The same numbers give the same bytes.
     """
     require_matplotlib()
     from gsmerge.io import atomic_output

@@ -147,8 +147,7 @@ def _add_key(fig: MplFigure, entries: Sequence[tuple[str, LineStyle]]) -> None:
 
 def _draw_curves(figure: figures.Curves, styles: Styles) -> MplFigure:
     fig, all_axes = _subplots(len(figure.panels))
-    key: dict[str, LineStyle] = {}
-    references: dict[str, LineStyle] = {}
+    key, references = dict[str, LineStyle](), dict[str, LineStyle]()
     for axes, panel in zip(all_axes, figure.panels, strict=True):
         _set_axes(axes, figure, panel)
         for line in panel.lines:
@@ -156,7 +155,7 @@ def _draw_curves(figure: figures.Curves, styles: Styles) -> MplFigure:
             key[line.name] = styles[line.name]
         if panel.reference is not None:
             name, level = panel.reference
-            style = references[name] = REFERENCE_STYLE
+            references[name] = style = REFERENCE_STYLE
             axes.axhline(level, color=style.color, linewidth=style.width, linestyle=style.dash, zorder=style.order)
         if figure.front:
             _mark_front(axes, panel)
@@ -182,10 +181,8 @@ def _set_axes(axes: Axes, figure: figures.Curves, panel: figures.Panel) -> None:
         room = MARGIN * (max(ys) - min(ys) or 1)
         axes.set_ylim(min(ys) - room, max(ys) + room)
         axes.yaxis.set_major_locator(MaxNLocator(6))
-    axes.set_xlabel(figure.x_label)
     arrow = "" if figure.y_scale == "log" else " ↑" if panel.higher else " ↓"
-    axes.set_ylabel(panel.y_label + arrow)
-    axes.set_axisbelow(True)
+    axes.set(xlabel=figure.x_label, ylabel=panel.y_label + arrow, axisbelow=True)
 
 
 def _draw_line(axes: Axes, line: Line, style: LineStyle) -> None:
@@ -230,8 +227,7 @@ def format_tick(value: float) -> str:
 
 def _log_axis(axes: Axes, which: str, low: float, high: float, *, percent: bool = False) -> None:
     """A logarithmic axis from low to high with round ticks."""
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    (axes.set_xlim if which == "x" else axes.set_ylim)(low, high)
+    axes.set(**{f"{which}scale": "log", f"{which}lim": (low, high)})
     axis = axes.xaxis if which == "x" else axes.yaxis
     factor = 100 if percent else 1
     axis.set_major_locator(FixedLocator([t / factor for t in log_ticks(low * factor, high * factor)]))
@@ -246,20 +242,16 @@ def _draw_bars(figure: figures.Bars) -> MplFigure:
     left = np.zeros(rows)
     for i, (stage, seconds) in enumerate(figure.stages.items()):
         color = "#bbbbbb" if stage == "other" else STAGE_COLORS[i % len(STAGE_COLORS)]
-        axes.barh(
-            range(rows), seconds, left=left, height=0.62, color=color, edgecolor="white", linewidth=0.6, label=stage
-        )
+        axes.barh(range(rows), seconds, 0.62, left, color=color, edgecolor="white", linewidth=0.6, label=stage)
         left += np.array(seconds)
     for row, total in enumerate(left):
         axes.text(total + 0.012 * left.max(), row, _format_seconds(float(total)), va="center")
     axes.set_yticks(range(rows), figure.rows)
     axes.set_ylim(rows - 0.5, -0.5)
-    axes.set_xlim(0, 1.12 * left.max())
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
-    axes.set_xlabel("Seconds")
-    axes.set_axisbelow(True)
+    axes.set(xlim=(0, 1.12 * left.max()), xlabel="Seconds", axisbelow=True)
     fig.legend(
         loc="outside upper center", ncols=min(len(figure.stages), 7), frameon=False, fontsize=7, handlelength=0.9,
         handleheight=0.9, columnspacing=1.0, handletextpad=0.4,
@@ -290,7 +282,6 @@ def _draw_break_even(figure: figures.BreakEven, styles: Styles) -> MplFigure:
         key.append((name + when, LineStyle(style.color, style.dash, "", style.width, style.order)))
     _log_axis(axes, "x", first, last)
     _log_axis(axes, "y", float(np.min(totals)) / 1.3, float(np.max(totals)) * 1.3)
-    axes.set_xlabel("Frames rendered")
-    axes.set_ylabel("Seconds, merge included")
+    axes.set(xlabel="Frames rendered", ylabel="Seconds, merge included")
     _add_key(fig, key)
     return fig

@@ -17,7 +17,7 @@ from gsmerge.research.charts.proxies import (
     proxy_psnr,
     read_proxies,
 )
-from gsmerge.research.charts.run import estimate_seconds
+from gsmerge.research.charts.run import RunOptions, estimate_seconds
 from gsmerge.research.charts.scenes import SceneSource, find_scenes, scene_names
 
 
@@ -90,7 +90,7 @@ def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
 def estimate(place: SceneSource, **options: object) -> float:
     method = str(options.pop("method", "gsmerge"))
     experiment = Experiment(place.path, method, options.pop("settings", {}), options.pop("views", None))  # type: ignore[arg-type]
-    return estimate_seconds([("key", experiment, place)], {}, threads=2, **options)  # type: ignore[arg-type]
+    return estimate_seconds([("key", experiment, place)], {}, RunOptions(threads=2, **options))  # type: ignore[arg-type]
 
 
 def test_estimates_grow_with_the_work(made_scene: Path) -> None:

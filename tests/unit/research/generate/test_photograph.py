@@ -10,6 +10,8 @@ import pytest
 from gsmerge.research.generate.paths import PATHS, is_usable, look_at
 from gsmerge.research.generate.photograph import (
     Lens,
+    Light,
+    Stage,
     develop,
     find_exposure,
     light_stage,
@@ -18,9 +20,8 @@ from gsmerge.research.generate.photograph import (
     trace,
 )
 from gsmerge.research.generate.shapes import LYING, Material, Shape, ball, box, column, pack, place, quad, rod, sheet
-from gsmerge.research.generate.stage import Light, Palette, Stage
 from gsmerge.research.generate.styles import STYLES
-from gsmerge.research.generate.textures import KINDS
+from gsmerge.research.generate.textures import KINDS, Palette
 
 LOOK = Material(0)
 LENS = Lens(40, 30, 40.0)

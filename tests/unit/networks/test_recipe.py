@@ -1,0 +1,95 @@
+"""``recipe="paper"``: the paper's own chain under one name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import scenes
+import torch
+
+from gsmerge import PixelScene
+from gsmerge.errors import UsageError
+from gsmerge.networks import NetworkOptions, Networks, save_checkpoint
+from gsmerge.options import CompactOptions
+
+SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
+
+
+@pytest.fixture(scope="module")
+def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Networks that moved away from their start at random."""
+    torch.manual_seed(0)
+    networks = Networks(SMALL)
+    for parameter in networks.parameters():
+        parameter.data += 0.05 * torch.randn_like(parameter)
+    path = tmp_path_factory.mktemp("networks") / "absolute.safetensors"
+    save_checkpoint(path, networks, {})
+    return path
+
+
+def test_recipe_is_its_settings(scene: PixelScene, absolute: Path) -> None:
+    found = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute))
+    settings = {"segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "robust": False, "fit": "none"}
+    wanted = scenes.compacted(scene, **settings, checkpoint=str(absolute))
+    assert torch.equal(found.gaussians.means, wanted.gaussians.means)
+    assert found.report.options["recipe"] == "paper"
+    assert found.report.choices["networks"]["options"]["outputs"] == "absolute"
+    assert {"encode", "match", "refine", "decode"} <= set(found.report.seconds)
+    assert found.report.options["fit"] == "none"
+
+
+def test_what_is_set_besides_goes_before() -> None:
+    options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": "a.safetensors", "match": "none"})
+    assert options.match.match == "none"
+    assert options.segment.segmentation == "bass-st"
+    assert options.with_settings({"k": 2}).match.match == "none"
+
+
+def test_decoded_geometry_decides_what_is_merged(scene: PixelScene, absolute: Path) -> None:
+    """Also with absolute outputs, whose heads do not read the moments."""
+    counts = {
+        geometry: scenes.compacted(
+            scene, recipe="paper", checkpoint=str(absolute), geometry=geometry, similarity=-1.0
+        ).report.choices["clusters"]
+        for geometry in ("analytic", "decoded")
+    }
+    assert counts["analytic"] != counts["decoded"]
+
+
+@pytest.mark.parametrize("checkpoint", ["auto", "shipped", "none"])
+def test_it_needs_a_file(checkpoint: str) -> None:
+    with pytest.raises(ValueError, match="recipe paper: expected a checkpoint with absolute outputs"):
+        CompactOptions().with_settings({"recipe": "paper", "checkpoint": checkpoint})
+
+
+def test_other_networks_are_refused(scene: PixelScene, tmp_path: Path) -> None:
+    path = tmp_path / "residual.safetensors"
+    save_checkpoint(path, Networks(replace(SMALL, outputs="residual")), {})
+    with pytest.raises(UsageError, match=r"expected networks with absolute outputs, .* has residual ones"):
+        scenes.compacted(scene, recipe="paper", checkpoint=str(path))
+
+
+def test_more_children_than_a_head_has_are_refused(scene: PixelScene, absolute: Path) -> None:
+    with pytest.raises(UsageError, match=r"k: expected at most 4 with the absolute outputs of .*, got 5"):
+        scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
+
+
+@pytest.mark.parametrize("rule", ["saliency", "distortion"])
+@pytest.mark.parametrize("settings", [{"fit": "none"}, {"fit_steps": 12}], ids=str)
+def test_mixed_k_lies_between_one_and_two(scene: PixelScene, settings: dict, rule: str) -> None:
+    one, mixed, two = (
+        len(scenes.compacted(scene, k=k, k_rule=rule, checkpoint="none", **settings).gaussians) for k in (1, "mixed", 2)
+    )
+    assert one < mixed < two
+
+
+def test_unknown_recipe_is_refused() -> None:
+    with pytest.raises(ValueError, match="recipe: expected paper, got 'soup'"):
+        CompactOptions().with_settings({"recipe": "soup"})
