@@ -37,8 +37,9 @@ class TrainOptions:
         segmentation: Superpixel method.
         match: Merging across views, see :class:`gsmerge.stages.match.MatchOptions`. Where no fit is used, what the
             networks make of a window is matched in every step.
-        overlap: Least overlap of a match, 0 to 1.
+        overlap: Least overlap of a match by ``"overlap"``, 0 to 1.
         iou: Least intersection over union of the boxes of a match by ``"aabb"``, 0 to 1.
+        similarity: Least cosine of the latents of a match by ``"aabb"``, -1 to 1.
         geometry: What is matched in every step: ``"analytic"``: the moments, ``"decoded"``: the K = 1 head's output.
         fit_steps: Steps of the full fit whose result is the target; fitted only where a loss uses it:
             ``regression_weight`` or ``photo_start`` above 0.
@@ -93,6 +94,7 @@ class TrainOptions:
     match: str = "overlap"
     overlap: float = 0.7
     iou: float = 0.2
+    similarity: float = 0.8
     geometry: str = "analytic"
     fit_steps: int = 300
     levels: tuple[int, ...] = SLOTS
@@ -163,6 +165,7 @@ class TrainOptions:
         SegmentOptions(segmentation=self.segmentation)
         for name in ("overlap", "iou"):
             self._expect(name, getattr(self, name), 0, 1)
+        self._expect("similarity", self.similarity, -1, 1)
         self.match_options()
 
     def _check_views(self) -> None:
@@ -196,8 +199,8 @@ class TrainOptions:
 
     def match_options(self) -> MatchOptions:
         """How Feature Gaussians are matched across views."""
-        overlap = self.iou if self.match == "aabb" else self.overlap
-        return MatchOptions(self.match, overlap=overlap, geometry=self.geometry)  # type: ignore[arg-type]
+        names = ("match", "overlap", "iou", "similarity", "geometry")
+        return MatchOptions(**{name: getattr(self, name) for name in names})
 
     def photo_level(self, width: int, height: int) -> float:
         """Factor by which the sides of photos of ``width`` by ``height`` pixels are divided."""
