@@ -1,12 +1,29 @@
-"""Networks and runs that take a second."""
+"""Networks, examples and runs that take a second."""
 
 from __future__ import annotations
 
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
 from gsmerge.networks import NetworkOptions
-from gsmerge.research.training import TrainOptions
+from gsmerge.research.training import Example, Shard, TrainOptions, write_shard
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 OPTIONS = TrainOptions(
     network=TINY, densities=(0.1,), fit_steps=12, levels=(1, 2), steps=12, warmup=2, rate=3e-3, crop=60, save_every=4,
     validation_crops=2, photo_start=0.3,
 )  # fmt: skip
+# As the paper's, in small: absolute heads, random views, boxes, no fit.
+PAPER = replace(
+    OPTIONS, network=replace(TINY, outputs="absolute"), random_views=(1, 12), match="aabb",
+    geometry="decoded", photo_start=0.0, photo_loss="mse", photo_weight=1.0, ssim_weight=0.05, regression_weight=0.0,
+    teacher_weight=0.25, diversity_weight=1.0, window=16, validation_windows=1,
+)  # fmt: skip
+
+
+def written(example: Example, folder: Path) -> Shard:
+    """The example as a shard, in a file that is named after it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{hashlib.sha256(example.images.tobytes()).hexdigest()[:8]}-{len(example.features)}.safetensors"
+    return Shard(path, example.name, write_shard(path, example))

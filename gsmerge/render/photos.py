@@ -79,7 +79,7 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
     return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
 
 
-def scene_photos(scene: PixelScene | UnalignedScene, level: int = 1) -> Photos:
+def scene_photos(scene: PixelScene | UnalignedScene, level: float = 1) -> Photos:
     """The scene's photos, each side divided by ``level`` (area averages).
 
     Raises:
@@ -90,7 +90,7 @@ def scene_photos(scene: PixelScene | UnalignedScene, level: int = 1) -> Photos:
     return photos_of(scene.images.numpy(), scene.cameras, level)
 
 
-def photos_of(images: np.ndarray, cameras: Cameras, level: int = 1) -> Photos:
+def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
     """Photos ``[v,h,w,3]`` of the cameras' size, each side divided by ``level`` (area averages)."""
     blank = blank_photos(cameras, level)
     if level == 1:
@@ -100,7 +100,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: int = 1) -> Photos:
     return replace(blank, images=small)
 
 
-def blank_photos(cameras: Cameras, level: int = 1) -> Photos:
+def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
     """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     w, h = cameras.width, cameras.height

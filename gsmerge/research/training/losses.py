@@ -1,13 +1,14 @@
-"""The losses: corrections compared with those of the fit, renders compared with photos, and regularizers.
+"""The losses: renders compared with photos, corrections compared with those of the fit, and regularizers.
 
 A window of a photo is rendered from all Feature Gaussians that reach into it, each run through all networks (paper
-section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. Regularizers keep
-early training near the analytic result, which is the paper's teacher, and siblings apart.
+section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. Regularizers hold
+early training near the moments of the groups, which are the paper's teacher, and siblings apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from itertools import permutations, product
 
 import numpy as np
 import torch
@@ -15,48 +16,44 @@ from torch import Tensor
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.measure.lpips import lpips_loss
+from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks import Networks
-from gsmerge.networks.residuals import RESIDUAL, ROTATION, residual_limits
+from gsmerge.networks.residuals import RESIDUAL, ROTATION, gaussian_sizes, residual_limits
 from gsmerge.render.autograd import render_differentiable
 from gsmerge.render.photos import NEAR
-from gsmerge.research.training.examples import Example
 from gsmerge.research.training.options import TrainOptions
-from gsmerge.research.training.predict import Crop, predict, predict_corrections
-from gsmerge.research.training.windows import Window
+from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, predict
+from gsmerge.research.training.targets import Targets
+from gsmerge.research.training.windows import Crop, Window
 from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.types import Gaussians
 
 MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
 
 
-def target_scales(examples: Sequence[Example]) -> dict[int, Tensor]:
+def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
     """``[13]`` standard deviation of every column of the targets of each K, at least a thousandth."""
-    scales = {}
-    for k in examples[0].levels:
-        levels = [example.levels[k] for example in examples]
-        targets = torch.cat([level.targets[level.mask] for level in levels])
-        scales[k] = targets.std(0, correction=0).clamp_min(1e-3)
-    return scales
+    sums: dict[int, Tensor] = {}
+    for levels in every:
+        for k, targets in levels.items():
+            values = targets.corrections[targets.mask].double()
+            part = torch.stack([torch.full((RESIDUAL,), len(values)), values.sum(0), values.square().sum(0)])
+            sums[k] = sums.get(k, 0) + part
+    variances = {k: squares / count - (total / count).square() for k, (count, total, squares) in sums.items()}
+    return {k: variance.clamp_min(0).sqrt().clamp_min(1e-3).float() for k, variance in variances.items()}
 
 
 def scaled_corrections(
-    crop: Crop, networks: Networks, scales: Mapping[int, Tensor], options: TrainOptions, seed: int
+    crop: Crop, corrections: Tensor, scales: Mapping[int, Tensor], options: TrainOptions
 ) -> tuple[Tensor, Tensor]:
     """``[j,13]`` corrections and targets of the scored children, in standard deviations of the targets.
 
     Targets are clamped to the bounds of the networks, and to a few standard deviations.
     """
-    return _scaled(crop, predict_corrections(crop, networks, seed), scales, options)
-
-
-def _scaled(
-    crop: Crop, corrections: Tensor, scales: Mapping[int, Tensor], options: TrainOptions
-) -> tuple[Tensor, Tensor]:
-    """:func:`scaled_corrections` of corrections ``[n,13]`` that are known."""
-    targets = crop.example.levels[crop.k].targets[crop.children[crop.scored]]
+    targets, scored = crop_targets(crop)
     limits = 2 * residual_limits(options.network.bounds)  # of all stages together
-    clamped = targets.clamp(-limits, limits) / scales[crop.k]
-    return corrections[crop.scored] / scales[crop.k], clamped.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+    clamped = targets[scored].clamp(-limits, limits) / scales[crop.k]
+    return corrections[scored] / scales[crop.k], clamped.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 
 
 def correction_loss(corrections: Tensor, targets: Tensor, options: TrainOptions) -> Tensor:
@@ -80,18 +77,17 @@ def window_loss(
     ``scales`` are the standard deviations of the targets of each K, see :func:`target_scales`.
     """
     crop = window.crop
-    prediction = predict(crop, networks, step)
+    prediction = predict(crop, networks, options, step)
     image = draw_window(prediction.gaussians, window, rng.random(3, dtype=np.float32))
     loss = photometric_loss(image, window, options)
     regression, teacher, diversity = options.regularizer_weights(step)
     if regression:
-        loss = loss + regression * correction_loss(*_scaled(crop, prediction.corrections, scales, options), options)
+        scaled = scaled_corrections(crop, prediction.corrections, scales, options)
+        loss = loss + regression * correction_loss(*scaled, options)
     if teacher:
-        loss = loss + teacher * teacher_loss(prediction.corrections)
+        loss = loss + teacher * teacher_loss(prediction, crop.example.members)
     if diversity and crop.k > 1:
-        loss = loss + diversity * diversity_loss(
-            prediction.gaussians, crop.example.levels[crop.k].parents[crop.children]
-        )
+        loss = loss + diversity * diversity_loss(prediction.gaussians, prediction.parents, crop.example.unit)
     return loss
 
 
@@ -122,61 +118,87 @@ def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
 
 def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Tensor:
     """Weighted sum of the difference of colours, 1 - SSIM and, if it has a weight, LPIPS (VGG)."""
-    example = window.crop.example
-    photo, mask = window.part(example.photos.images), window.part(example.masks)
+    photo, mask = window.image, window.mask
     color = color_loss(image, photo, mask, options.photo_loss)
     similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
     loss = options.photo_weight * color + options.ssim_weight * (1 - similar)
     return loss + options.lpips_weight * lpips_loss(image, photo, mask) if options.lpips_weight else loss
 
 
-def render_window(window: Window, networks: Networks | None) -> Tensor:
-    """``[h,w,3]`` render of a window on black within [0, 1]; None: of the analytic stages alone."""
-    crop = window.crop
+def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:
+    """``[h,w,3]`` render of a window on black within [0, 1], and the share of Feature Gaussians that were merged.
+
+    Without networks of the analytic stages alone, and the share is 0.
+    """
     with torch.no_grad():
         if networks is None:
-            gaussians = crop.example.levels[crop.k].children[crop.children]
+            gaussians, matched = analytic_gaussians(window.crop, options), 0.0
         else:
-            gaussians = predict(crop, networks, 0).gaussians
-        return draw_window(gaussians, window, np.zeros(3, np.float32)).clamp(0, 1)
+            prediction = predict(window.crop, networks, options, 0)
+            gaussians, matched = prediction.gaussians, prediction.matched
+        return draw_window(gaussians, window, np.zeros(3, np.float32)).clamp(0, 1), matched
 
 
-def window_psnr(window: Window, networks: Networks | None) -> float:
-    """PSNR (dB) of :func:`render_window` within the mask."""
-    example = window.crop.example
-    photo, mask = window.part(example.photos.images), window.part(example.masks)
-    error = float(color_loss(render_window(window, networks), photo, mask, "mse"))
+def window_psnr(window: Window, image: Tensor) -> float:
+    """PSNR (dB) of a render ``[h,w,3]`` of a window within the mask."""
+    error = float(color_loss(image, window.image, window.mask, "mse"))
     return min(MAX_DB, -10 * float(np.log10(max(error, 1e-12))))
+
+
+def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
+    """Distance of Gaussians from the moments of the groups that they stand for (paper section 4.6).
+
+    The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
+    teacher_mean, teacher_cov). The loss is the angle between the rotations, and the L1 distance of the means, in
+    sizes of the teacher, and of the logarithms of the scales. A Gaussian has 24 equal pairs of rotation and scales;
+    the one nearest to the prediction counts.
+    """
+    g, merged = prediction.gaussians, prediction.merged
+    if len(g) == 0:
+        return g.means.new_zeros(())
+    moments = pool_members(members, merged.starts.numpy(), merged.members.numpy(), "paper")
+    scales, quats = (torch.from_numpy(axes).float()[prediction.parents] for axes in principal_axes(moments.covars))
+    scales, turns = _nearest_axes(scales, quats, g.quats)
+    sizes = gaussian_sizes(scales)
+    means = torch.from_numpy(moments.means).float()[prediction.parents]
+    distances = (g.means - means).abs() / sizes[:, None]
+    return turns.mean() + distances.mean() + (torch.log(g.scales) - torch.log(scales)).abs().mean()
+
+
+def _nearest_axes(scales: Tensor, quats: Tensor, predicted: Tensor) -> tuple[Tensor, Tensor]:
+    """Scales ``[n,3]`` in the order of axes that is nearest to predicted rotations ``[n,4]``; the angles ``[n]``."""
+    signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
+    orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
+    proper = (signed[:, None] @ orders).reshape(-1, 3, 3)
+    proper = proper[torch.linalg.det(proper) > 0]  # [24,3,3]
+    between = quat_to_rotmat(predicted).transpose(1, 2) @ quat_to_rotmat(quats)
+    best = torch.einsum("nij,pji->np", between.detach(), proper).argmax(1)
+    chosen = proper[best]
+    turn = between @ chosen
+    skew = torch.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+    cosine = (turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    sine = (skew.square().sum(1) / 4 + 1e-12).sqrt()  # has a gradient at no angle too
+    return (scales[:, None] @ chosen.abs())[:, 0], torch.atan2(sine, cosine)
 
 
 GOAL = 0.5  # overlap of the boxes of two children that has no loss
 GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
 
 
-def teacher_loss(corrections: Tensor) -> Tensor:
-    """Size of corrections ``[n,13]``: the angle of the rotation, and L1 of everything else.
+def diversity_loss(gaussians: Gaussians, parents: Tensor, unit: float) -> Tensor:
+    """Pairs of siblings that overlap too much or too little, or differ in opacity (paper supplement D).
 
-    The analytic ones are the moment-matched teacher of the paper; corrections are the difference to it, in sizes of
-    the Gaussian, logarithms and logits. The length of a rotation vector is the geodesic distance of the quaternions.
-    """
-    if len(corrections) == 0:
-        return corrections.new_zeros(())
-    rest = torch.cat([corrections[:, : ROTATION.start], corrections[:, ROTATION.stop :]], 1)
-    return corrections[:, ROTATION].norm(dim=1).mean() + rest.abs().mean()
-
-
-def diversity_loss(gaussians: Gaussians, parents: Tensor) -> Tensor:
-    """Pairs of siblings (``parents [n]``) that overlap too much or too little, or differ in opacity (paper supplement).
-
-    Pairs are weighted by their volumes, divided by their mean over all pairs and without gradient: otherwise the loss
-    would depend on the scale of the world, and shrinking would be the easiest way to lower it.
+    Args:
+        gaussians: n children.
+        parents: ``[n]`` the parent of each, ascending.
+        unit: The scene's unit of length; pairs are weighted by their volumes in it, so that the loss does not depend
+            on the scale of the world.
     """
     one, other = sibling_pairs(parents)
     if len(one) == 0:
         return gaussians.means.new_zeros(())
-    volumes = gaussians.scales.detach().prod(1)
-    weights = (volumes[one] * volumes[other]).sqrt()
-    weights = weights / weights.mean().clamp_min(1e-30)
+    volumes = (gaussians.scales / unit).prod(1)
+    weights = (volumes[one] * volumes[other]).clamp_min(1e-30).sqrt()
     profile = overlap_profile(gaussians, one, other)
     opacity = (gaussians.opacities[one] - gaussians.opacities[other]).square()
     return (weights * (GEOMETRY * profile + OPACITY * opacity)).mean()

@@ -11,24 +11,42 @@ from typing import Any
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_table
+from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks import NetworkOptions
 from gsmerge.networks.modules import SLOTS
 from gsmerge.stages.fit.loss import LOSS_WINDOW
+from gsmerge.stages.match import MatchOptions
+from gsmerge.stages.segment import SegmentOptions
+
+LISTS = ("levels", "densities", "views", "random_views")
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How networks are trained to predict what the fit changes.
+    """What networks are trained on, and how.
 
     Args:
         network: Sizes of the networks.
         views: Numbers of views, evenly spread; 0 means all. A scene gives an example for each. The photos of the
             other views are novel views.
+        random_views: Least and most views of a subset that is drawn anew for every window, as ``[1, 12]`` in the
+            paper, in place of ``views``; empty: those. Not with a loss that uses the fit, whose result is that of one
+            subset.
         densities: Superpixels per pixel; a scene gives an example for each. Two by default, since the full fit starts
             with 57 % of the usual number.
-        match: Merging across views of the examples, see :class:`gsmerge.stages.match.MatchOptions`.
-        fit_steps: Steps of the full fit whose result is the target.
-        levels: Numbers of children K whose heads are trained, of 1, 2 and 4; each needs a fit of every scene.
+        segmentation: Superpixel method.
+        match: Merging across views, see :class:`gsmerge.stages.match.MatchOptions`. Where no fit is used, what the
+            networks make of a window is matched in every step.
+        overlap: Least overlap of a match by ``"overlap"``, 0 to 1.
+        iou: Least intersection over union of the boxes of a match by ``"aabb"``, 0 to 1.
+        similarity: Least cosine of the latents of a match by ``"aabb"``, -1 to 1.
+        geometry: What is matched in every step: ``"analytic"``: the moments, ``"decoded"``: the K = 1 head's output.
+        fit_steps: Steps of the full fit whose result is the target; fitted only where a loss uses it:
+            ``regression_weight`` or ``photo_start`` above 0.
+        levels: Numbers of children K whose heads are trained, of 1, 2 and 4; each needs a fit, if there is one.
+        buffer: Examples in memory for each crop of a step, which draws one of them.
+        refresh: Steps after which the next example takes the place of the oldest of these.
+        workers: Threads that read examples ahead.
         steps: Steps of the training.
         warmup: Steps over which the learning rate increases.
         rate: Highest learning rate.
@@ -37,28 +55,31 @@ class TrainOptions:
         clip: Largest norm of the gradient.
         average: Weight of the previous mean in the running mean of the weights, which is validated and saved; less in
             the first steps.
-        crops: Crops per step, worked on in parallel.
-        crop: Merged Feature Gaussians of a crop: those nearest to one of them.
+        crops: Crops or windows per step, of all processes together; worked on in parallel.
+        crop: Feature Gaussians of a crop: those nearest to one of them.
         inner: Share of a crop that is scored; the rest are neighbours.
         turn_weight: Weight of the rotation in the loss; it is small because axes of similar length have no direction.
         photo_start: Share of the steps after which renders are compared with photos; 1: never. Of two runs of
             400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.
         novel: Share of the windows in novel views, if there are any.
         photo_scale: Factor by which the sides of the photos are divided.
+        photo_side: Longer side of the photos in pixels, where they are larger, in place of ``photo_scale``; 476 in the
+            paper; 0: not used.
         window: Side of a window of a photo that is rendered, pixels.
         most: Feature Gaussians that may reach into a window; a window with more is halved.
         photo_loss: Colour loss: ``"l1"`` or ``"mse"`` (as in the paper).
         photo_weight: Weight of the colour loss.
         ssim_weight: Weight of 1 - SSIM.
-        lpips_weight: Weight of LPIPS (VGG), whose networks must be installed; a step takes twice as long with it.
+        lpips_weight: Weight of LPIPS (VGG), whose weights must be installed; a step takes twice as long with it.
         regression_weight: Weight of the regression when renders are compared; it falls to 0 until the end of the run.
-        teacher_weight: Weight of the distance from the analytic Gaussians.
+        teacher_weight: Weight of the distance from the moments of the groups (paper eq. teacher_mean, teacher_cov).
         teacher_steps: Steps that compare renders over which it falls to 0.
         diversity_weight: Weight of the diversification of several children.
         diversity_steps: Steps that compare renders over which it falls to 0.
         save_every: Steps between checkpoints, validation and lines of the table.
-        validation_crops: Crops of each scene for validation, always the same.
-        validation_windows: Windows of each scene for validation, always the same.
+        validation_examples: Most examples for validation, evenly spread over those that there are.
+        validation_crops: Crops of each of them, always the same; only where a loss uses the fit.
+        validation_windows: Windows of each of them, always the same.
         seed: Seed of all random numbers.
 
     Raises:
@@ -67,10 +88,19 @@ class TrainOptions:
 
     network: NetworkOptions = field(default_factory=NetworkOptions)
     views: tuple[int, ...] = (3, 6, 0)
+    random_views: tuple[int, ...] = ()
     densities: tuple[float, ...] = (0.025, 0.044)
+    segmentation: str = "rdseg"
     match: str = "overlap"
+    overlap: float = 0.7
+    iou: float = 0.2
+    similarity: float = 0.8
+    geometry: str = "analytic"
     fit_steps: int = 300
     levels: tuple[int, ...] = SLOTS
+    buffer: int = 4
+    refresh: int = 4
+    workers: int = 1
     steps: int = 6000
     warmup: int = 200
     rate: float = 1e-3
@@ -85,6 +115,7 @@ class TrainOptions:
     photo_start: float = 0.0
     novel: float = 0.75
     photo_scale: int = 2
+    photo_side: int = 0
     window: int = 96
     most: int = 4000
     photo_loss: str = "l1"
@@ -97,15 +128,17 @@ class TrainOptions:
     diversity_weight: float = 0.0
     diversity_steps: int = 50_000
     save_every: int = 200
+    validation_examples: int = 24
     validation_crops: int = 8
     validation_windows: int = 4
     seed: int = 0
 
     def __post_init__(self) -> None:
         for name in ("fit_steps", "steps", "crops", "crop", "save_every", "validation_crops", "photo_scale", "most",
-                     "validation_windows", "teacher_steps", "diversity_steps"):  # fmt: skip
+                     "validation_windows", "teacher_steps", "diversity_steps", "buffer", "refresh", "workers",
+                     "validation_examples"):  # fmt: skip
             self._expect(name, getattr(self, name), 1, 10**9, whole=True)
-        for name in ("warmup", "seed"):
+        for name in ("warmup", "seed", "photo_side"):
             self._expect(name, getattr(self, name), 0, 10**9, whole=True)
         self._expect("inner", self.inner, 1e-6, 1)
         self._expect("window", self.window, LOSS_WINDOW, 10**9, whole=True)
@@ -116,22 +149,36 @@ class TrainOptions:
         weights = [f.name for f in fields(self) if f.name.endswith("_weight")]
         for name in ("decay", *weights):
             self._expect(name, getattr(self, name), 0, 1e6)
-        for name in ("levels", "densities", "views"):  # JSON and TOML have lists
+        for name in LISTS:  # JSON and TOML have lists
             object.__setattr__(self, name, tuple(getattr(self, name)))
+        self._check_views()
         if not self.densities:
             raise ValueError("densities: expected at least one, got none")
         for density in self.densities:
             self._expect("densities", density, 1e-6, 1)
-        if not self.views:
-            raise ValueError("views: expected at least one number, got none")
-        for count in self.views:
-            self._expect("views", count, 0, 10**6, whole=True)
         if self.photo_loss not in ("l1", "mse"):
             raise ValueError(f'photo_loss: expected "l1" or "mse", got {self.photo_loss!r}')
         if not self.levels or len(set(self.levels)) < len(self.levels) or not set(self.levels) <= set(SLOTS):
             raise ValueError(f"levels: expected some of 1, 2 and 4, got {list(self.levels)}")
-        if self.match not in ("overlap", "aabb", "none"):
-            raise ValueError(f'match: expected "overlap", "aabb" or "none", got {self.match!r}')
+        if self.match is None:
+            raise ValueError('match: expected "overlap", "aabb" or "none", got None')
+        SegmentOptions(segmentation=self.segmentation)
+        for name in ("overlap", "iou"):
+            self._expect(name, getattr(self, name), 0, 1)
+        self._expect("similarity", self.similarity, -1, 1)
+        self.match_options()
+
+    def _check_views(self) -> None:
+        if not self.views:
+            raise ValueError("views: expected at least one number, got none")
+        for count in self.views:
+            self._expect("views", count, 0, 10**6, whole=True)
+        for count in self.random_views:
+            self._expect("random_views", count, 1, 10**6, whole=True)
+        if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
+            raise ValueError(f"random_views: expected the least and the most, got {list(self.random_views)}")
+        if self.random_views and self.uses_fit:
+            raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
 
     @staticmethod
     def _expect(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
@@ -139,6 +186,34 @@ class TrainOptions:
         if isinstance(value, bool) or not isinstance(value, kind) or not low <= value <= high:
             number = "a whole number" if whole else "a number"
             raise ValueError(f"{name}: expected {number} from {low:g}, got {value!r}")
+
+    @property
+    def uses_fit(self) -> bool:
+        """Whether a loss compares corrections with those of a full fit."""
+        return self.regression_weight > 0 or self.photo_start > 0
+
+    @property
+    def example_views(self) -> tuple[int, ...]:
+        """Numbers of views of a scene's examples; random subsets are drawn from all."""
+        return (0,) if self.random_views else self.views
+
+    def match_options(self) -> MatchOptions:
+        """How Feature Gaussians are matched across views."""
+        names = ("match", "overlap", "iou", "similarity", "geometry")
+        return MatchOptions(**{name: getattr(self, name) for name in names})
+
+    def photo_level(self, width: int, height: int) -> float:
+        """Factor by which the sides of photos of ``width`` by ``height`` pixels are divided."""
+        return max(1.0, max(width, height) / self.photo_side) if self.photo_side else self.photo_scale
+
+    def require_weights(self) -> None:
+        """Refuse to start without what the losses need.
+
+        Raises:
+            GsmergeError: If LPIPS has a weight, and its weights are not installed.
+        """
+        if self.lpips_weight:
+            require_lpips("vgg")
 
     @property
     def photo_step(self) -> int:
@@ -167,7 +242,7 @@ class TrainOptions:
 
     def to_dict(self) -> dict[str, Any]:
         """All settings as plain values."""
-        return asdict(self) | {name: list(getattr(self, name)) for name in ("levels", "densities", "views")}
+        return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> TrainOptions:
@@ -179,7 +254,7 @@ class TrainOptions:
         return TrainOptions().with_settings(values)
 
     def with_settings(self, values: Mapping[str, Any]) -> TrainOptions:
-        """Some settings changed, as in :meth:`from_dict`; a ``network`` is changed from the default one.
+        """Some settings changed, as in :meth:`from_dict`; so are those in the tables ``network`` and ``bounds``.
 
         Raises:
             ValueError: If a name is unknown or a value out of range.
@@ -187,10 +262,13 @@ class TrainOptions:
         unknown = sorted(values.keys() - {f.name for f in fields(TrainOptions)})
         if unknown:
             raise ValueError(f"unknown setting {unknown[0]!r}")
-        network = values.get("network", asdict(self.network))
-        if not isinstance(network, Mapping):
-            raise ValueError(f"network: expected a table, got {network!r}")
-        return replace(self, **{**values, "network": NetworkOptions.from_dict(network)})
+        table = values.get("network", {})
+        if not isinstance(table, Mapping):
+            raise ValueError(f"network: expected a table, got {table!r}")
+        present, bounds = asdict(self.network), table.get("bounds", {})
+        if isinstance(bounds, Mapping):
+            table = {**table, "bounds": present["bounds"] | dict(bounds)}
+        return replace(self, **{**values, "network": NetworkOptions.from_dict(present | dict(table))})
 
 
 def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
@@ -206,12 +284,18 @@ def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
         raise SceneError(path, str(error).splitlines()[0]) from error
 
 
-# Table of hyperparameters and section 5.1 of the paper; settings that it does not give are the defaults.
+# Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper; settings that it does not give are the defaults, but
+# for the densities, of which the fit alone needs two.
 PAPER: Mapping[str, Any] = MappingProxyType(
     {
         "network": {"outputs": "absolute"},
-        "views": tuple(range(1, 13)),
+        "random_views": (1, 12),
+        "densities": (0.044,),
+        "segmentation": "bass-st",
         "match": "aabb",
+        "iou": 0.2,
+        "geometry": "decoded",
+        "photo_side": 476,
         "levels": (1, 2, 4),
         "steps": 300_000,
         "warmup": 2_000,

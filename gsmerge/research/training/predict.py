@@ -21,33 +21,88 @@ from gsmerge.networks.apply import (
 )
 from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
 from gsmerge.networks.tokens import GroupFeatures
-from gsmerge.research.training.examples import Example, corrections_between
-from gsmerge.stages.merge import cluster_runs, pool_runs, take
+from gsmerge.research.training.options import TrainOptions
+from gsmerge.research.training.targets import corrections_between
+from gsmerge.research.training.windows import Crop
+from gsmerge.stages.decode import divide
+from gsmerge.stages.match import match
+from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 
 @dataclass(frozen=True, eq=False)
-class Crop:
-    """Neighbouring Feature Gaussians of an example, with K children each."""
+class Prediction:
+    """A crop's children, corrected by the networks."""
 
-    example: Example
-    k: int  # which of its levels
-    rows: Tensor  # [r] ascending rows of its merged Feature Gaussians
-    children: Tensor  # [n] ascending rows of the level's children
-    scored: Tensor  # [n] bool, whether their targets count
+    gaussians: Gaussians  # n corrected children, with gradients
+    parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
+    merged: FeatureGaussians  # the crop's, merged and refined
+    corrections: Tensor  # [n,13] of all stages together, from the analytic children as the targets
+    matched: float  # share of the crop's Feature Gaussians that were merged with others
 
 
-def sample_crop(example: Example, count: int, inner: float, rng: np.random.Generator) -> Crop:
-    """The ``count`` Feature Gaussians nearest to a random one, of which the share ``inner`` nearest to it is scored."""
-    k = list(example.levels)[int(rng.integers(len(example.levels)))]
-    level, centre = example.levels[k], example.centres[int(rng.integers(len(example.centres)))]
-    distances = (example.centres - centre).square().sum(1)
-    order = torch.argsort(distances, stable=True)[:count]
-    inside, close = torch.zeros(2, len(distances), dtype=torch.bool)
-    inside[order], close[order[: max(1, int(inner * len(order)))]] = True, True
-    children = torch.nonzero(inside[level.parents])[:, 0]
-    scored = close[level.parents[children]] & level.mask[children]
-    return Crop(example, k, torch.nonzero(inside)[:, 0], children, scored)
+def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
+    """A crop through all networks.
+
+    Each stage reads the results of those before it; gradients go through the latents and the corrections. At K = 1 the
+    corrections of all stages add up; the children of a larger K are pooled again from the members, so the stages before
+    their head reach them through the latent alone.
+
+    The Gaussians of K = 1 are the results of the stages, one after the other; their gradient is that of the sum.
+    """
+    example = crop.example
+    context = NetworkContext(networks, example.members, example.cameras, seed)
+    parts = take(example.features, crop.rows)
+    group_features = context.describe(parts)
+    encoded, shifts = apply_encoding(parts, group_features, run_encoder(parts, group_features, context), networks)
+    matches = match_crop(crop, encoded, options, context)
+    merged, before = _merged(encoded, group_features, shifts, matches, context)
+    group_features = context.describe(merged)
+    raw = run_refiner(merged, group_features, find_neighbors(merged, networks.options.neighbors), context)
+    refined, residuals = apply_corrections(merged, group_features, raw, networks)
+    group_features = context.describe(refined)
+    children, parents = divide(refined, example.members, np.full(len(refined), crop.k))
+    children = prepare_children(children, parents, refined, group_features, networks)
+    heads = run_heads(children, parents, refined, group_features, context)
+    before = before + residuals if crop.k == 1 else torch.zeros_like(heads)
+    last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
+    own = torch.from_numpy(parents)
+    frames = group_features.frames[own]
+    gaussians, corrections = move_gaussians(children, last, frames), before + heads
+    if example.targets and networks.options.outputs == "absolute":
+        analytic, _ = divide(merge(parts, matches), example.members, np.full(len(refined), crop.k))
+        corrections = corrections_between(analytic, gaussians, frames)
+    return Prediction(gaussians, own, refined, corrections, _matched(matches))
+
+
+def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
+    """A crop's children without networks."""
+    parts = take(crop.example.features, crop.rows)
+    merged = merge(parts, match_crop(crop, parts, options))
+    return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
+
+
+def match_crop(
+    crop: Crop, parts: FeatureGaussians, options: TrainOptions, context: NetworkContext | None = None
+) -> Matches:
+    """Clusters of the r Feature Gaussians ``parts`` of a crop: those that were fitted, or what matches now."""
+    known = crop.example.matches
+    if known is not None:
+        ids, local = torch.unique(known.clusters[crop.rows], return_inverse=True)
+        return Matches(local, len(ids))
+    with torch.no_grad():
+        return match(parts, options.match_options(), context)
+
+
+def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
+    """``[n,13]`` corrections by the fit of a crop's children, and ``[n]`` bool: those that count."""
+    matches = crop.example.matches
+    assert matches is not None
+    rows, targets = merged_rows(matches), crop.example.targets[crop.k]
+    inside, inner = torch.zeros(2, matches.count, dtype=torch.bool)
+    inside[rows[crop.rows]], inner[rows[crop.rows[crop.inner]]] = True, True
+    own = torch.nonzero(inside[targets.parents])[:, 0]
+    return targets.corrections[own], targets.mask[own] & inner[targets.parents[own]]
 
 
 def merged_rows(matches: Matches) -> Tensor:
@@ -61,52 +116,10 @@ def merged_rows(matches: Matches) -> Tensor:
     return rows
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """A crop's children, corrected by the networks."""
-
-    corrections: Tensor  # [n,13] of all stages together, from the analytic children as the targets
-    gaussians: Gaussians  # the corrected children, with gradients
-
-
-def predict(crop: Crop, networks: Networks, seed: int) -> Prediction:
-    """A crop through all networks.
-
-    Each stage reads the results of those before it; gradients go through the latents and the corrections. At K = 1 the
-    corrections of all stages add up; the children of a larger K are pooled again from the members, so the stages before
-    their head reach them through the latent alone.
-
-    The Gaussians of K = 1 are the results of the stages, one after the other; their gradient is that of the sum.
-    """
-    example = crop.example
-    context = NetworkContext(networks, example.members, example.cameras, seed)
-    owner = merged_rows(example.matches)
-    parts = take(example.features, torch.nonzero(torch.isin(owner, crop.rows))[:, 0])
-    local = torch.searchsorted(crop.rows, owner[torch.isin(owner, crop.rows)])
-    group_features = context.describe(parts)
-    parts, shifts = apply_encoding(parts, group_features, run_encoder(parts, group_features, context), networks)
-    merged, corrections = _merged(parts, group_features, shifts, Matches(local, len(crop.rows)), context)
-    group_features = context.describe(merged)
-    raw = run_refiner(merged, group_features, find_neighbors(merged, networks.options.neighbors), context)
-    refined, residuals = apply_corrections(merged, group_features, raw, networks)
-    group_features = context.describe(refined)
-    analytic = example.levels[crop.k].children[crop.children]
-    parents = torch.searchsorted(crop.rows, example.levels[crop.k].parents[crop.children])
-    frames, single = group_features.frames[parents], crop.k == 1
-    children = group_features.base if single else analytic
-    children = prepare_children(children, parents.numpy(), refined, group_features, networks)
-    heads = run_heads(children, parents.numpy(), refined, group_features, context)
-    before = corrections + residuals if single else torch.zeros_like(heads)
-    last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
-    gaussians = move_gaussians(children, last, frames)
-    if networks.options.outputs == "absolute":
-        return Prediction(corrections_between(analytic, gaussians, frames), gaussians)
-    return Prediction(before + heads, gaussians)
-
-
-def predict_corrections(crop: Crop, networks: Networks, seed: int) -> Tensor:
-    """``[n,13]`` corrections of a crop's children by the networks, see :func:`predict`."""
-    return predict(crop, networks, seed).corrections
+def _matched(matches: Matches) -> float:
+    """Share of the Feature Gaussians that are not alone in their cluster."""
+    sizes = torch.bincount(matches.clusters, minlength=matches.count)
+    return float(sizes[sizes > 1].sum()) / max(1, len(matches.clusters))
 
 
 def _merged(

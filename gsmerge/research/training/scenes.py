@@ -31,7 +31,7 @@ class TrainingScene:
     cameras: Cameras  # of all photos, those of the chosen views first
     images: np.ndarray  # [p,h,w,3] float32, at the size of the scene's own
 
-    def photos(self, level: int = 1) -> Photos:
+    def photos(self, level: float = 1) -> Photos:
         """All photos, each side divided by ``level``."""
         names = tuple(map(str, range(len(self.cameras))))
         unaligned = UnalignedScene(self.scene.gaussians[:0], self.cameras, torch.from_numpy(self.images), names)
@@ -77,19 +77,39 @@ def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
 
 
-def coverage_masks(training: TrainingScene) -> np.ndarray:
-    """``[p,h,w]`` bool: pixels of surfaces that the chosen views see, and that their Gaussians cover."""
-    own, cameras = len(training.scene), training.cameras
-    splats, photos = prepare(training.scene.gaussians, np.zeros(3)), training.photos()
+def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
+    """How much of every photo each chosen view covers.
 
-    def opaque(view: int) -> np.ndarray:
-        return 1 - composite(plan_view(splats, **photos.camera(view), near=NEAR))[1] >= OPAQUE
+    Args:
+        training: The scene, of v chosen views, and its p photos.
+        level: Factor by which the sides of the photos are divided.
 
-    masks = np.stack(parallel_map(opaque, range(len(cameras))))
-    if len(cameras) > own:
-        points = context_points(training.scene, NEAR)
-        masks[own:] &= visible_pixels(points, cameras[own:], NEAR, training.scene.cameras)
-    return masks
+    Returns:
+        ``[v,p,h,w]`` uint8: opacity of the view's Gaussians times 255; 0 on surfaces that the view does not see. The
+        transmittances of views multiply, so this says what any subset of them covers.
+    """
+    scene, photos = training.scene, training.photos(level)
+    viewmats, Ks = torch.from_numpy(photos.viewmats), torch.from_numpy(photos.Ks)
+    cameras = Cameras(viewmats, Ks, photos.width, photos.height)
+
+    def one_view(view: int) -> np.ndarray:
+        part = subset(scene, [view])
+        splats = prepare(part.gaussians, np.zeros(3))
+        plans = (plan_view(splats, **photos.camera(photo), near=NEAR) for photo in range(len(photos)))
+        opacities = np.stack([1 - composite(plan)[1] for plan in plans])
+        seen = visible_pixels(context_points(part, NEAR), cameras, NEAR, scene.cameras)
+        seen[view] = True
+        return np.where(seen, np.round(255 * opacities), 0).astype(np.uint8)
+
+    return np.stack(parallel_map(one_view, range(len(scene))))
+
+
+def covered_pixels(covers: np.ndarray) -> np.ndarray:
+    """``[...]`` bool: pixels that views cover together; ``covers [v,...]`` as of :func:`coverage`."""
+    left = np.ones(covers.shape[1:], np.float32)
+    for cover in covers:
+        left *= 1 - cover.astype(np.float32) / 255
+    return left <= 1 - OPAQUE
 
 
 def reduced_masks(masks: np.ndarray, photos: Photos) -> np.ndarray:

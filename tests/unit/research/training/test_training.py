@@ -2,23 +2,24 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from learned import noisy
-from scenes import arc, make_scene, room, two_planes
-from training_runs import OPTIONS, TINY
+from scenes import arc, make_scene, room
+from training_runs import OPTIONS, TINY, written
 
 import gsmerge
 from gsmerge.errors import SceneError
-from gsmerge.networks import NetworkContext, NetworkOptions, Networks, load_checkpoint
+from gsmerge.networks import Bounds, NetworkContext, NetworkOptions, Networks, load_checkpoint
 from gsmerge.networks.apply import encode_features, refine_features, run_heads
 from gsmerge.networks.residuals import LOGIT, MEAN, SIZE, bound_residuals, move_gaussians
 from gsmerge.research.training import (
     Example,
+    Shard,
     TrainOptions,
     choose_device,
     make_example,
@@ -26,10 +27,11 @@ from gsmerge.research.training import (
     read_config,
     train,
 )
-from gsmerge.research.training.examples import corrections_between
-from gsmerge.research.training.predict import Crop, merged_rows, predict_corrections, sample_crop
+from gsmerge.research.training.predict import analytic_gaussians, crop_targets, merged_rows, predict
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
-from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.research.training.targets import corrections_between
+from gsmerge.research.training.windows import Crop, sample_crop
+from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.merge import merge
 from gsmerge.types import PixelScene
 
@@ -51,22 +53,32 @@ def example() -> Example:
     return make_example(training_scene(), OPTIONS, 0.1, "room")
 
 
+@pytest.fixture(scope="module")
+def shard(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Shard:
+    return written(example, tmp_path_factory.mktemp("shards"))
+
+
+def everything(example: Example, k: int) -> Crop:
+    rows = torch.arange(len(example.features))
+    return Crop(example, k, rows, torch.ones(len(rows), dtype=torch.bool))
+
+
 def files(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()}
 
 
 def test_targets_lead_from_the_start_to_the_fit(example: Example) -> None:
-    """Applying the targets gives what the fit gave."""
-    for k, level in example.levels.items():
-        assert len(level.children) == len(level.parents) == len(level.targets) == len(level.mask)
-        assert bool(level.mask.any())
-        assert bool(level.targets[level.mask].any(1).all())
-        assert not bool(level.targets[~level.mask].any())
-        assert int(torch.bincount(level.parents).max()) == k
+    """Each analytic child has one, in the order that children come in."""
+    for k, targets in example.targets.items():
+        assert len(analytic_gaussians(everything(example, k), OPTIONS)) == len(targets.parents) == len(targets.mask)
+        assert bool(targets.mask.any())
+        assert bool(targets.corrections[targets.mask].any(1).all())
+        assert not bool(targets.corrections[~targets.mask].any())
+        assert int(torch.bincount(targets.parents).max()) == k
 
 
 def test_differences_undo_corrections(example: Example) -> None:
-    start = example.levels[1].children
+    start = analytic_gaussians(everything(example, 1), OPTIONS)
     start = replace(start, opacities=start.opacities.clamp(0.1, 0.9))
     raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
     frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
@@ -77,59 +89,75 @@ def test_differences_undo_corrections(example: Example) -> None:
 
 
 def test_untrained_networks_predict_nothing(example: Example) -> None:
-    crop = sample_crop(example, 40, 0.5, np.random.default_rng(0))
-    assert len(crop.rows) == 40
-    assert 0 < int(crop.scored.sum()) <= 20 * crop.k
-    assert not bool(predict_corrections(crop, Networks(TINY), 0).any())
+    crop = sample_crop(example, OPTIONS.levels, 40, 0.5, np.random.default_rng(0))
+    assert 40 <= len(crop.rows) < 120
+    assert int(crop.inner.sum()) >= 20
+    assert not bool(predict(crop, Networks(TINY), OPTIONS, 0).corrections.any())
 
 
-def test_owners_are_the_rows_after_merging(example: Example) -> None:
-    found, merged = merged_rows(example.matches), merge(example.features, example.matches)
-    torch.testing.assert_close(merged.means, example.centres)
-    weights = torch.zeros(len(merged)).index_add(0, found, example.features.weights)
+def test_rows_after_merging(example: Example) -> None:
+    assert example.matches is not None
+    rows, merged = merged_rows(example.matches), merge(example.features, example.matches)
+    weights = torch.zeros(len(merged)).index_add(0, rows, example.features.weights)
     torch.testing.assert_close(weights, merged.weights)
     assert len(merged) < len(example.features)
+
+
+def test_crops_hold_whole_clusters_and_their_targets(example: Example) -> None:
+    assert example.matches is not None
+    sizes = torch.bincount(example.matches.clusters)
+    rows = merged_rows(example.matches)
+    for seed in range(4):
+        crop = sample_crop(example, (2,), 40, 0.5, np.random.default_rng(seed))
+        inside = torch.bincount(example.matches.clusters[crop.rows], minlength=len(sizes))
+        assert bool(((inside == 0) | (inside == sizes)).all())
+        corrections, scored = crop_targets(crop)
+        prediction = predict(crop, Networks(TINY), OPTIONS, 0)
+        assert len(prediction.gaussians) == len(corrections) == len(scored)
+        expected = torch.isin(example.targets[2].parents, rows[crop.rows])
+        torch.testing.assert_close(corrections, example.targets[2].corrections[expected])
+        assert 0 < int(scored.sum()) < int(example.targets[2].mask[expected].sum())
 
 
 def test_what_is_trained_is_what_runs(example: Example) -> None:
     """The corrections of a crop that holds everything are those that the stages make."""
     networks = noisy(TINY)
+    assert example.matches is not None
     learned = NetworkContext(networks, example.members, example.cameras, 5)
-    everything = torch.arange(len(example.centres))
     encoded = encode_features(example.features, learned)
     refined = refine_features(merge(encoded, example.matches, learned), learned)
-    level = example.levels[2]
-    crop = Crop(example, 2, everything, torch.arange(len(level.children)), level.mask)
     with torch.no_grad():
-        found = predict_corrections(crop, networks, 5)
+        real = predict(everything(example, 2), networks, OPTIONS, 5).corrections
     group_features = learned.describe(refined)
-    expected = run_heads(level.children, level.parents.numpy(), refined, group_features, learned)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
-    first = replace(crop, k=1, children=everything, scored=example.levels[1].mask)
+    children, parents = divide(refined, example.members, np.full(len(refined), 2))
+    expected = run_heads(children, parents, refined, group_features, learned)
+    torch.testing.assert_close(real, expected, atol=1e-5, rtol=1e-5)
     with torch.no_grad():
-        total = predict_corrections(first, networks, 5)
+        total = predict(everything(example, 1), networks, OPTIONS, 5).corrections
     final = decode(refined, example.members, DecodeOptions(min_opacity=0), networks=learned)
-    start = example.levels[1].children
+    start = analytic_gaussians(everything(example, 1), OPTIONS)
     made = corrections_between(start, final, learned.describe(merge(example.features, example.matches)).frames)
     for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
-        given, real = total[:, columns].reshape(-1), made[:, columns].reshape(-1)
-        assert float(torch.corrcoef(torch.stack([given, real]))[0, 1]) > 0.8
+        pair = torch.stack([total[:, columns].reshape(-1), made[:, columns].reshape(-1)])
+        assert float(torch.corrcoef(pair)[0, 1]) > 0.8
 
 
 def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> None:
-    networks, level = noisy(TINY), example.levels[1]
-    rng = np.random.default_rng(3)
-    small = sample_crop(replace(example, levels={1: level}), 60, 0.1, rng)
-    everything = torch.arange(len(level.children))
+    networks = noisy(TINY)
+    small = sample_crop(example, (1,), 90, 0.1, np.random.default_rng(3))
     with torch.no_grad():
-        whole = predict_corrections(Crop(example, 1, everything, everything, level.mask), networks, 0)
-        some = predict_corrections(small, networks, 0)
-    torch.testing.assert_close(some[small.scored], whole[small.children][small.scored], atol=1e-5, rtol=1e-4)
+        whole = predict(everything(example, 1), networks, OPTIONS, 0)
+        some = predict(small, networks, OPTIONS, 0)
+    assert example.matches is not None
+    rows = merged_rows(example.matches)
+    kept = torch.unique(rows[small.rows])
+    inner = torch.isin(kept, rows[small.rows[small.inner]])
+    torch.testing.assert_close(some.corrections[inner], whole.corrections[kept][inner], atol=1e-5, rtol=1e-4)
 
 
-def test_training_lowers_the_loss(example: Example, tmp_path: Path) -> None:
+def test_training_lowers_the_loss(shard: Shard, tmp_path: Path) -> None:
     options = replace(OPTIONS, steps=30, save_every=10)
-    done = train([example], [], tmp_path, options)
+    done = train([shard], [], tmp_path, options)
     rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))
     assert [int(row["step"]) for row in rows] == [10, 20, 30]
     losses = [float(row["validation_loss"]) for row in rows]
@@ -138,12 +166,12 @@ def test_training_lowers_the_loss(example: Example, tmp_path: Path) -> None:
     assert float(rows[-1]["explained_color"]) > 0
     best = load_checkpoint(done.best)
     assert best.networks.options == TINY
-    assert best.training["data"] == [example.sha256]
+    assert best.training["data"] == [shard.sha256]
     assert best.training["options"] == options.to_dict()
 
 
-def test_a_trained_checkpoint_works(example: Example, tmp_path: Path) -> None:
-    done = train([example], [], tmp_path, replace(OPTIONS, steps=4))
+def test_a_trained_checkpoint_works(shard: Shard, tmp_path: Path) -> None:
+    done = train([shard], [], tmp_path, replace(OPTIONS, steps=4))
     chosen = {"fit": "none", "superpixels": "10%", "robust": False}
     plain = gsmerge.compact(scene(), **chosen)
     learned = gsmerge.compact(scene(), **chosen, checkpoint=str(done.last), require_checkpoint=True)
@@ -152,8 +180,8 @@ def test_a_trained_checkpoint_works(example: Example, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(example: Example, tmp_path: Path) -> None:
-    train([example], [example], tmp_path / "whole", OPTIONS, threads=1)
+def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(shard: Shard, tmp_path: Path) -> None:
+    train([shard], [shard], tmp_path / "whole", OPTIONS, threads=1)
 
     def stop(step: int, *_: float) -> None:
         if step in (6, 9):
@@ -162,61 +190,29 @@ def test_interrupted_runs_end_with_the_same_bytes_on_any_number_of_threads(examp
 
     stops: list[int] = []
     with pytest.raises(StoppedError):
-        train([example], [example], tmp_path / "parts", OPTIONS, threads=4, progress=stop)
+        train([shard], [shard], tmp_path / "parts", OPTIONS, threads=4, progress=stop)
     assert load_checkpoint(tmp_path / "parts" / "last.safetensors").training["step"] == 4
     with pytest.raises(StoppedError):
-        train([example], [example], tmp_path / "parts", OPTIONS, threads=2, progress=stop)
-    done = train([example], [example], tmp_path / "parts", OPTIONS)
+        train([shard], [shard], tmp_path / "parts", OPTIONS, threads=2, progress=stop)
+    done = train([shard], [shard], tmp_path / "parts", OPTIONS)
     assert done.resumed == 4
     assert stops == [6, 6]
     assert files(tmp_path / "whole") == files(tmp_path / "parts")
-    again = train([example], [example], tmp_path / "parts", OPTIONS)
+    again = train([shard], [shard], tmp_path / "parts", OPTIONS)
     assert (again.resumed, again.step) == (12, 12)
 
 
-def test_another_run_is_not_gone_on_with(example: Example, tmp_path: Path) -> None:
-    train([example], [], tmp_path, replace(OPTIONS, steps=4))
+def test_another_run_is_not_gone_on_with(shard: Shard, tmp_path: Path) -> None:
+    train([shard], [], tmp_path, replace(OPTIONS, steps=4))
     with pytest.raises(SceneError, match="same options"):
-        train([example], [], tmp_path, replace(OPTIONS, steps=8))
+        train([shard], [], tmp_path, replace(OPTIONS, steps=8))
     with pytest.raises(SceneError, match="same data"):
-        train([replace(example, sha256="0")], [], tmp_path, replace(OPTIONS, steps=4))
+        train([replace(shard, sha256="0")], [], tmp_path, replace(OPTIONS, steps=4))
     with pytest.raises(ValueError, match="examples"):
         train([], [], tmp_path)
     (tmp_path / "state.safetensors").write_bytes(b"state")
     with pytest.raises(SceneError, match="damaged"):
-        train([example], [], tmp_path, replace(OPTIONS, steps=4))
-
-
-def test_examples_are_kept_by_content(tmp_path: Path) -> None:
-    fits: list[int] = []
-
-    def report(step: int, _: int) -> None:
-        fits.append(step)
-
-    first = make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, report)
-    assert len(fits) == 2 * OPTIONS.fit_steps
-    second = make_example(training_scene(), OPTIONS, 0.1, "b", tmp_path, report)
-    assert len(fits) == 2 * OPTIONS.fit_steps
-    assert first.sha256 == second.sha256
-    for k in OPTIONS.levels:
-        for f in fields(first.levels[k]):
-            a, b = getattr(first.levels[k], f.name), getattr(second.levels[k], f.name)
-            assert a.means.equal(b.means) if f.name == "children" else a.equal(b)
-    (kept,) = tmp_path.iterdir()
-    kept.write_bytes(kept.read_bytes()[:1000])
-    assert (
-        make_example(training_scene(), OPTIONS, 0.1, "a", tmp_path, report)
-        .levels[1]
-        .targets.equal(first.levels[1].targets)
-    )
-    assert len(fits) == 4 * OPTIONS.fit_steps
-    other = make_example(
-        make_training_scene(make_scene(two_planes(), arc(3, 32, 24)), range(3)), OPTIONS, 0.1, "c", tmp_path
-    )
-    assert other.sha256 != first.sha256
-    sparse = make_example(training_scene(), OPTIONS, 0.05, "a", tmp_path)
-    assert len(sparse.features) < len(first.features)
-    assert len(list(tmp_path.iterdir())) == 3
+        train([shard], [], tmp_path, replace(OPTIONS, steps=4))
 
 
 def test_settings_are_checked(tmp_path: Path) -> None:
@@ -238,6 +234,13 @@ def test_settings_are_checked(tmp_path: Path) -> None:
         {"photo_loss": "l2"},
         {"lpips_weight": -1},
         {"teacher_steps": 0},
+        {"buffer": 0},
+        {"segmentation": "slice"},
+        {"overlap": 2},
+        {"iou": -0.1},
+        {"photo_side": -1},
+        {"random_views": (1, 2)},  # with a fit
+        {"random_views": (3, 2), "photo_start": 0.0, "regression_weight": 0.0},
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replace(OPTIONS, **wrong)  # type: ignore[arg-type]
@@ -254,10 +257,13 @@ def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
     assert (paper.rate_at(1999), paper.photo_step, paper.clip) == (5e-5, 0, 10)
     assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
     assert preset_options("default") == TrainOptions()
-    config.write_text(json.dumps({"steps": 10, "network": {"width": 16}}))
-    changed = read_config(config, paper)
-    assert changed == replace(paper, steps=10, network=NetworkOptions(width=16))
-    assert read_config(config) == replace(TrainOptions(), steps=10, network=NetworkOptions(width=16))
+    config.write_text(json.dumps({"steps": 10, "network": {"width": 16, "bounds": {"mean": 0.5}}}))
+    network = NetworkOptions(width=16, outputs="absolute", bounds=Bounds(mean=0.5))
+    assert read_config(config, paper) == replace(paper, steps=10, network=network)
+    assert read_config(config) == replace(TrainOptions(), steps=10, network=replace(network, outputs="residual"))
+    assert not paper.uses_fit
+    assert paper.photo_level(952, 100) == 2
+    assert paper.photo_level(320, 240) == 1
     with pytest.raises(ValueError, match="preset"):
         preset_options("papers")
 
@@ -295,7 +301,7 @@ def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_training_on_cuda(example: Example, tmp_path: Path) -> None:
-    on_cpu, on_cuda = (train([example], [], tmp_path / device, OPTIONS, device=device) for device in ("cpu", "cuda"))
+def test_training_on_cuda(shard: Shard, tmp_path: Path) -> None:
+    on_cpu, on_cuda = (train([shard], [], tmp_path / device, OPTIONS, device=device) for device in ("cpu", "cuda"))
     assert on_cuda.loss == pytest.approx(on_cpu.loss, rel=0.05)
     assert load_checkpoint(on_cuda.best).networks.num_parameters > 0

@@ -1,0 +1,112 @@
+"""Memory and steps per second of ``gsmerge train``: streamed examples, all in memory, several processes.
+
+python benchmarks/training.py made                     # 200 scenes of gsmerge generate, streamed and in memory
+python benchmarks/training.py made --processes 1 2     # one thread each; wants as many idle processors
+
+The folder is filled with scenes and their examples first, which is resumed if it was interrupted. Each measurement is a
+process of its own, and all of them draw the same windows. Processor seconds hardly depend on what else runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from gsmerge.research.generate import GenerateOptions, generate
+from gsmerge.research.training import TrainOptions, join_processes, prepare_shards, preset_options, read_shard, train
+from gsmerge.research.training import stream as streams
+from gsmerge.runtime.memory import peak_memory
+
+WARM = 10  # steps before the clock starts: kernels are loaded, readers are ahead
+LINE = "{:<28} {:>10} {:>12} {:>16} {:>10}"
+
+
+def options_of(args: argparse.Namespace) -> TrainOptions:
+    return replace(
+        preset_options("paper"), lpips_weight=0.0, steps=args.steps + WARM, save_every=10**6, crops=args.crops,
+        validation_examples=1, validation_windows=1,
+    )  # fmt: skip
+
+
+def measure(args: argparse.Namespace, kind: str) -> None:
+    """In a process of its own: prepare, or prepare and train; prints JSON."""
+    scenes, options = sorted((args.folder / "scenes").glob("scene_*")), options_of(args)
+    with join_processes("cpu") as processes:
+        shards = prepare_shards(scenes[: args.scenes], options, args.folder / "examples", processes)
+        facts = {"shards": len(shards), "bytes": sum(shard.path.stat().st_size for shard in shards)}
+        if kind != "prepare":
+            if kind == "memory":
+                examples = {shard: read_shard(shard) for shard in shards}
+                streams.read_shard = lambda shard, check: examples[shard]  # type: ignore[assignment]
+            marks: list[tuple[float, float]] = []
+
+            def mark(*_: float) -> None:
+                marks.append((time.perf_counter(), time.process_time()))
+
+            with tempfile.TemporaryDirectory() as out:
+                folder = Path(os.environ.get("BENCHMARK_OUT", out))  # of all processes
+                train(shards, shards[:1], folder, options, threads=args.threads, processes=processes, progress=mark)
+            (start, start_cpu), (end, end_cpu) = marks[WARM - 1], marks[-1]
+            facts |= {"seconds": end - start, "processor": end_cpu - start_cpu}
+        if processes.rank == 0:
+            print(json.dumps({**facts, "peak": peak_memory()}), flush=True)
+
+
+def run(args: argparse.Namespace, kind: str, processes: int = 1, threads: int | None = None) -> dict[str, float]:
+    """What :func:`measure` prints in one process, or several."""
+    own = [__file__, args.folder, "--measure", kind, "--scenes", args.scenes, "--steps", args.steps]
+    own += ["--crops", args.crops, "--threads", threads or args.threads]
+    launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", processes] if processes > 1 else []
+    with tempfile.TemporaryDirectory() as out:
+        environment = {**os.environ, "BENCHMARK_OUT": out, "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, *map(str, [*launcher, *own])]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode:
+        sys.exit(done.stderr)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--scenes", type=int, default=200)
+    parser.add_argument("--size", default="160x120")
+    parser.add_argument("--views", default="4-6", help="least and most")
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--crops", type=int, default=2)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--processes", type=int, nargs="+", default=[])
+    parser.add_argument("--measure", choices=("prepare", "streamed", "memory"))
+    args = parser.parse_args()
+    if args.measure:
+        measure(args, args.measure)
+        return
+    width, height = map(int, args.size.split("x"))
+    least, _, most = args.views.partition("-")
+    made = GenerateOptions(width=width, height=height, views=(int(least), int(most or least)))
+    generate(args.folder / "scenes", args.scenes, made)
+    print(LINE.format("", "peak, GB", "steps per s", "processor s/step", "ratio"))
+    prepared = run(args, "prepare")
+    print(LINE.format("prepare", f"{prepared['peak'] / 1e9:.2f}", "", "", ""), flush=True)
+    print(f"{prepared['shards']} examples, {prepared['bytes'] / 1e9:.2f} GB")
+    rows = [("memory", 1), ("streamed", 1)] if not args.processes else [("streamed", n) for n in args.processes]
+    first = None
+    for kind, count in rows:
+        facts = run(args, kind, count, 1 if args.processes else None)
+        speed = args.steps / facts["seconds"]
+        first = first or speed
+        name = kind if not args.processes else f"{count} process{'es' * (count > 1)} of one thread"
+        cpu = f"{facts['processor'] / args.steps:.3f}"
+        line = LINE.format(name, f"{facts['peak'] / 1e9:.2f}", f"{speed:.3f}", cpu, f"{speed / first:.2f}")
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

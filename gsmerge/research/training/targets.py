@@ -1,0 +1,117 @@
+"""What the full fit changes in the K analytic Gaussians of every merged Feature Gaussian.
+
+A full fit of these to all photos, without growth, gives a target for each: fitted minus analytic, in the columns that
+networks correct. Gaussians that no photo shows have no target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes
+from gsmerge.networks.tokens import compute_group_features
+from gsmerge.render.photos import Photos
+from gsmerge.research.training.options import TrainOptions
+from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, reduced_masks
+from gsmerge.stages.decode import DecodeOptions, divide
+from gsmerge.stages.fit.full import Masks, fit_full
+from gsmerge.stages.fit.options import FitOptions
+from gsmerge.stages.fit.stage import visible_mask
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
+
+Progress = Callable[[int, int], None]  # step, steps
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Corrections by the fit of the n analytic Gaussians of one K."""
+
+    parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
+    corrections: Tensor  # [n,13]
+    mask: Tensor  # [n] whether there is a target
+
+
+def fit_targets(
+    training: TrainingScene,
+    merged: FeatureGaussians,
+    options: TrainOptions,
+    name: str,
+    progress: Progress | None = None,
+) -> dict[int, Targets]:
+    """The targets of every K of ``options.levels``.
+
+    Args:
+        training: The scene and its photos.
+        merged: Its analytic Feature Gaussians, merged across views.
+        options: Levels, steps of the fit, seed.
+        name: Of the scene, for errors.
+        progress: Called with (step, steps) of the fits.
+
+    Raises:
+        SceneError: If the fit does not improve held-out parts of the photos.
+    """
+    photos, masks = (training.photos(), training.photos(2)), covered_pixels(coverage(training))
+    masks[: len(training.scene)] = True  # of the other photos, only what the scene covers counts
+    sized = masks, reduced_masks(masks, photos[1])
+    frames = compute_group_features(merged, training.members, training.scene.cameras).frames
+    targets = {}
+    for number, k in enumerate(options.levels):
+
+        def report(step: int, steps: int, *_: float, number: int = number) -> None:
+            if progress:
+                progress(number * steps + step, len(options.levels) * steps)
+
+        children, parents = divide(merged, training.members, np.full(len(merged), k))
+        fitted, mask = _fit_level(name, photos, sized, children, options, report)
+        own, corrections = torch.from_numpy(parents), torch.zeros(len(children), RESIDUAL)
+        corrections[mask] = corrections_between(children[mask], fitted, frames[own][mask])
+        targets[k] = Targets(own, corrections, mask)
+    return targets
+
+
+def _fit_level(
+    name: str,
+    photos: tuple[Photos, Photos],
+    masks: Masks,
+    start: Gaussians,
+    options: TrainOptions,
+    progress: Callable[[int, int, float, float], None],
+) -> tuple[Gaussians, Tensor]:
+    """Gaussians after a full fit without growth, and a mask ``[n]`` of those that were fitted, which a photo shows."""
+    fit = FitOptions(fit_steps=options.fit_steps)
+    mask = start.opacities >= DecodeOptions().min_opacity
+    mask[mask.clone()] = visible_mask(start[mask], photos[1], fit.min_contribution)
+    fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress, masks=masks)
+    if not report.accepted:
+        problem = f"expected a scene that the fit makes better ({report.stopped})"
+        raise SceneError(name, problem, "leave it out")
+    return fitted, mask
+
+
+def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
+    """``[n,13]`` corrections in frames ``[n,3,3]`` that turn ``start`` into ``end``."""
+    back, sizes = frames.transpose(1, 2), gaussian_sizes(start.scales).clamp_min(1e-12)
+    residuals = torch.zeros(len(start), RESIDUAL)
+    residuals[:, MEAN] = (back @ (end.means - start.means)[:, :, None])[:, :, 0] / sizes[:, None]
+    residuals[:, SIZE] = torch.log(end.scales.clamp_min(1e-12) / start.scales.clamp_min(1e-12))
+    rotations = quat_to_rotmat(end.quats) @ quat_to_rotmat(start.quats).transpose(1, 2)
+    residuals[:, ROTATION] = (back @ rotation_vectors(rotations)[:, :, None])[:, :, 0]
+    ends = [torch.logit(g.opacities.clamp(0.004, 0.999)) for g in (start, end)]  # clamped as in the fit
+    residuals[:, LOGIT] = ends[1] - ends[0]
+    residuals[:, COLOR] = SH_C0 * (end.sh0 - start.sh0)[:, 0]
+    return residuals.nan_to_num()
+
+
+def rotation_vectors(rotations: Tensor) -> Tensor:
+    """Rotation vectors ``[n,3]`` of rotations ``[n,3,3]`` well below half a turn."""
+    skew = rotations - rotations.transpose(1, 2)
+    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1) / 2
+    sine, cosine = axis.norm(dim=1), (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    return axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))[:, None]

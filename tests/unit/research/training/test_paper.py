@@ -1,0 +1,210 @@
+"""What ``--preset paper`` trains with: random views, clusters, the teacher, absolute heads."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from learned import noisy
+from scenes import arc, make_scene, room
+from training_runs import PAPER, TINY, written
+
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.networks import Networks, load_checkpoint
+from gsmerge.research.training import Example, make_example, make_training_scene, preset_options, train
+from gsmerge.research.training.examples import draw_views, select_views
+from gsmerge.research.training.losses import teacher_loss, window_loss
+from gsmerge.research.training.predict import Prediction, match_crop, predict
+from gsmerge.research.training.windows import Window, sample_window, whole_photo
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.merge import merge
+from gsmerge.types import Gaussians
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    with use_threads(1):
+        yield
+
+
+@pytest.fixture(scope="module")
+def example() -> Example:
+    """Without a fit, so in a moment."""
+    return make_example(make_training_scene(make_scene(room(), arc(4, 48, 36)), range(4)), PAPER, 0.1, "room")
+
+
+def windows(example: Example, count: int) -> list[Window]:
+    rng = np.random.default_rng(0)
+    drawn = (draw_views(example, PAPER, rng) for _ in range(count))
+    return [sample_window(part, PAPER.levels, PAPER.window, PAPER.most, 0.5, rng) for part in drawn]
+
+
+def test_no_fit_where_no_loss_uses_it(example: Example, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (example.matches, example.targets) == (None, {})
+    monkeypatch.setattr("gsmerge.research.training.targets.fit_full", lambda *_, **__: pytest.fail("a fit"))
+    training = make_training_scene(make_scene(room(), arc(2, 32, 24)), range(2))
+    make_example(training, replace(preset_options("paper"), lpips_weight=0.0), 0.1, "room")
+    with pytest.raises(BaseException, match="a fit"):
+        make_example(training, replace(preset_options("default"), fit_steps=2), 0.1, "room")
+
+
+def test_photos_have_the_longer_side_that_is_asked_for() -> None:
+    training = make_training_scene(make_scene(room(), arc(2, 48, 36)), range(2))
+    small = make_example(training, replace(PAPER, photo_side=32), 0.1, "room")
+    assert small.images.shape == (2, 24, 32, 3)
+    assert small.covers.shape == (2, 2, 24, 32)
+    np.testing.assert_allclose(small.photos.Ks[0, :2] * 1.5, training.cameras.Ks[0, :2], rtol=1e-6)
+    assert make_example(training, replace(PAPER, photo_side=476), 0.1, "room").images.shape == (2, 36, 48, 3)
+
+
+def test_every_window_has_views_of_its_own(example: Example) -> None:
+    rng = np.random.default_rng(0)
+    drawn = [draw_views(example, PAPER, rng) for _ in range(200)]
+    counts = Counter(len(part.cameras) for part in drawn)
+    assert set(counts) == {1, 2, 3, 4}
+    assert min(counts.values()) > 25
+    assert {len(draw_views(example, replace(PAPER, random_views=(2, 3)), rng).cameras) for _ in range(20)} == {2, 3}
+
+
+def test_some_views_of_an_example_are_an_example_of_some_views(example: Example) -> None:
+    """As if it had been made of them, apart from the frame."""
+    part = select_views(example, [1, 3])
+    pixels = 48 * 36
+    assert (len(part.cameras), len(part.photos), part.covers.shape[:2]) == (2, 4, (2, 4))
+    torch.testing.assert_close(part.cameras.viewmats, example.cameras.viewmats[[1, 3]])
+    np.testing.assert_array_equal(part.members.means[:pixels], example.members.means[pixels : 2 * pixels])
+    np.testing.assert_array_equal(part.images, example.images[[1, 3, 0, 2]])
+    np.testing.assert_array_equal(part.covers[1, 2], example.covers[3, 0])
+    rows = torch.isin(example.features.views, torch.tensor([1, 3]))
+    torch.testing.assert_close(part.base.means, example.base.means[rows])
+    assert set(part.features.views.tolist()) == {0, 1}
+    for row in range(0, len(part.features), 17):
+        own = part.features.members[part.features.starts[row] : part.features.starts[row + 1]]
+        assert set((own // pixels).tolist()) == {int(part.features.views[row])}
+        weights = part.members.opacities[own.numpy()]
+        mean = (weights[:, None] * part.members.means[own.numpy()]).sum(0) / weights.sum()
+        np.testing.assert_allclose(part.features.means[row], mean, atol=1e-4)
+    assert part.mask(2).sum() <= example.mask(0).sum()
+    assert select_views(example, range(4)) is example
+
+
+def test_the_preset_s_examples_have_clusters(example: Example) -> None:
+    """Boxes of one surface that is seen from two places hardly ever share 0.7, which was their limit once."""
+    crop = whole_photo(example, 0).crop
+    paper = preset_options("paper")
+    sizes = torch.bincount(match_crop(crop, example.features, paper).clusters)
+    assert float(sizes[sizes > 1].sum()) > 0.1 * len(example.features)
+    strict = torch.bincount(match_crop(crop, example.features, replace(paper, iou=0.7)).clusters)
+    assert int(strict[strict > 1].sum()) < 0.5 * int(sizes[sizes > 1].sum())
+    shares = [predict(window.crop, noisy(TINY), PAPER, 0).matched for window in windows(example, 12)]
+    assert max(shares) > 0.1
+
+
+def test_every_network_gets_a_gradient(example: Example) -> None:
+    networks = noisy(replace(TINY, outputs="absolute")).requires_grad_(True)
+    sums: Counter[str] = Counter()
+    for window in windows(example, 12):
+        loss = window_loss(networks, window, {}, PAPER, 0, np.random.default_rng(0))
+        names, parameters = zip(*networks.named_parameters(), strict=True)
+        for name, part in zip(names, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
+            if part is not None:
+                sums[name.partition(".")[0] + name.partition("heads.")[2][:1]] += float(part.abs().sum())
+    assert {name for name, value in sums.items() if value > 0} == {"encoder", "merger", "refiner", "heads1", "heads2"}
+
+
+def test_training_moves_every_layer_of_the_merger(example: Example, tmp_path: Path) -> None:
+    """Beyond what weight decay does: the last layer begins at zero, which decay leaves there."""
+    options = replace(PAPER, steps=12, save_every=12, decay=0.0, average=0.0)
+    done = train([written(example, tmp_path)], [], tmp_path / "run", options)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)
+        before = Networks(options.network)
+    after = load_checkpoint(done.last).networks
+    assert after.options.outputs == "absolute"
+    for (name, start), end in zip(before.named_parameters(), after.parameters(), strict=True):
+        if name.startswith("merger"):
+            assert not torch.equal(start, end), name
+    assert bool(after.merger.out.weight.abs().max() > 1e-4)
+    assert done.validation_loss is None
+    header = (tmp_path / "run" / "losses.csv").read_text().splitlines()[0]
+    assert header == "step,rate,loss,psnr_analytic,psnr_learned,matched"
+
+
+def teacher_of(example: Example) -> Prediction:
+    """The Gaussians of the paper's two equations, by hand, for a whole example."""
+    crop, m = whole_photo(example, 0).crop, example.members
+    merged = merge(example.features, match_crop(crop, example.features, PAPER))
+    means, covars = [], []
+    for first, last in zip(merged.starts[:-1].tolist(), merged.starts[1:].tolist(), strict=True):
+        ids = merged.members[first:last].numpy()
+        weights, points = m.opacities[ids].astype(float)[:, None], m.means[ids].astype(float)
+        means.append((weights * points).sum(0) / weights.sum())  # eq. teacher_mean
+        offsets = points - means[-1]
+        covars.append((weights * offsets).T @ offsets / weights.sum())  # eq. teacher_cov
+    floor = (0.1 * merged.footprints.double())[:, None, None] ** 2 * torch.eye(3)  # one pixel has no spread
+    values, axes = torch.linalg.eigh(torch.from_numpy(np.stack(covars)) + floor)
+    axes[:, :, 0] *= torch.linalg.det(axes)[:, None]
+    count = len(merged)
+    gaussians = Gaussians(
+        torch.from_numpy(np.stack(means)).float(), rotations_to_quats(axes), values.sqrt().float(),
+        torch.full((count,), 0.5), torch.zeros(count, 1, 3), torch.zeros(count, 0, 3),
+    )  # fmt: skip
+    return Prediction(gaussians, torch.arange(count), merged, torch.zeros(count, 13), 0.0)
+
+
+def rotations_to_quats(rotations: torch.Tensor) -> torch.Tensor:
+    from gsmerge.geometry import rotmat_to_quat
+
+    return rotmat_to_quat(rotations).float()
+
+
+def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:
+    exact = teacher_of(example)
+    assert int((exact.merged.views < 0).sum()) > 0  # clusters too
+    assert float(teacher_loss(exact, example.members)) < 0.02  # rounding of nearly round ones
+    g = exact.gaussians
+    wider = replace(exact, gaussians=replace(g, scales=g.scales * 2))
+    difference = float(teacher_loss(wider, example.members)) - float(teacher_loss(exact, example.members))
+    assert difference == pytest.approx(np.log(2), abs=1e-3)
+    turned = replace(exact, gaussians=replace(g, quats=turn(g.quats, 0.2)))
+    assert float(teacher_loss(turned, example.members)) == pytest.approx(0.2, abs=0.04)
+    sizes = (g.scales[:, 1] * g.scales[:, 2]).sqrt()
+    moved = replace(exact, gaussians=replace(g, means=g.means + 0.3 * sizes[:, None]))
+    assert float(teacher_loss(moved, example.members)) == pytest.approx(0.3, abs=0.02)
+
+
+def turn(quats: torch.Tensor, angle: float) -> torch.Tensor:
+    """Rotated about the first axis of the world."""
+    w, x, y, z = quats.unbind(1)
+    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    return torch.stack([c * w - s * x, c * x + s * w, c * y - s * z, c * z + s * y], 1)
+
+
+def test_axes_in_another_order_are_the_same_gaussian(example: Example) -> None:
+    exact = teacher_of(example)
+    g = exact.gaussians
+    cycled = quat_to_rotmat(g.quats)[:, :, [1, 2, 0]]
+    other = replace(exact, gaussians=replace(g, quats=rotations_to_quats(cycled), scales=g.scales[:, [1, 2, 0]]))
+    assert float(teacher_loss(other, example.members)) < 0.02
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales"])
+def test_gradient_of_the_teacher_is_that_of_finite_differences(example: Example, name: str) -> None:
+    exact = teacher_of(example)
+    g, generator = exact.gaussians, torch.Generator().manual_seed(0)
+    start = replace(g, means=g.means + 0.1 * g.scales.max(), scales=g.scales * 1.3, quats=turn(g.quats, 0.1))
+    value = getattr(start, name).clone().requires_grad_(True)
+    direction = torch.randn(value.shape, generator=generator) * (g.scales if name != "quats" else 0.1)
+
+    def loss(tensor: torch.Tensor) -> torch.Tensor:
+        return teacher_loss(replace(exact, gaussians=replace(start, **{name: tensor})), example.members)
+
+    (gradient,) = torch.autograd.grad(loss(value), value)
+    with torch.no_grad():
+        ends = [float(loss(value + step * direction)) for step in (1e-2, -1e-2)]
+    assert float((gradient * direction).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-2, rel=0.05, abs=2e-3)
