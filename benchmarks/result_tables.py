@@ -168,8 +168,8 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         return []
     head = ("export", "method", "kept", *QUALITY)
     words = (
-        "One depth network, written as four programs write their files: what differs is order, encoding, frames and what"
-        " is left out or voxelised, not the network. The paper's table compares four networks. All input views."
+        "One depth network, written as four programs write their files: what differs is order, encoding, frames and"
+        " what is left out or voxelised, not the network. The paper's table compares four networks. All input views."
     )
     title = "Backbones (the paper's table of novel view synthesis)"
     return [

@@ -1,4 +1,4 @@
-"""One optimiser step on all parameters of all Gaussians, and the structural part of the image loss."""
+"""One optimiser step on all parameters of all Gaussians."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from gsmerge.kernels.jit import kernel
 # columns of the state: mean 3, log scale 3, quaternion 4, opacity logit 1, colour 3
 MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14
 MAX_LOGIT, MIN_LOGIT = f4(6.9), f4(-5.5)
-C1, C2 = f4(1e-4), f4(9e-4)  # SSIM's constants for a data range of 1
 
 
 @kernel
@@ -95,20 +94,3 @@ def adam(
         for c in range(4):
             quats[i, c] = x[i, QUAT + c]
         opacities[i] = f4(1.0) / (f4(1.0) + np.exp(-x[i, LOGIT]))
-
-
-@kernel
-def similarity_terms(mx, my, xx, yy, xy, out_mean, out_square, out_cross):
-    """Per-window derivatives of SSIM with respect to the window's mean, mean square and mean cross product.
-
-    All arrays flat float32; ``mx``, ``xx`` of the image, ``my``, ``yy`` of the photo, ``xy`` of both.
-    """
-    for i in range(mx.shape[0]):
-        a, b = mx[i], my[i]
-        n1, n2 = f4(2.0) * a * b + C1, f4(2.0) * (xy[i] - a * b) + C2
-        d1, d2 = a * a + b * b + C1, xx[i] - a * a + yy[i] - b * b + C2
-        q = f4(1.0) / (d1 * d2)
-        s = n1 * n2 * q
-        square, cross = -s / d2, f4(2.0) * n1 * q
-        out_mean[i] = f4(2.0) * b * n2 * q - f4(2.0) * a * s / d1 - f4(2.0) * a * square - b * cross
-        out_square[i], out_cross[i] = square, cross

@@ -92,7 +92,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     drawn = plan_view(state.splats, **photos.camera(view), opacities=opacities)
     colors = state.view_colors()
     image, transmittance = composite(drawn, colors, background)
-    gradient = image_gradient(image, photos.images[view], weight, plan.options.ssim_lambda)
+    gradient, error = image_gradient(image, photos.images[view], weight, plan.options.ssim_lambda)
     g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
     rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
     g.opacities[:] += np.float32(plan.options.opacity_reg / count)
@@ -110,8 +110,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
         )  # fmt: skip
 
     parallel_map(update, range(0, len(state.x), ROWS))
-    error = weight[..., None] * (image - photos.images[view]) ** 2
-    return float(error.sum(dtype=np.float64) / max(3 * weight.sum(), 1))
+    return error / max(3 * float(weight.sum()), 1)
 
 
 @dataclass(frozen=True)

@@ -6,21 +6,19 @@ quick to differentiate, so its values differ from the measured ones of :func:`gs
 
 from __future__ import annotations
 
-import cv2
+from itertools import pairwise
+
 import numpy as np
 import torch
+from numpy import float32 as f4
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from gsmerge.kernels.gaussians.optimise import C1, C2, similarity_terms
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.kernels.raster import image_loss
+from gsmerge.kernels.raster.image_loss import C1, C2
+from gsmerge.runtime.threads import parallel_map, use_threads
 
-LOSS_WINDOW = 7  # pixels per side of the windows of loss_ssim
-
-
-def _box(array: np.ndarray) -> np.ndarray:
-    """Window means; zero beyond the border, so that the operator is its own transpose."""
-    return cv2.blur(array, (LOSS_WINDOW, LOSS_WINDOW), borderType=cv2.BORDER_CONSTANT)
+LOSS_WINDOW = image_loss.SIDE  # pixels per side of the windows of loss_ssim
 
 
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
@@ -35,7 +33,9 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
     return above / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
 
 
-def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float) -> np.ndarray:
+def image_gradient(
+    image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float
+) -> tuple[np.ndarray, float]:
     """Gradient of the loss (1 - dssim) |image - photo| + dssim (1 - SSIM), per pixel of the image.
 
     Args:
@@ -45,21 +45,16 @@ def image_gradient(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssi
         ssim_lambda: Share of structural similarity, see :func:`loss_ssim`.
 
     Returns:
-        ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size.
+        ``[h,w,3]`` float32, divided by the number of pixels, so that it means the same at every size; and the
+        weighted sum of the squared errors of all channels.
     """
-    mean, square, cross = np.empty_like(image), np.empty_like(image), np.empty_like(image)
-    windows = parallel_map(lambda pair: _box(pair[0] if pair[1] is None else pair[0] * pair[1]), _pairs(image, photo))
-    similarity_terms(*(w.reshape(-1) for w in windows), mean.reshape(-1), square.reshape(-1), cross.reshape(-1))
-    channels = weight[..., None]
-    from_mean, from_square, from_cross = parallel_map(lambda a: _box(a * channels), (mean, square, cross))
-    from_square *= image
-    from_cross *= photo
-    similarity = from_mean + 2 * from_square + from_cross
-    gradient = np.float32(1 - ssim_lambda) * channels * np.sign(image - photo) - np.float32(ssim_lambda) * similarity
-    gradient /= np.float32(image.shape[0] * image.shape[1])
-    return gradient
-
-
-def _pairs(image: np.ndarray, photo: np.ndarray) -> list[tuple[np.ndarray, np.ndarray | None]]:
-    """What structural similarity takes window means of: both, their squares and their product."""
-    return [(image, None), (photo, None), (image, image), (photo, photo), (image, photo)]
+    height, width = weight.shape
+    gradient, errors = np.empty((height, 3 * width), np.float32), np.empty(height, np.float32)
+    flat, goal = (np.ascontiguousarray(a).reshape(height, -1) for a in (image, photo))
+    with use_threads() as threads:
+        cuts = [height * i // threads for i in range(threads + 1)]
+        parallel_map(
+            lambda span: image_loss.image_gradient(flat, goal, weight, f4(ssim_lambda), *span, gradient, errors),
+            list(pairwise(cuts)),
+        )
+    return gradient.reshape(height, width, 3), float(errors.sum(dtype=np.float64))
