@@ -44,19 +44,12 @@ MAX_FACTOR = 4  # times the usual count is the most that a quality target may ta
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What a number of Gaussians reaches after a short fit, on parts of the photos that it was not fitted to.
+    """What a number of Gaussians reaches after a short fit, on parts of the photos that it was not fitted to."""
 
-    Args:
-        count: Gaussians.
-        psnr: dB.
-        ssim: Structural similarity.
-        lpips: LPIPS (VGG), None where its weights are not installed.
-    """
-
-    count: int
-    psnr: float
-    ssim: float
-    lpips: float | None = None
+    count: int  # Gaussians
+    psnr: float  # dB
+    ssim: float  # Structural similarity
+    lpips: float | None = None  # LPIPS (AlexNet), None where its weights are not installed
 
 
 def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | None:
@@ -232,19 +225,12 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
 
 @dataclass(frozen=True)
 class Search:
-    """The outcome of a search for a quality.
+    """The outcome of a search for a quality."""
 
-    Args:
-        count: The count that was chosen.
-        psnr: What it reaches, dB.
-        met: Whether that is the target.
-        tried: Every count that was run and its PSNR, in the order of the runs.
-    """
-
-    count: int
-    psnr: float
-    met: bool
-    tried: tuple[tuple[int, float], ...]
+    count: int  # The count that was chosen
+    psnr: float  # What it reaches, dB
+    met: bool  # Whether that is the target
+    tried: tuple[tuple[int, float], ...]  # Every count that was run and its PSNR, in the order of the runs
 
 
 def search_count(run: Callable[[int], float], target: float, start: int, least: int, most: int) -> Search:

@@ -22,17 +22,11 @@ from gsmerge.types import Gaussians
 
 @dataclass(frozen=True, eq=False)
 class DecodePlan:
-    """What a file is decoded to.
+    """What a file is decoded to."""
 
-    Args:
-        counts: ``[g]`` most Gaussians of each group.
-        min_contribution: See :class:`StoredSettings`; 0: contributions are not measured.
-        notes: What differs from what was asked for, one sentence each.
-    """
-
-    counts: np.ndarray
-    min_contribution: float
-    notes: tuple[str, ...] = ()
+    counts: np.ndarray  # [g] most Gaussians of each group
+    min_contribution: float  # See StoredSettings; 0: contributions are not measured
+    notes: tuple[str, ...] = ()  # What differs from what was asked for, one sentence each
 
 
 def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | None = None) -> DecodePlan:

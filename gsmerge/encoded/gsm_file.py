@@ -149,18 +149,11 @@ def save_encoded(
 
 @dataclass(frozen=True, eq=False)
 class GsmFile:
-    """The content of a ``.gsm`` file, checked as it is taken.
-
-    Args:
-        path: The file.
-        kind: ``ENCODED`` or ``STATE``.
-        header: Its header, each entry of its type.
-        tensors: Tensors by key.
-    """
+    """The content of a ``.gsm`` file, checked as it is taken."""
 
     path: Path
-    kind: str
-    header: Mapping[str, Any]
+    kind: str  # `ENCODED` or `STATE`
+    header: Mapping[str, Any]  # Its header, each entry of its type
     tensors: Mapping[str, Tensor]
 
     def error(self, problem: str) -> SceneError:

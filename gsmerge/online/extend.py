@@ -52,33 +52,19 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelSc
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What became of a batch of views.
-
-    Args:
-        num_views: Views of the batch.
-        num_input: Gaussians of the batch.
-        num_new: Groups that it became, merged across its own views.
-        num_covered: Of these, left out because the state shows their pixels as well.
-        num_joined: Of the rest, those that were merged into groups of the state.
-        num_hidden: Of the rest, left out because none of the batch's views shows them.
-        num_groups: Groups of the state afterwards.
-        seconds: Wall time of each stage.
-        choices: What the stages decided.
-        notes: Warnings, one sentence each.
-        options: All settings, by their names in reports.
-    """
+    """What became of a batch of views."""
 
     num_views: int
-    num_input: int
-    num_new: int
-    num_covered: int
-    num_joined: int
-    num_hidden: int
-    num_groups: int
-    seconds: Mapping[str, float]
-    choices: Mapping[str, Any]
-    notes: tuple[str, ...]
-    options: Mapping[str, Any]
+    num_input: int  # Gaussians of the batch
+    num_new: int  # Groups that it became, merged across its own views
+    num_covered: int  # Of these, left out because the state shows their pixels as well
+    num_joined: int  # Of the rest, those that were merged into groups of the state
+    num_hidden: int  # Of the rest, left out because none of the batch's views shows them
+    num_groups: int  # Groups of the state afterwards
+    seconds: Mapping[str, float]  # Wall time of each stage
+    choices: Mapping[str, Any]  # What the stages decided
+    notes: tuple[str, ...]  # Warnings, one sentence each
+    options: Mapping[str, Any]  # All settings, by their names in reports
 
 
 def extend(

@@ -28,42 +28,25 @@ WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another 
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients of a loss with respect to the Gaussians of a plan.
+    """Gradients of a loss with respect to the Gaussians of a plan."""
 
-    Args:
-        ids: ``[m]`` int32, ascending: the Gaussians that the rows belong to; all others have none.
-        means: ``[m,3]`` float32, through geometry alone (colours seen from elsewhere: :func:`color_gradients`).
-        quats: ``[m,4]`` float32, with respect to the quaternions as they are, of whatever length.
-        scales: ``[m,3]`` float32, with respect to linear scales.
-        opacities: ``[m]`` float32.
-        colors: ``[m,3]`` float32, with respect to the colours in this view, as they are blended.
-        viewmat: ``[4,4]`` float64, last row 0; None if not asked for.
-    """
-
-    ids: Array
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    colors: Array
-    viewmat: Array | None
+    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    means: Array  # [m,3] float32, through geometry alone (colours seen from elsewhere: color_gradients)
+    quats: Array  # [m,4] float32, with respect to the quaternions as they are, of whatever length
+    scales: Array  # [m,3] float32, with respect to linear scales
+    opacities: Array  # [m] float32
+    colors: Array  # [m,3] float32, with respect to the colours in this view, as they are blended
+    viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
 
 
 @dataclass(frozen=True, eq=False)
 class ColorGradients:
-    """Gradients of a loss through the colours that the Gaussians of a plan show its view.
+    """Gradients of a loss through the colours that the Gaussians of a plan show its view."""
 
-    Args:
-        ids: ``[m]`` int32, ascending: the Gaussians that the rows belong to; all others have none.
-        sh0: ``[m,1,3]`` float32.
-        shN: ``[m,k-1,3]`` float32.
-        means: ``[m,3]`` float32, through the viewing direction alone.
-    """
-
-    ids: Array
-    sh0: Array
-    shN: Array
-    means: Array
+    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    sh0: Array  # [m,1,3] float32
+    shN: Array  # [m,k-1,3] float32
+    means: Array  # [m,3] float32, through the viewing direction alone
 
 
 def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:

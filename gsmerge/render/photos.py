@@ -26,19 +26,13 @@ EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 @dataclass(frozen=True)
 class Photos:
-    """V photos of one size.
+    """V photos of one size."""
 
-    Args:
-        images: ``[v,h,w,3]`` float32, sRGB in [0, 1].
-        viewmats: ``[v,4,4]`` world to camera.
-        Ks: ``[v,3,3]`` intrinsics at this size.
-        eps2d: Low-pass variance in square pixels of this size: it stays that of the full-size image, so that
-            scales are judged against the filter that they will be rendered with.
-    """
-
-    images: np.ndarray
-    viewmats: np.ndarray
-    Ks: np.ndarray
+    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]
+    viewmats: np.ndarray  # [v,4,4] world to camera
+    Ks: np.ndarray  # [v,3,3] intrinsics at this size
+    # Low-pass variance in square pixels of this size: it stays that of the full-size image, so that scales are judged
+    # against the filter that they will be rendered with
     eps2d: float
 
     def __len__(self) -> int:

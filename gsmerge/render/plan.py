@@ -24,25 +24,15 @@ MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Gaussians as the kernels take them: contiguous float32 arrays.
+    """Gaussians as the kernels take them: contiguous float32 arrays."""
 
-    Args:
-        means: ``[n,3]`` world positions less ``origin``.
-        quats: ``[n,4]`` wxyz.
-        scales: ``[n,3]`` linear.
-        opacities: ``[n]`` in [0, 1].
-        sh0: ``[n,1,3]``.
-        shN: ``[n,k-1,3]``.
-        origin: ``[3]`` float64, subtracted from the means before they were rounded to float32.
-    """
-
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    sh0: Array
-    shN: Array
-    origin: Array
+    means: Array  # [n,3] world positions less `origin`
+    quats: Array  # [n,4] wxyz
+    scales: Array  # [n,3] linear
+    opacities: Array  # [n] in [0, 1]
+    sh0: Array  # [n,1,3]
+    shN: Array  # [n,k-1,3]
+    origin: Array  # [3] float64, subtracted from the means before they were rounded to float32
 
     def __len__(self) -> int:
         return len(self.means)
@@ -50,35 +40,20 @@ class Splats:
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """What is drawn where in one view.
-
-    Args:
-        splats: The Gaussians.
-        ids: ``[m]`` int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
-        footprints: ``[m,8]`` float32, see :mod:`gsmerge.kernels.raster.project`.
-        depths: ``[m]`` float32, camera z.
-        members: ``[intersections]`` int32 rows of ``ids``, tile after tile, nearest first.
-        offsets: ``[tiles+1]`` int64 starts of the tiles' lists.
-        eye: ``[3]`` float32, the camera's centre less ``splats.origin``.
-        opacities: ``[n]`` float32, those that are drawn.
-        camera: The view's numbers in the order of :mod:`gsmerge.kernels.raster.project`, float32.
-        viewmat: ``[4,4]`` float64, world to camera.
-        width: Image width, pixels.
-        height: Image height, pixels.
-    """
+    """What is drawn where in one view."""
 
     splats: Splats
-    ids: Array
-    footprints: Array
-    depths: Array
-    members: Array
-    offsets: Array
-    eye: Array
-    opacities: Array
-    camera: Array
-    viewmat: Array
-    width: int
-    height: int
+    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
+    footprints: Array  # [m,8] float32, see gsmerge.kernels.raster.project
+    depths: Array  # [m] float32, camera z
+    members: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
+    offsets: Array  # [tiles+1] int64 starts of the tiles' lists
+    eye: Array  # [3] float32, the camera's centre less `splats.origin`
+    opacities: Array  # [n] float32, those that are drawn
+    camera: Array  # The view's numbers in the order of gsmerge.kernels.raster.project, float32
+    viewmat: Array  # [4,4] float64, world to camera
+    width: int  # pixels
+    height: int  # pixels
 
     @property
     def columns(self) -> int:

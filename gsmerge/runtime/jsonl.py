@@ -22,15 +22,10 @@ except ImportError:  # not a POSIX system: one process at a time
 
 @dataclass(frozen=True)
 class Lines:
-    """What a file of JSON lines holds.
+    """What a file of JSON lines holds."""
 
-    Args:
-        values: One per line that could be read.
-        notes: Lines that were dropped, one sentence each.
-    """
-
-    values: tuple[dict[str, Any], ...]
-    notes: tuple[str, ...]
+    values: tuple[dict[str, Any], ...]  # One per line that could be read
+    notes: tuple[str, ...]  # Lines that were dropped, one sentence each
 
 
 def read_lines(path: Path) -> Lines:
