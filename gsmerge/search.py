@@ -53,13 +53,7 @@ class CurvePoint:
 
 
 def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | None:
-    """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say.
-
-    Args:
-        prepared: The scene.
-        build: What makes Gaussians of it, see :func:`gsmerge.pipeline.build`.
-        log: Takes the curve.
-    """
+    """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say."""
     limits, options = prepared.limits, prepared.options
     drop = options.budget.max_drop
     if drop is None and not options.budget.auto:
@@ -78,8 +72,6 @@ def search_quality(prepared: PreparedScene, build: Build, score: Score, log: Run
 
     Args:
         prepared: The scene, with a PSNR as ``quality`` among its options.
-        build: What makes Gaussians of it.
-        score: What makes a result of those.
         log: Of what came before; its seconds and notes enter the report.
     """
     target, limits = prepared.options.budget.target_psnr, prepared.limits
@@ -118,10 +110,8 @@ def measure_curve(
 
     Args:
         prepared: The scene, which must have photos.
-        build: What makes Gaussians of it.
         steps: Length of the fits; those of the options do not matter.
         counts: Numbers of Gaussians, each within the limits.
-        log: Takes the progress.
     """
     options = prepared.options
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
@@ -173,14 +163,7 @@ def level_counts(finest: int, levels: int, least: int) -> list[int]:
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
     """The fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
 
-    Between points the curve is a straight line over the logarithm of the count.
-
-    Args:
-        points: By rising count, at least one.
-        max_drop: dB.
-
-    Raises:
-        ValueError: If there is no point.
+    Between points, which come by rising count, the curve is a straight line over the logarithm of the count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -197,13 +180,7 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     """The count beyond which more Gaussians are not worth it, by PSNR and structure together.
 
     The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB per doubling, on
-    a straight line between the slopes that lie midway between the points.
-
-    Args:
-        points: By rising count, at least one.
-
-    Raises:
-        ValueError: If there is no point.
+    a straight line between the slopes that lie midway between the points, which come by rising count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -238,10 +215,6 @@ def search_count(run: Callable[[int], float], target: float, start: int, least: 
 
     Args:
         run: Count -> PSNR (dB), taken to rise with the count.
-        target: dB.
-        start: First count.
-        least: Fewest Gaussians that can be run.
-        most: Most Gaussians that are allowed.
     """
     tried: dict[int, float] = {}
     count = min(max(start, least), most)

@@ -114,12 +114,7 @@ def _bytes(text: str | None) -> int | None:
 
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: RecordIndex, schedule: Schedule) -> None:
-    """Compact all scenes, report each, and sum up.
-
-    Raises:
-        BatchError: If a scene failed.
-        TargetError: If none did, and a result misses its target.
-    """
+    """Compact all scenes, report each, and sum up."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.summary import Totals, summary_lines, write_summary
 

@@ -69,12 +69,7 @@ def _generate(args: opt.Args, options: GenerateOptions, seed: int) -> list[Scene
 
 
 def _options(args: opt.Args) -> GenerateOptions:
-    """The settings of the scenes.
-
-    Raises:
-        UsageError: If a value is none of the possible ones.
-        SceneError: If the file of ranges cannot be read.
-    """
+    """The settings of the scenes."""
     from gsmerge.research.generate import GenerateOptions, read_ranges
 
     counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", args.views)

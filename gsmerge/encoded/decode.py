@@ -30,11 +30,7 @@ class DecodePlan:
 
 
 def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | None = None) -> DecodePlan:
-    """How many Gaussians each group becomes, see :func:`decode_scene`.
-
-    Raises:
-        UsageError: As :func:`decode_scene`.
-    """
+    """How many Gaussians each group becomes, see :func:`decode_scene`."""
     s = encoded.settings
     if budget is not None and k is not None:
         raise UsageError("expected one of k and budget, got both")

@@ -74,17 +74,10 @@ def write_gsm(
     """Write a ``.gsm`` file: what both kinds have, and ``entries`` and ``tensors`` of one kind.
 
     Args:
-        path: The file; complete, or what it was before.
         kind: ``ENCODED`` or ``STATE``.
-        stored: The content.
-        features: Its groups.
         children: The prefix of their children's keys, and the children.
         entries: Further entries of the header.
         tensors: Further tensors by key.
-        overwrite: Replace an existing file.
-
-    Raises:
-        SceneError: If the file exists or cannot be written.
     """
     frame, cameras, settings = stored.frame, stored.cameras, asdict(stored.settings)
     header = {
@@ -161,11 +154,7 @@ class GsmFile:
         return SceneError(self.path, problem, REMEDY)
 
     def tensor(self, key: str, dtype: torch.dtype, *shape: int | None) -> Tensor:
-        """A tensor of a type and shape (None: any size), finite.
-
-        Raises:
-            SceneError: If it is missing, another one, or not finite.
-        """
+        """A tensor of a type and shape (None: any size), finite."""
         tensor = self.tensors.get(key)
         expected = f"{key}: expected {str(dtype).removeprefix('torch.')} {['n' if n is None else n for n in shape]}"
         if tensor is None:
@@ -231,12 +220,7 @@ class GsmFile:
 
 
 def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
-    """Read a ``.gsm`` file of one of some kinds.
-
-    Raises:
-        SceneError: If there is no such file, it is damaged or of another format or a newer schema, or its header lacks
-            an entry.
-    """
+    """Read a ``.gsm`` file of one of some kinds."""
     path = Path(path)
     check_file(path)
     try:
@@ -282,11 +266,7 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
 
 
 def read_encoded(file: GsmFile) -> Encoded:
-    """The encoded scene of a file of that kind.
-
-    Raises:
-        SceneError: As :func:`load_encoded`.
-    """
+    """The encoded scene of a file of that kind."""
     features, settings = file.features(), file.settings()
     common = file.common(features.shN.shape[1])
     return Encoded(

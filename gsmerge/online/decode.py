@@ -44,11 +44,7 @@ def default_fit(stored: Encoded | OnlineState) -> FitOptions:
 
 
 def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
-    """Refuse a fit without photos.
-
-    Raises:
-        UsageError: If a fit is asked for and there are no photos.
-    """
+    """Refuse a fit without photos."""
     if options.fit != "none" and not num_photos(stored):
         raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
 
@@ -67,12 +63,8 @@ def decode_stored(
 
     Args:
         stored: A state of one or more batches, or an encoded scene, which has no photos.
-        k: As of :func:`gsmerge.decode_scene`.
         budget: As there. A full fit begins with fewer and grows to the number.
         options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
-        seed: Of the fit.
-        threads: Threads to use; None: all processors.
-        progress: As of :func:`gsmerge.compact`.
 
     Raises:
         UsageError: If a fit is asked for and there are no photos, or K or the budget is out of range.

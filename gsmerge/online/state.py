@@ -81,15 +81,7 @@ class OnlineState(StoredScene):
 def bake(
     features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int, rule: Rule = "depth"
 ) -> GroupSet:
-    """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more.
-
-    Args:
-        features: g Feature Gaussians with their members.
-        members: The Gaussians that they point to.
-        networks: Networks whose heads correct what is decoded; None: none do.
-        max_k: Most children that are stored of a group.
-        rule: How children are pooled.
-    """
+    """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -205,12 +197,7 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
 
 
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """The state as an encoded scene, which decodes at any K and budget.
-
-    Args:
-        state: Of one or more batches.
-        fitted_colors: Use the colours that fit the photos; otherwise those of the exports.
-    """
+    """The state as an encoded scene, in the colours that fit the photos or else in those of the exports."""
     groups = with_fitted_colors(state.groups) if fitted_colors else state.groups
     features = groups.features
     return Encoded(

@@ -83,12 +83,8 @@ def rasterize(
         colors: ``[n,3]``, taken as they are, or with ``sh_degree`` ``[n,k,3]`` spherical harmonics.
         cameras: World-to-camera matrices ``[c,4,4]``, intrinsics ``[c,3,3]``, width and height.
         background: ``[3]``.
-        sh_degree: Degree of the spherical harmonics; None: ``colors`` are colours.
         eps2d: Dilation of the footprints, pixels squared.
         antialiased: Lower the opacity by what the dilation adds to the footprint.
-        near: Nearest depth drawn.
-        far: Farthest depth drawn.
-        with_depths: Also the mean depth.
 
     Returns:
         Images, alphas and depths, on the device of the tensors, the depths without gradients; and ``[c,n]`` bool: which

@@ -49,7 +49,6 @@ def draw_views(
         plan_one: Plans the view of a number.
         shape: Views, height and width.
         background: ``[3]`` float32.
-        with_depths: Also draw depths.
     """
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.zeros((*shape, 1), np.float32) if with_depths else None
@@ -73,11 +72,7 @@ def draw_views(
 
 
 def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device:
-    """The device of all tensors.
-
-    Raises:
-        ValueError: If there are several.
-    """
+    """The device of all tensors."""
     devices = {tensor.device for tensor in (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)}
     if len(devices) > 1:
         named = " and ".join(sorted(map(str, devices)))

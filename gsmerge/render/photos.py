@@ -74,11 +74,7 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
 
 
 def scene_photos(scene: PixelScene | UnalignedScene, level: int = 1) -> Photos:
-    """The scene's photos, each side divided by ``level`` (area averages).
-
-    Raises:
-        ValueError: If the scene has no images.
-    """
+    """The scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     return photos_of(scene.images.numpy(), scene.cameras, level)
@@ -119,16 +115,11 @@ def photo_errors(
     """Render some Gaussians into the photos' cameras and score every picture, several views at once.
 
     Args:
-        gaussians: n Gaussians.
-        photos: V photos.
         score: Called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
         views: Of the photos, in the order of the result; None: all.
         near: Near plane, in the Gaussians' unit.
         colors: ``[n,3]`` in place of the Gaussians' harmonics.
         keep: View -> ``[n]`` mask of the Gaussians that are drawn in it; None: all.
-
-    Returns:
-        The score of each view.
     """
     splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
 

@@ -88,9 +88,6 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
         gaussians: n Gaussians; means may be float64, for scenes in geographic coordinates.
         origin: ``[3]`` world point that becomes the arrays' zero. None: the world's zero, unless the scene is far
             away from it compared with its size.
-
-    Returns:
-        The arrays.
     """
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
     means = gaussians.means
@@ -193,11 +190,7 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
 
 
 def check_range(near: float, far: float, eps2d: float) -> None:
-    """Refuse a depth range or a dilation that makes no sense.
-
-    Raises:
-        ValueError: If it does not.
-    """
+    """Refuse a depth range or a dilation that makes no sense."""
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
 

@@ -40,10 +40,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
 
     Args:
         pixels: Of all views together, or Gaussians where they are more.
-        view_pixels: Of one view.
         options: All settings by flat name, with the checkpoint that is used.
-        photos: Whether the scene has photos.
-        fit_steps: Steps of the full fit.
     """
     method, fit, views = options["method"], fit_of(options, photos=photos), pixels / max(view_pixels, 1)
     if method == "gsmerge":
@@ -68,19 +65,13 @@ def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
 
     Args:
         pixels: As of :func:`work_seconds`.
-        photos: Whether the scene has photos.
         num_rest: Columns of higher harmonics.
     """
     return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
 
 
 def memory_problem(needed: int, available: int | None) -> str | None:
-    """A sentence where a scene is not likely to fit into the machine's memory; None where it does.
-
-    Args:
-        needed: Bytes, by :func:`memory_bytes`.
-        available: Bytes that the machine has; None: not known.
-    """
+    """A sentence where the bytes of :func:`memory_bytes` are not likely to fit into the machine's; None where they do."""
     if available is None or needed <= available:
         return None
     return (

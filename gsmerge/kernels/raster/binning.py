@@ -68,8 +68,6 @@ def count_tiles(boxes, lines, columns):
 
     Args:
         boxes: ``[m,4]`` int16 first and (exclusive) last tile column, first and last tile row.
-        lines: Rows of tiles.
-        columns: Tiles per row.
 
     Returns:
         ``[lines * columns]`` int64.
@@ -99,7 +97,6 @@ def deal_tiles(order, boxes, columns, cursors, members):
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
         boxes: ``[m,4]`` int16 their boxes, in the same order.
-        columns: Tiles per row.
         cursors: ``[tiles]`` int64 where each list goes on, advanced.
         members: ``[intersections]`` int32, written.
     """

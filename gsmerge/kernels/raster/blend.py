@@ -138,13 +138,6 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
     """Blend a range of tiles into an image.
 
     Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        colors: ``[m,3]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        first: First tile.
-        last: Last tile, exclusive.
         background: ``[3]`` float32.
         image: ``[h,w,3]`` float32, written in the tiles' pixels.
         transmittance: ``[h,w]`` float32, likewise.
@@ -212,12 +205,6 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
     """Per intersection of a range of tiles: the weights times up to four channels of an image, summed.
 
     Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        first: First tile.
-        last: Last tile, exclusive.
         image: ``[h,w,c]`` float32, c <= CHANNELS.
         slots: ``[intersections,CHANNELS]`` float32, written in the tiles' part.
     """
@@ -249,9 +236,7 @@ def add_slots(members, slots, ids, first, sums):
     """Add the intersections' sums to their Gaussians, in the order of the lists.
 
     Args:
-        members: ``[intersections]`` int32.
         slots: ``[intersections,CHANNELS]`` float32.
-        ids: ``[m]`` int32.
         first: First channel of ``sums`` to add to.
         sums: ``[n,c]`` float32, added to.
     """
@@ -288,12 +273,6 @@ def contributions(footprints, members, offsets, columns, height, width, totals):
     """Sum and maximum over the pixels of every Gaussian's weight.
 
     Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        height: Of the image, pixels.
-        width: Of the image, pixels.
         totals: ``[m,2]`` float32: sums, added to, and maxima, raised.
     """
     state = np.empty(3 * PLANE, np.float32)

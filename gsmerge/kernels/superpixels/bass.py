@@ -120,7 +120,6 @@ def infer_labels(labels, colours, count):
     Args:
         labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; they stay so.
         colours: ``[h,w,3]`` float32, CIELAB / 100.
-        count: Number of regions.
     """
     height, width, _ = colours.shape
     table = simple_point_table()
