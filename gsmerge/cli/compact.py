@@ -80,8 +80,7 @@ def _run(
         def move(stage: str, done: int, total: int) -> None:
             if stage == "fit":
                 finish()
-            if progress is not None:
-                progress(stage, done, total)
+            progress(stage, done, total)
 
         return compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,

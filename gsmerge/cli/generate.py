@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,11 +61,7 @@ def _generate(args: opt.Args, options: GenerateOptions, seed: int) -> list[Scene
     if args.dry_run:
         return plan(args.output, args.scenes, options, **where)
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
-
-        def move(done: int, total: int) -> None:
-            if progress is not None:
-                progress("generate", done, total)
-
+        move = partial(progress, "generate")
         return generate_scenes(args.output, args.scenes, options, **where, threads=args.threads, progress=move)
 
 

@@ -85,5 +85,4 @@ def _write_renders(args: opt.Args, gaussians: Gaussians, views: Cameras, picture
             ).images
             for path, image in zip(pictures[some], renders, strict=True):
                 write_picture(path, to_picture(image), overwrite=args.overwrite)
-            if progress is not None:
-                progress("render", min(first + count, len(views)), len(views))
+            progress("render", min(first + count, len(views)), len(views))

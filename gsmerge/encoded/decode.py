@@ -82,11 +82,7 @@ def _distribute(encoded: Encoded, total: int) -> DecodePlan:
 
 
 def decode_scene(
-    encoded: Encoded,
-    *,
-    k: int | None = None,
-    budget: int | str | None = None,
-    threads: int | None = None,
+    encoded: Encoded, *, k: int | None = None, budget: int | str | None = None, threads: int | None = None
 ) -> Gaussians:
     """The Gaussians of an encoded scene, in the scene's own world frame. No fit follows, as there are no photos.
 

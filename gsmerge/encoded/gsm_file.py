@@ -104,11 +104,7 @@ def write_gsm(
 
 
 def save_encoded(
-    path: str | PathLike[str],
-    encoded: Encoded,
-    *,
-    overwrite: bool = False,
-    source: Mapping[str, Any] | None = None,
+    path: str | PathLike[str], encoded: Encoded, *, overwrite: bool = False, source: Mapping[str, Any] | None = None
 ) -> None:
     """Write an encoded scene.
 

@@ -59,7 +59,7 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
 
 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
-    """``[g]`` mean of the pixels' errors ``[v,h,w]`` over every group's members; a member without a pixel counts as 1."""
+    """``[g]`` mean of the pixels' errors ``[v,h,w]`` over each group's members; one without a pixel counts as 1."""
     rows = features.members.numpy()
     pixels = rows if members.pixels is None else members.pixels[rows]
     each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)

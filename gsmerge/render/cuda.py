@@ -135,14 +135,7 @@ def _empty(tensors: tuple[Tensor, ...], backgrounds: Tensor, size: tuple[int, in
 
 
 def render_cuda(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    background: Array,
-    *,
-    antialiased: bool,
-    near: float,
-    far: float,
-    with_depths: bool,
+    gaussians: Gaussians, cameras: Cameras, background: Array, *, near: float, far: float, **options: Any
 ) -> Rendering:
     """:func:`gsmerge.render` by gsplat; same arguments, except for the checked ``[3]`` background.
 
@@ -160,10 +153,9 @@ def render_cuda(
         (local, cameras.Ks, cameras.width, cameras.height),
         torch.from_numpy(background),
         sh_degree=gaussians.sh_degree,
-        antialiased=antialiased,
         near=near,
         far=far,
-        with_depths=with_depths,
+        **options,
     )
     return drawn
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
 from gsmerge.render.blend import view_colors
-from gsmerge.render.plan import Array, ViewPlan, pieces
+from gsmerge.render.plan import Array, ViewPlan, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
@@ -53,15 +53,6 @@ def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
     return np.ascontiguousarray(array, np.float32)
-
-
-def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
-    """Ranges of tiles with about equally many intersections, some per thread."""
-    count = len(plan.members)
-    num = 1 if threads == 1 else max(1, min(4 * threads, count // WORTH))
-    cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
-    return list(pairwise(edges.tolist()))
 
 
 def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
@@ -106,7 +97,7 @@ def gradients_of(
         tints[slice(*span)] = sums[slice(*span), :3]
 
     with use_threads() as threads:
-        parallel_map(tiles, _tile_ranges(plan, threads))
+        parallel_map(tiles, tile_ranges(plan, threads, WORTH))
         parallel_map(project, _blocks(m, threads))
     viewmat = None
     if with_viewmat:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -116,25 +117,19 @@ def render(
         GsmergeError: If CUDA tensors are given and gsplat is not installed.
     """
     under = background_color(background.detach().cpu() if isinstance(background, Tensor) else background)
+    options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
     if one_device(gaussians, cameras).type == "cuda":
         from gsmerge.render.cuda import render_cuda
 
-        return render_cuda(
-            gaussians, cameras, under, antialiased=antialiased, near=near, far=far, with_depths=with_depths
-        )
+        return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
     inputs = (*vars(gaussians).values(), cameras.viewmats)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         from gsmerge.render.autograd import render_differentiable  # compiled only for those who train
 
-        return render_differentiable(
-            gaussians, cameras, under, antialiased=antialiased, near=near, far=far, with_depths=with_depths
-        )
+        return render_differentiable(gaussians, cameras, under, with_depths=with_depths, **options)
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
     def plan_one(view: int) -> ViewPlan:
-        return plan_view(
-            splats, viewmats[view], Ks[view], cameras.width, cameras.height,
-            antialiased=antialiased, near=near, far=far,
-        )  # fmt: skip
+        return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
 
     return draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)

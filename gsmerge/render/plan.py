@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -104,10 +105,24 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     )
 
 
+def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
+    """Pieces of work for the pool, some per thread as they may take unequally long, each of about ``least`` or more."""
+    return 1 if threads == 1 else max(1, min(4 * threads, count // least))
+
+
 def pieces(count: int, threads: int) -> list[tuple[int, int]]:
-    """Ranges for the pool, some per thread as they may take unequally long; no result depends on where they end."""
-    num = 1 if threads == 1 else max(1, min(4 * threads, count // PIECE))
+    """Ranges for the pool; no result depends on where they end."""
+    num = num_pieces(count, threads)
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
+
+
+def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
+    """Ranges of tiles with about equally many intersections, at least about ``least``, for the pool."""
+    count = len(plan.members)
+    num = num_pieces(count, threads, least)
+    cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
+    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
+    return list(pairwise(edges.tolist()))
 
 
 def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool) -> Array:

@@ -71,7 +71,7 @@ def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
 
 
 def memory_problem(needed: int, available: int | None) -> str | None:
-    """A sentence where the bytes of :func:`memory_bytes` are not likely to fit into the machine's; None where they do."""
+    """A sentence where the bytes of :func:`memory_bytes` are not likely to fit into the machine; None if they do."""
     if available is None or needed <= available:
         return None
     return (
