@@ -13,7 +13,7 @@ from gsmerge.cli.console import announce_compilation, print_document, stage_prog
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.research.generate import GenerateOptions, SceneFolder
+    from gsmerge.research.generate import GenerateOptions
 
 
 @opt.command(
@@ -41,28 +41,23 @@ def generate(args: opt.Args) -> None:
     if out.exists() and not out.is_dir():
         raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     seed = args.seed or 0
-    scenes = _generate(args, options, seed)
     from gsmerge.report import document_head
+    from gsmerge.research.generate import generate as generate_scenes
+    from gsmerge.research.generate import plan
 
+    where: dict[str, Any] = {"seed": seed, "overwrite": args.overwrite}
+    if args.dry_run:
+        scenes = plan(out, args.scenes, options, **where)
+    else:
+        with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+            move = partial(progress, "generate")
+            scenes = generate_scenes(out, args.scenes, options, **where, threads=args.threads, progress=move)
     document = {**document_head(), "options": options.to_dict(), "seed": seed, "dry_run": args.dry_run, "notes": []}
     document["scenes"] = [{"folder": str(scene.folder), "kept": scene.kept} for scene in scenes]
     kept = sum(scene.kept for scene in scenes)
     line = f"{out}: {'would write ' if args.dry_run else ''}{len(scenes) - kept} scenes"
     line += f", {kept} were there already" if kept else ""
     print_document(document, line, as_json=args.json, quiet=args.quiet)
-
-
-def _generate(args: opt.Args, options: GenerateOptions, seed: int) -> list[SceneFolder]:
-    """Make the scenes, or list which there would be."""
-    from gsmerge.research.generate import generate as generate_scenes
-    from gsmerge.research.generate import plan
-
-    where: dict[str, Any] = {"seed": seed, "overwrite": args.overwrite}
-    if args.dry_run:
-        return plan(args.output, args.scenes, options, **where)
-    with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
-        move = partial(progress, "generate")
-        return generate_scenes(args.output, args.scenes, options, **where, threads=args.threads, progress=move)
 
 
 def _options(args: opt.Args) -> GenerateOptions:
