@@ -50,11 +50,11 @@ class StoredSettings:
     # Gaussians that add less than this to every pixel of every view that they lie in are left out, where no number is
     # to be met; 0: none are
     min_contribution: float
-    target_count: int | None  # Gaussians that a budget asked for, without those that no view sees; None without one
+    target_count: int | None = None  # Gaussians that a budget asked for, without those that no view sees
     # Of an unaligned scene, its groups and the empty superpixels whose Gaussians other groups get; None: K Gaussians
     # for each group
-    num_slots: int | None
-    knee_count: int  # Gaussians at the knee of the scene's own curve of distortion: `--budget auto` without photos
+    num_slots: int | None = None
+    knee_count: int = 0  # Gaussians at the knee of the scene's own curve of distortion: `--budget auto` without photos
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

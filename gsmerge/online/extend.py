@@ -226,9 +226,6 @@ def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> Onlin
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
         min_contribution=options.fit.min_contribution if prepared.given.images is not None else 0.0,
-        target_count=None,
-        num_slots=None,
-        knee_count=0,
     )
     return OnlineState(
         groups=groups,
