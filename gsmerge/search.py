@@ -68,11 +68,9 @@ def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | No
 
 
 def search_quality(prepared: PreparedScene, build: Build, score: Score, log: RunLog) -> CompactResult:
-    """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do.
+    """The fewest Gaussians that render the input photos at the PSNR among the options; the best result where none do.
 
-    Args:
-        prepared: The scene, with a PSNR as ``quality`` among its options.
-        log: Of what came before; its seconds and notes enter the report.
+    The seconds and notes of ``log``, of what came before, enter the report.
     """
     target, limits = prepared.options.budget.target_psnr, prepared.limits
     assert target is not None
@@ -106,12 +104,8 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
-    PSNR and SSIM are those of blocks that the short fits leave out, at full size; LPIPS needs whole pictures.
-
-    Args:
-        prepared: The scene, which must have photos.
-        steps: Length of the fits; those of the options do not matter.
-        counts: Numbers of Gaussians, each within the limits.
+    The fits take ``steps``, whatever the options say. PSNR and SSIM are those of blocks that the fits leave out, at
+    full size; LPIPS needs whole pictures.
     """
     options = prepared.options
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
@@ -213,8 +207,7 @@ class Search:
 def search_count(run: Callable[[int], float], target: float, start: int, least: int, most: int) -> Search:
     """The fewest Gaussians that reach a PSNR, within 15 %, by a few runs; the best of them where none does.
 
-    Args:
-        run: Count -> PSNR (dB), taken to rise with the count.
+    ``run``: count -> PSNR (dB), taken to rise with the count.
     """
     tried: dict[int, float] = {}
     count = min(max(start, least), most)

@@ -59,11 +59,7 @@ def write_picture(path: Path, picture: Picture, *, overwrite: bool) -> None:
 
 
 def report_pictures(args: Args, pictures: Sequence[Path], facts: Mapping[str, Any], line: str) -> None:
-    """Say which pictures were written, or would be: as JSON on stdout, or as a line on stderr.
-
-    Args:
-        facts: Further entries of the JSON document.
-    """
+    """Say which pictures were written, or would be: as JSON with further ``facts``, or as a line."""
     from gsmerge.report import document_head
 
     if args.json or args.dry_run:

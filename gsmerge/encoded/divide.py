@@ -51,13 +51,10 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: R
 
 
 def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which Gaussians stand for each group, and the group ``[n]`` of each, rising.
-
-    Args:
-        counts: ``[g]`` most Gaussians of each, at least 1.
+    """Which Gaussians stand for each of g groups, at most ``counts [g]`` of it, and the rising group of each.
 
     Returns:
-        ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children.
+        ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children, and ``[n]`` groups.
     """
     splits, slots = division.splits.numpy().astype(np.int64), division.slots.numpy().astype(np.int64)
     count, uniform = len(splits), division.uniform.numpy()

@@ -63,7 +63,7 @@ def decode_stored(
 
     Args:
         stored: A state of one or more batches, or an encoded scene, which has no photos.
-        budget: As there. A full fit begins with fewer and grows to the number.
+        k, budget: As of :func:`gsmerge.decode_scene`. A full fit begins with fewer and grows to the number.
         options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
 
     Raises:

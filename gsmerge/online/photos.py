@@ -76,8 +76,7 @@ def update_replay(
 ) -> Replay:
     """The stored photos with new ones among them: every n-th of all views, n a power of two.
 
-    Args:
-        view_ids: ``[s]`` the view of each new one; of a view that is stored already, the first photo stays.
+    ``view_ids [s]``: the view of each new one; of a view that is stored already, the first photo stays.
     """
     ids, rows = np.unique(view_ids, return_index=True)
     new = ~np.isin(ids, replay.views)

@@ -44,13 +44,7 @@ def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array
 def draw_views(
     plan_one: Callable[[int], ViewPlan], shape: tuple[int, int, int], background: Array, with_depths: bool
 ) -> Rendering:
-    """Draw the plans of ``c`` views.
-
-    Args:
-        plan_one: Plans the view of a number.
-        shape: Views, height and width.
-        background: ``[3]`` float32.
-    """
+    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width)."""
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.zeros((*shape, 1), np.float32) if with_depths else None
 

@@ -61,9 +61,7 @@ def score_cost(views: float) -> float:
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
     """Memory that a scene takes, imports included, within a factor of about two.
 
-    Args:
-        pixels: As of :func:`work_seconds`.
-        num_rest: Columns of higher harmonics.
+    ``pixels`` as of :func:`work_seconds`; ``num_rest``: columns of higher harmonics.
     """
     return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
 
@@ -103,11 +101,8 @@ def estimate_run(
 
     Args:
         grid: Views, height and width.
-        options: All settings by flat name, as of ``CompactOptions.resolved()``.
-        num_pixels: Of all views together, or Gaussians where they are more.
-        photos: Whether the scene has photos.
+        options: As of :func:`work_seconds`, and so are ``num_pixels`` (its ``pixels``), ``photos`` and ``fit_steps``.
         threads: Threads that run.
-        fit_steps: Steps of the full fit.
         num_rest: Columns of higher harmonics.
 
     Returns:

@@ -171,12 +171,7 @@ def blend_backward(
 
 @kernel
 def gather_slots(members, slots, first, last, sums):
-    """Add up the rows of the Gaussians first to last, in the order of the lists.
-
-    Args:
-        slots: ``[intersections,SUMS]`` float32.
-        sums: ``[m,SUMS]`` float32, added to.
-    """
+    """Add the ``slots [intersections,SUMS]`` of some Gaussians to ``sums [m,SUMS]``, in the order of the lists."""
     num = members.shape[0]
     for i in range(num):
         k = members[i]

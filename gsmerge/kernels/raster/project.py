@@ -81,14 +81,11 @@ def _cull_block(block, camera):
 
 @kernel
 def cull(means, scales, opacities, keep, camera, first, last, ids):
-    """List the Gaussians of a range that may touch the image.
+    """List the Gaussians of a range that may touch the image -> their number.
 
     Args:
         keep: ``[n]`` uint8, 0 drops a Gaussian; an empty array keeps all.
         ids: ``[last - first + 1]`` int32, written: ascending.
-
-    Returns:
-        The number of ids written.
     """
     block = np.zeros(7 * BLOCK, np.float32)
     count = 0

@@ -103,11 +103,10 @@ CONNECTIVITY = connectivity_table()
 
 
 def refine(labels, pixels, count, num_sweeps, spread):
-    """Sweep in place, forth and back, until nothing moves or ``num_sweeps`` are done; returns the labels.
+    """Sweep in place, forth and back, until nothing moves or ``num_sweeps`` are done; returns the padded labels.
 
-    Args:
-        labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; they stay so.
-        spread: Square root of the weight of squared pixels against squared colours, float32.
+    Each of the ``count`` regions is 4-connected and not empty, and stays so. ``spread``: square root of the weight of
+    squared pixels against squared colours, float32.
     """
     rows = region_rows(labels, pixels, count, count, spread)
     num_pixels = rows[:, NUM_PIXELS]
