@@ -29,12 +29,6 @@ def check_format(output: Path, budget: BudgetOptions | None = None) -> None:
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
-def check_picture(output: Path) -> None:
-    """Refuse a name that promises another format than the one that pictures are written in."""
-    if output.suffix.lower() != ".png":
-        raise UsageError(f"{output}: expected a name that ends in .png")
-
-
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Refuse an output file that is one of the inputs, that exists, whose folder does not, or that is named twice.
 
