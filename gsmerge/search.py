@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.render.metrics import WINDOW, ssim
-from gsmerge.render.photos import Photos, photo_errors, scene_photos
+from gsmerge.render.photos import Photos, render_photos, scene_photos
 from gsmerge.report import CompactResult
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
@@ -115,16 +115,14 @@ def measure_curve(
     weights = training_weights(photos, HOLDOUT, options.seed)
     points: list[CurvePoint] = []
     for count in counts:
-        log.curve_progress(len(points), len(counts))
+        if log.progress:
+            log.progress("curve: what each count brings", len(points), len(counts))
         points.append(_point(count, build(quick, count, RunLog()), photos, weights, short.min_gain))
     return points
 
 
 def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.ndarray], min_gain: float) -> CurvePoint:
-    def clipped(view: int, image: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return np.clip(image, 0, 1)
-
-    images = photo_errors(gaussians, photos, clipped)
+    images = [np.clip(image, 0, 1) for image in render_photos(gaussians, photos)]
     views = range(len(photos))
     similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
     perceptual = None

@@ -57,10 +57,7 @@ def draw_views(
             weighted = blend(plan, colors, np.zeros(3, np.float32))[0][..., :1]
             np.divide(weighted, alphas[view], out=depths[view], where=alphas[view] > 0)
 
-    if shape[0] == 1:
-        one(0)  # not through the pool, so that the pieces of the one view can share it
-    else:
-        parallel_map(one, range(shape[0]))
+    parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
     return Rendering(
         torch.from_numpy(images), torch.from_numpy(alphas), None if depths is None else torch.from_numpy(depths)
     )

@@ -94,11 +94,9 @@ def blank_photos(cameras: Cameras, level: int = 1) -> Photos:
     """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     w, h = cameras.width, cameras.height
-    size = (w, h) if level == 1 else (max(1, round(w / level)), max(1, round(h / level)))
-    black = np.broadcast_to(np.float32(0), (len(cameras), size[1], size[0], 3))
-    if level == 1:
-        return Photos(black, viewmats, Ks, EPS2D)
-    sx, sy = size[0] / w, size[1] / h
+    width, height = max(1, round(w / level)), max(1, round(h / level))
+    black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))
+    sx, sy = width / w, height / h
     return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
 
 

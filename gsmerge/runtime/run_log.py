@@ -40,11 +40,6 @@ class RunLog:
         if not report.accepted:
             self.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
 
-    def curve_progress(self, done: int, total: int) -> None:
-        """One point of the curve is measured."""
-        if self.progress:
-            self.progress("curve: what each count brings", done, total)
-
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """A block whose time counts as that of a stage."""
