@@ -71,13 +71,9 @@ def write_gsm(
     *,
     overwrite: bool,
 ) -> None:
-    """Write a ``.gsm`` file: what both kinds have, and ``entries`` and ``tensors`` of one kind.
+    """Write a ``.gsm`` file: what both kinds have, and header ``entries`` and ``tensors`` by key of one kind.
 
-    Args:
-        kind: ``ENCODED`` or ``STATE``.
-        children: The prefix of their children's keys, and the children.
-        entries: Further entries of the header.
-        tensors: Further tensors by key.
+    ``children``: the prefix of the children's keys, and the children.
     """
     frame, cameras, settings = stored.frame, stored.cameras, asdict(stored.settings)
     header = {

@@ -59,10 +59,9 @@ def decode_stored(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> DecodeResult:
-    """A state as Gaussians in the world frame, fitted to the photos that it has stored; or an encoded scene.
+    """A state as Gaussians in the world frame, fitted to its photos; or an encoded scene, which has none.
 
     Args:
-        stored: A state of one or more batches, or an encoded scene, which has no photos.
         k, budget: As of :func:`gsmerge.decode_scene`. A full fit begins with fewer and grows to the number.
         options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
 

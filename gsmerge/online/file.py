@@ -101,7 +101,7 @@ def extend_file(
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Add a batch of views to the state in a file, or make the file if there is none.
+    """Add a batch of views to the state in a file, or make the file if there is none -> the report, plain JSON types.
 
     The file is replaced when all is done, and not at all if anything goes wrong or another process has changed it.
 
@@ -109,9 +109,6 @@ def extend_file(
         path: The state, or an encoded scene.
         settings: As of :class:`gsmerge.Compactor`; by default the state's own.
         seconds_before: Wall time by name of what the caller did before.
-
-    Returns:
-        The report, in plain JSON types.
 
     Raises:
         SceneError: If the state or the scene cannot be read, or the state cannot be written or was changed meanwhile.

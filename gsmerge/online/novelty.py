@@ -77,10 +77,7 @@ def novel_rows(
 ) -> Tensor:
     """Rows of a batch's groups that show something which the state does not show as well.
 
-    Args:
-        there: The state's Gaussians in view.
-        photos: The batch's photos at half the state's size.
-        cameras: The batch's own cameras.
+    ``there``: the state's Gaussians in view; ``photos``: the batch's, at half the state's size.
     """
     if options.tolerance == 0:
         return torch.arange(len(features))

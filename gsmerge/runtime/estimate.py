@@ -102,7 +102,6 @@ def estimate_run(
     Args:
         grid: Views, height and width.
         options: As of :func:`work_seconds`, and so are ``num_pixels`` (its ``pixels``), ``photos`` and ``fit_steps``.
-        threads: Threads that run.
         num_rest: Columns of higher harmonics.
 
     Returns:
