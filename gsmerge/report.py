@@ -91,9 +91,6 @@ def report_document(
     """The report of one ``compact`` as plain JSON types.
 
     Args:
-        report: The :class:`gsmerge.CompactReport`.
-        input_path: The ``.ply`` that was read.
-        output_path: The ``.ply`` that was written.
         seconds_before: Wall time by name of what came before the report's stages (imports, reading).
         seconds_after: The same for what came after them (writing).
         coarser: File and :class:`gsmerge.CompactReport` of further levels of detail.

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.render.metrics import WINDOW, ssim
-from gsmerge.render.photos import Photos, photo_errors, scene_photos
+from gsmerge.render.photos import Photos, render_photos, scene_photos
 from gsmerge.report import CompactResult
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
@@ -44,29 +44,16 @@ MAX_FACTOR = 4  # times the usual count is the most that a quality target may ta
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What a number of Gaussians reaches after a short fit, on parts of the photos that it was not fitted to.
+    """What a number of Gaussians reaches after a short fit, on parts of the photos that it was not fitted to."""
 
-    Args:
-        count: Gaussians.
-        psnr: dB.
-        ssim: Structural similarity.
-        lpips: LPIPS (VGG), None where its weights are not installed.
-    """
-
-    count: int
-    psnr: float
-    ssim: float
-    lpips: float | None = None
+    count: int  # Gaussians
+    psnr: float  # dB
+    ssim: float  # Structural similarity
+    lpips: float | None = None  # LPIPS (AlexNet), None where its weights are not installed
 
 
 def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | None:
-    """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say.
-
-    Args:
-        prepared: The scene.
-        build: What makes Gaussians of it, see :func:`gsmerge.pipeline.build`.
-        log: Takes the curve.
-    """
+    """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say."""
     limits, options = prepared.limits, prepared.options
     drop = options.budget.max_drop
     if drop is None and not options.budget.auto:
@@ -81,13 +68,9 @@ def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | No
 
 
 def search_quality(prepared: PreparedScene, build: Build, score: Score, log: RunLog) -> CompactResult:
-    """The fewest Gaussians that render the input photos at a PSNR; the best that was reached where none do.
+    """The fewest Gaussians that render the input photos at the PSNR among the options; the best result where none do.
 
-    Args:
-        prepared: The scene, with a PSNR as ``quality`` among its options.
-        build: What makes Gaussians of it.
-        score: What makes a result of those.
-        log: Of what came before; its seconds and notes enter the report.
+    The seconds and notes of ``log``, of what came before, enter the report.
     """
     target, limits = prepared.options.budget.target_psnr, prepared.limits
     assert target is not None
@@ -121,14 +104,8 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
-    PSNR and SSIM are those of blocks that the short fits leave out, at full size; LPIPS needs whole pictures.
-
-    Args:
-        prepared: The scene, which must have photos.
-        build: What makes Gaussians of it.
-        steps: Length of the fits; those of the options do not matter.
-        counts: Numbers of Gaussians, each within the limits.
-        log: Takes the progress.
+    The fits take ``steps``, whatever the options say. PSNR and SSIM are those of blocks that the fits leave out, at
+    full size; LPIPS needs whole pictures.
     """
     options = prepared.options
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
@@ -138,16 +115,14 @@ def measure_curve(
     weights = training_weights(photos, HOLDOUT, options.seed)
     points: list[CurvePoint] = []
     for count in counts:
-        log.curve_progress(len(points), len(counts))
+        if log.progress:
+            log.progress("curve: what each count brings", len(points), len(counts))
         points.append(_point(count, build(quick, count, RunLog()), photos, weights, short.min_gain))
     return points
 
 
 def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.ndarray], min_gain: float) -> CurvePoint:
-    def clipped(view: int, image: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return np.clip(image, 0, 1)
-
-    images = photo_errors(gaussians, photos, clipped)
+    images = [np.clip(image, 0, 1) for image in render_photos(gaussians, photos)]
     views = range(len(photos))
     similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
     perceptual = None
@@ -180,14 +155,7 @@ def level_counts(finest: int, levels: int, least: int) -> list[int]:
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
     """The fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
 
-    Between points the curve is a straight line over the logarithm of the count.
-
-    Args:
-        points: By rising count, at least one.
-        max_drop: dB.
-
-    Raises:
-        ValueError: If there is no point.
+    Between points, which come by rising count, the curve is a straight line over the logarithm of the count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -204,13 +172,7 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     """The count beyond which more Gaussians are not worth it, by PSNR and structure together.
 
     The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB per doubling, on
-    a straight line between the slopes that lie midway between the points.
-
-    Args:
-        points: By rising count, at least one.
-
-    Raises:
-        ValueError: If there is no point.
+    a straight line between the slopes that lie midway between the points, which come by rising count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -232,30 +194,18 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
 
 @dataclass(frozen=True)
 class Search:
-    """The outcome of a search for a quality.
+    """The outcome of a search for a quality."""
 
-    Args:
-        count: The count that was chosen.
-        psnr: What it reaches, dB.
-        met: Whether that is the target.
-        tried: Every count that was run and its PSNR, in the order of the runs.
-    """
-
-    count: int
-    psnr: float
-    met: bool
-    tried: tuple[tuple[int, float], ...]
+    count: int  # The count that was chosen
+    psnr: float  # What it reaches, dB
+    met: bool  # Whether that is the target
+    tried: tuple[tuple[int, float], ...]  # Every count that was run and its PSNR, in the order of the runs
 
 
 def search_count(run: Callable[[int], float], target: float, start: int, least: int, most: int) -> Search:
     """The fewest Gaussians that reach a PSNR, within 15 %, by a few runs; the best of them where none does.
 
-    Args:
-        run: Count -> PSNR (dB), taken to rise with the count.
-        target: dB.
-        start: First count.
-        least: Fewest Gaussians that can be run.
-        most: Most Gaussians that are allowed.
+    ``run``: count -> PSNR (dB), taken to rise with the count.
     """
     tried: dict[int, float] = {}
     count = min(max(start, least), most)

@@ -237,15 +237,10 @@ class UnalignedScene:
 
 @dataclass(frozen=True)
 class Groups:
-    """A partition of the pixels of every view into superpixels.
+    """A partition of the pixels of every view into superpixels."""
 
-    Args:
-        labels: ``[v,h,w]`` int32, the superpixel of each pixel, 0 to ``counts[v] - 1`` within its view.
-        counts: Superpixels of each view.
-    """
-
-    labels: Tensor
-    counts: tuple[int, ...]
+    labels: Tensor  # [v,h,w] int32, the superpixel of each pixel, 0 to `counts[v] - 1` within its view
+    counts: tuple[int, ...]  # Superpixels of each view
 
     def __post_init__(self) -> None:
         _expect("labels", self.labels, (len(self.counts), "h", "w"))
@@ -256,32 +251,20 @@ class Groups:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """The superpixels of a scene and the number of Gaussians that they become.
+    """The superpixels of a scene and the number of Gaussians that they become."""
 
-    Args:
-        groups: Superpixels of every view.
-        coarse: Coarse ones for the backing layer; None: no such layer.
-        count: Gaussians in the end; never more.
-        exact: Whether that number was asked for as such, and is to be met.
-    """
-
-    groups: Groups
-    coarse: Groups | None
-    count: int
-    exact: bool
+    groups: Groups  # Superpixels of every view
+    coarse: Groups | None  # Coarse ones for the backing layer; None: no such layer
+    count: int  # Gaussians in the end; never more
+    exact: bool  # Whether that number was asked for as such, and is to be met
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Clusters of Feature Gaussians that show the same piece of surface.
+    """Clusters of Feature Gaussians that show the same piece of surface."""
 
-    Args:
-        clusters: ``[g]`` int64, the cluster of each Feature Gaussian, dense from 0.
-        count: Number of clusters.
-    """
-
-    clusters: Tensor
-    count: int
+    clusters: Tensor  # [g] int64, the cluster of each Feature Gaussian, dense from 0
+    count: int  # Number of clusters
 
 
 @dataclass(frozen=True)
@@ -291,40 +274,23 @@ class FeatureGaussians:
     Everything that describes the group adds up over its members (weights, masses, extinctions) or is an average
     with the weights, so merging Feature Gaussians is pooling again. Opacity is derived when decoding:
     ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is what blending conserves).
-
-    Args:
-        means: ``[g,3]`` float32.
-        covars: ``[g,3,3]`` float32: spread of the members' means plus their own covariances.
-        weights: ``[g]`` sum of the members' opacities.
-        masses: ``[g]`` opacity-weighted volume (paper eq. mass).
-        extinctions: ``[g]`` optical depth integrated over the members' discs, world units squared.
-        gains: ``[g]`` factor on the optical depth: 1, or what the other views' photos say.
-        spreads: ``[g]`` factor on the standard deviations at decoding.
-        sh0: ``[g,1,3]`` base colour.
-        shN: ``[g,k-1,3]``.
-        footprints: ``[g]`` size of one pixel at the group's depth, world units.
-        views: ``[g]`` int64, the view of the group, -1 when it was merged from several.
-        backing: ``[g]`` bool: belongs to the coarse layer behind the surfaces.
-        starts: ``[g+1]`` int64 into ``members``.
-        members: ``[m]`` int64 rows of the scene's Gaussians, group by group.
-        latents: ``[g,d]`` what the networks remember of the group (paper section 4.2); d = 0 without networks.
     """
 
-    means: Tensor
-    covars: Tensor
-    weights: Tensor
-    masses: Tensor
-    extinctions: Tensor
-    gains: Tensor
-    spreads: Tensor
-    sh0: Tensor
-    shN: Tensor
-    footprints: Tensor
-    views: Tensor
-    backing: Tensor
-    starts: Tensor
-    members: Tensor
-    latents: Tensor
+    means: Tensor  # [g,3] float32
+    covars: Tensor  # [g,3,3] float32: spread of the members' means plus their own covariances
+    weights: Tensor  # [g] sum of the members' opacities
+    masses: Tensor  # [g] opacity-weighted volume (paper eq. mass)
+    extinctions: Tensor  # [g] optical depth integrated over the members' discs, world units squared
+    gains: Tensor  # [g] factor on the optical depth: 1, or what the other views' photos say
+    spreads: Tensor  # [g] factor on the standard deviations at decoding
+    sh0: Tensor  # [g,1,3] base colour
+    shN: Tensor  # [g,k-1,3]
+    footprints: Tensor  # [g] size of one pixel at the group's depth, world units
+    views: Tensor  # [g] int64, the view of the group, -1 when it was merged from several
+    backing: Tensor  # [g] bool: belongs to the coarse layer behind the surfaces
+    starts: Tensor  # [g+1] int64 into `members`
+    members: Tensor  # [m] int64 rows of the scene's Gaussians, group by group
+    latents: Tensor  # [g,d] what the networks remember of the group (paper section 4.2); d = 0 without networks
 
     def __post_init__(self) -> None:
         g = self.means.shape[0]

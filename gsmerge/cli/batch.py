@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, redirect_stdout
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
     from gsmerge.batch.plan import Schedule
     from gsmerge.batch.records import RecordIndex
-    from gsmerge.batch.summary import Totals
 
 
 def parse_jobs(text: str) -> int:
@@ -114,12 +113,7 @@ def _bytes(text: str | None) -> int | None:
 
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: RecordIndex, schedule: Schedule) -> None:
-    """Compact all scenes, report each, and sum up.
-
-    Raises:
-        BatchError: If a scene failed.
-        TargetError: If none did, and a result misses its target.
-    """
+    """Compact all scenes, report each, and sum up."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.summary import Totals, summary_lines, write_summary
 
@@ -132,8 +126,15 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
         with (
             _separate_stdout(options, quiet=args.silent),
             closing(run_batch(jobs, out, options, index=index, schedule=schedule)) as records,
+            total_progress(totals.total, quiet=args.silent) as progress,
         ):
-            _follow(records, totals, lines, quiet=args.silent)
+            for record in records:
+                totals.add(record)
+                if lines is not None:
+                    print(json.dumps(record, separators=(",", ":")), file=lines, flush=True)
+                failed = f", {totals.counts['failed']} failed" if totals.counts["failed"] else ""
+                why = f": {record['error']}" if record["error"] else ""
+                progress(f"{record['scene']} {record['status']}{why}{failed}", totals.ended, totals.total)
     except KeyboardInterrupt:
         interrupted = True
         raise
@@ -142,10 +143,10 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
             path = write_summary(out)
             if not args.silent:
                 print("\n".join(map(one_line, summary_lines(totals, path))))
-    failed = totals.counts["failed"]
-    if failed:
+    num_failed = totals.counts["failed"]
+    if num_failed:
         scene, why = totals.failures[0]
-        raise BatchError(f"{failed} of {totals.total} scenes failed; the first: {scene}: {why}")
+        raise BatchError(f"{num_failed} of {totals.total} scenes failed; the first: {scene}: {why}")
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
 
@@ -158,18 +159,6 @@ def _separate_stdout(options: BatchOptions, *, quiet: bool) -> Iterator[None]:
         return
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere if quiet else sys.stderr):
         yield
-
-
-def _follow(records: Iterable[dict[str, Any]], totals: Totals, lines: TextIO | None, *, quiet: bool) -> None:
-    """Report every scene as it ends."""
-    with total_progress(totals.total, quiet=quiet) as progress:
-        for record in records:
-            totals.add(record)
-            if lines is not None:
-                print(json.dumps(record, separators=(",", ":")), file=lines, flush=True)
-            failed = f", {totals.counts['failed']} failed" if totals.counts["failed"] else ""
-            why = f": {record['error']}" if record["error"] else ""
-            progress(f"{record['scene']} {record['status']}{why}{failed}", totals.ended, totals.total)
 
 
 def _print_plan(

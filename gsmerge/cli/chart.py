@@ -73,7 +73,7 @@ def chart(args: opt.Args) -> None:
     if args.draw_only:
         _print_drawn(args, _draw(out, [], 0), 0)
         return
-    from gsmerge.research.charts.run import RunOptions
+    from gsmerge.research.charts.run import RunOptions, run_plan
 
     nets, missing = lpips_networks(args.lpips)
     with opt.usage_errors():
@@ -87,7 +87,11 @@ def chart(args: opt.Args) -> None:
         _print_plan(args, plan, stored, options, notes)
         return
     say_notes(notes, quiet=args.silent)
-    done, more = _run(plan, out, options, quiet=args.silent)
+    done: list[RunRecord] = []
+    more: list[str] = []
+    if plan.total > 0:
+        with announce_compilation(quiet=args.silent), total_progress(plan.total, quiet=args.silent) as progress:
+            done, more = run_plan(plan, out, options, progress)
     say_notes(more, quiet=args.silent)
     _print_drawn(args, _draw(out, [*notes, *more], len(done)), len(notes) + len(more))
     failed = [record for record in done if record.error is not None]
@@ -136,15 +140,6 @@ def _make_plan(
     places = find_scenes(scenes, args.targets, args.target_images)
     plan, stored = make_plan(experiments, places, args.output, options)
     return plan, stored, [*notes, *plan.notes]
-
-
-def _run(plan: Plan, out: Path, options: RunOptions, *, quiet: bool) -> tuple[list[RunRecord], list[str]]:
-    from gsmerge.research.charts.run import run_plan
-
-    if plan.total == 0:
-        return [], []
-    with announce_compilation(quiet=quiet), total_progress(plan.total, quiet=quiet) as progress:
-        return run_plan(plan, out, options, progress)
 
 
 def _print_plan(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
@@ -12,8 +11,7 @@ from gsmerge.cli.paths import check_format, check_outputs, checkpoint_files, def
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
-    from gsmerge.io import ReadHints, SceneFiles
-    from gsmerge.options import CompactOptions
+    from gsmerge.io import SceneFiles
 
 
 @opt.command(
@@ -41,8 +39,25 @@ def compact(args: opt.Args) -> None:
         print_plan(args, files, settings, out, hints)
         return
     _warn_of_memory(files, quiet=args.silent)
-    document = _run(args, files, settings, out, hints=hints, start=start)
+    from gsmerge.compact_file import compact_files
     from gsmerge.report import summary_lines, to_json
+
+    seconds_before = {"import": perf_counter() - start}
+    needs_fit = settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
+    with (
+        announce_compilation(quiet=args.silent, share=needs_fit) as finish,
+        stage_progress(quiet=args.silent) as progress,
+    ):
+
+        def move(stage: str, done: int, total: int) -> None:
+            if stage == "fit":
+                finish()
+            progress(stage, done, total)
+
+        document = compact_files(
+            files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
+            hashed=args.json or args.report is not None, seconds_before=seconds_before,
+        )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)
     if args.report is not None:
@@ -62,28 +77,3 @@ def _warn_of_memory(files: SceneFiles, *, quiet: bool) -> None:
     problem = memory_problem(memory_bytes(count, photos=True, num_rest=num_rest), machine_memory())
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)
-
-
-def _run(
-    args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, *, hints: ReadHints, start: float
-) -> dict[str, Any]:
-    """Read, compact and write; returns the report."""
-    from gsmerge.compact_file import compact_files
-
-    imported = perf_counter()
-    needs_fit = settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
-    with (
-        announce_compilation(quiet=args.silent, share=needs_fit) as finish,
-        stage_progress(quiet=args.silent) as progress,
-    ):
-
-        def move(stage: str, done: int, total: int) -> None:
-            if stage == "fit":
-                finish()
-            if progress is not None:
-                progress(stage, done, total)
-
-        return compact_files(
-            files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
-            hashed=args.json or args.report is not None, seconds_before={"import": imported - start},
-        )  # fmt: skip

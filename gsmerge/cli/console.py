@@ -103,16 +103,17 @@ def _terminal(*, quiet: bool) -> Any:
 
 
 @contextmanager
-def stage_progress(*, quiet: bool) -> Iterator[Progress | None]:
-    """A progress bar per stage on stderr; yields the callable that moves it.
+def stage_progress(*, quiet: bool) -> Iterator[Progress]:
+    """A progress bar per stage on stderr, unless quiet or where stderr is no terminal.
+
+    ``FORCE_COLOR`` in the environment makes anything a terminal.
 
     Yields:
-        ``(stage, done, total) -> None``, or None when quiet or when stderr is no terminal (``FORCE_COLOR`` set
-        in the environment counts as one).
+        ``(stage, done, total) -> None``.
     """
     console = _terminal(quiet=quiet)
     if console is None:
-        yield None
+        yield lambda stage, done, total: None
         return
     from rich import progress as rich
 

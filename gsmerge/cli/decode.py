@@ -6,15 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_format, check_outputs, default_output
 from gsmerge.errors import SceneError
-
-if TYPE_CHECKING:
-    from gsmerge.options import CompactOptions
 
 
 @opt.command(
@@ -34,27 +31,17 @@ def decode(args: opt.Args) -> None:
     out = args.output or default_output(args.encoded)
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite)
     check_format(out)
-    document = _run(args, out, args.settings(), start)
-    say_notes(document["notes"], quiet=args.silent)
-    line = f"would write  {out}: at most {document['output'].get('num_gaussians_at_most', 0):,} Gaussians"
-    print_document(
-        document, line if args.dry_run else _summary(document), as_json=args.json,
-        quiet=args.quiet and not args.dry_run,
-    )  # fmt: skip
-
-
-def _run(args: opt.Args, out: Path, settings: CompactOptions, start: float) -> dict[str, Any]:
-    """Read, decode and write; returns the report."""
     from gsmerge.encoded.decode import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
     from gsmerge.online.file import load_stored
     from gsmerge.report import document_head, seconds_document
 
-    imported, path, count = perf_counter(), args.encoded, {"k": args.k, "budget": args.budget}
+    settings, imported, path = args.settings(), perf_counter(), args.encoded
+    count = {"k": args.k, "budget": args.budget}
     stored = load_stored(path)
     lost, read = lost_harmonics(out, stored.sh_degree), perf_counter()
-    document = {
+    document: dict[str, Any] = {
         **document_head(),
         "input": {
             "path": str(path), "bytes": path.stat().st_size, "num_groups": len(stored),
@@ -70,7 +57,10 @@ def _run(args: opt.Args, out: Path, settings: CompactOptions, start: float) -> d
         plan = plan_decode(encoded, **count)
         most = int(plan.counts.sum()) + encoded.num_kept
         output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
-        return document | output | {"notes": [*plan.notes, *notes]}
+        document |= output | {"notes": [*plan.notes, *notes]}
+        say_notes(document["notes"], quiet=args.silent)
+        print_document(document, f"would write  {out}: at most {most:,} Gaussians", as_json=args.json)
+        return
     with atomic_output(out, overwrite=args.overwrite) as temporary:
         with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
             decoded = decode_stored(
@@ -82,13 +72,15 @@ def _run(args: opt.Args, out: Path, settings: CompactOptions, start: float) -> d
         write_gaussians(temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending)
     seconds = {"import": imported - start, "read": read - imported, "decode": done - read}
     seconds["write"] = perf_counter() - done
-    return document | {
+    document |= {
         "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(decoded.gaussians)},
         "ratio": len(decoded.gaussians) / max(stored.settings.num_input, 1),
         "fit": decoded.fit and asdict(decoded.fit),
         **seconds_document(seconds),
         "notes": [*decoded.notes, *notes],
     }
+    say_notes(document["notes"], quiet=args.silent)
+    print_document(document, _summary(document), as_json=args.json, quiet=args.quiet)
 
 
 def _comments(about: Mapping[str, Any]) -> Sequence[str]:

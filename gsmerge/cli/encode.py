@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, checkpoint_files, input_files
-
-if TYPE_CHECKING:
-    from gsmerge.io import ReadHints, SceneFiles
-    from gsmerge.options import CompactOptions
 
 
 @opt.command(
@@ -33,15 +28,6 @@ def encode(args: opt.Args) -> None:
 
         print_plan(args, files, settings, out, hints)
         return
-    document = _run(args, files, settings, out, hints, start)
-    say_notes(document["notes"], quiet=args.silent)
-    print_document(document, _summary(document), as_json=args.json, quiet=args.quiet)
-
-
-def _run(
-    args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints, start: float
-) -> dict[str, Any]:
-    """Read, encode and write; returns the report."""
     from gsmerge.compact_file import read_input
     from gsmerge.encoded.encode import encode_scene
     from gsmerge.encoded.gsm_file import save_encoded
@@ -60,19 +46,21 @@ def _run(
         save_encoded(temporary, encoded, overwrite=True, source={"name": files.ply.name, **hashed, **texts})
     seconds = {"import": imported - start, "read": read - imported, "encode": done - read}
     seconds["write"] = perf_counter() - done
-    own, size, used = encoded.settings, out.stat().st_size, encoded.about["options"]
+    own, size, about = encoded.settings, out.stat().st_size, encoded.about
     counts = {"num_groups": len(encoded), "num_gaussians_at_most": encoded.max_gaussians, "max_k": own.max_k}
-    return {
+    document = {
         **document_head(),
         "input": {"path": str(files.ply), "num_gaussians": own.num_input, **hashed, **given.recognised},
         "output": {"path": str(out), "bytes": size, **counts},
         "ratio_bytes": size / hashed["bytes"],
-        "options": used,
-        "seed": used["seed"],
-        "choices": encoded.about["choices"],
+        "options": about["options"],
+        "seed": about["options"]["seed"],
+        "choices": about["choices"],
         **seconds_document(seconds),
-        "notes": [*given.notes, *encoded.about["notes"]],
+        "notes": [*given.notes, *about["notes"]],
     }
+    say_notes(document["notes"], quiet=args.silent)
+    print_document(document, _summary(document), as_json=args.json, quiet=args.quiet)
 
 
 def _summary(document: Mapping[str, Any]) -> str:

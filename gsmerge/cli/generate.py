@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from gsmerge.cli.console import announce_compilation, print_document, stage_prog
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.research.generate import GenerateOptions, SceneFolder
+    from gsmerge.research.generate import GenerateOptions
 
 
 @opt.command(
@@ -40,9 +41,17 @@ def generate(args: opt.Args) -> None:
     if out.exists() and not out.is_dir():
         raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     seed = args.seed or 0
-    scenes = _generate(args, options, seed)
     from gsmerge.report import document_head
+    from gsmerge.research.generate import generate as generate_scenes
+    from gsmerge.research.generate import plan
 
+    where: dict[str, Any] = {"seed": seed, "overwrite": args.overwrite}
+    if args.dry_run:
+        scenes = plan(out, args.scenes, options, **where)
+    else:
+        with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+            move = partial(progress, "generate")
+            scenes = generate_scenes(out, args.scenes, options, **where, threads=args.threads, progress=move)
     document = {**document_head(), "options": options.to_dict(), "seed": seed, "dry_run": args.dry_run, "notes": []}
     document["scenes"] = [{"folder": str(scene.folder), "kept": scene.kept} for scene in scenes]
     kept = sum(scene.kept for scene in scenes)
@@ -51,30 +60,8 @@ def generate(args: opt.Args) -> None:
     print_document(document, line, as_json=args.json, quiet=args.quiet)
 
 
-def _generate(args: opt.Args, options: GenerateOptions, seed: int) -> list[SceneFolder]:
-    """Make the scenes, or list which there would be."""
-    from gsmerge.research.generate import generate as generate_scenes
-    from gsmerge.research.generate import plan
-
-    where: dict[str, Any] = {"seed": seed, "overwrite": args.overwrite}
-    if args.dry_run:
-        return plan(args.output, args.scenes, options, **where)
-    with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
-
-        def move(done: int, total: int) -> None:
-            if progress is not None:
-                progress("generate", done, total)
-
-        return generate_scenes(args.output, args.scenes, options, **where, threads=args.threads, progress=move)
-
-
 def _options(args: opt.Args) -> GenerateOptions:
-    """The settings of the scenes.
-
-    Raises:
-        UsageError: If a value is none of the possible ones.
-        SceneError: If the file of ranges cannot be read.
-    """
+    """The settings of the scenes."""
     from gsmerge.research.generate import GenerateOptions, read_ranges
 
     counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", args.views)

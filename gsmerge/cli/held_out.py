@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
-    """The networks of ``--lpips``; without that option those that are installed, with a note where none is.
-
-    Raises:
-        UsageError: If a network that was asked for is not installed.
-    """
+    """The networks of ``--lpips``; without that option those that are installed, with a note where none is."""
     from gsmerge.measure.evaluate import NETS
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
@@ -34,11 +30,7 @@ def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
 
 
 def require_views(load: SceneLoad) -> None:
-    """Refuse a scene without cameras.
-
-    Raises:
-        SceneError: If it has no views.
-    """
+    """Refuse a scene without cameras."""
     if len(load.scene) == 0:
         problem = "expected cameras to measure from, found none beside it"
         raise SceneError(load.files.ply, problem, "name them with --cameras")
@@ -74,11 +66,7 @@ def held_out_views(
 
 
 def file_names(paths: Sequence[Path]) -> list[str]:
-    """A short name for each file: its own where no two are alike, otherwise its path.
-
-    Raises:
-        UsageError: If a file is given twice.
-    """
+    """A short name for each file: its own where no two are alike, otherwise its path. No file may be given twice."""
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")
     short = [path.name for path in paths]

@@ -21,11 +21,7 @@ def default_output(ply: Path) -> Path:
 
 
 def check_format(output: Path, budget: BudgetOptions | None = None) -> None:
-    """Refuse an output whose name says no known format, or a budget in bytes for a format of unknown size.
-
-    Raises:
-        UsageError: In either case.
-    """
+    """Refuse an output whose name says no known format, or a budget in bytes for a format of unknown size."""
     from gsmerge.io import output_format
 
     ending = output_format(output)
@@ -33,27 +29,12 @@ def check_format(output: Path, budget: BudgetOptions | None = None) -> None:
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
-def check_picture(output: Path) -> None:
-    """Refuse a name that promises another format than the one that pictures are written in.
-
-    Raises:
-        UsageError: If it does not end in .png.
-    """
-    if output.suffix.lower() != ".png":
-        raise UsageError(f"{output}: expected a name that ends in .png")
-
-
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Refuse an output file that is one of the inputs, that exists, whose folder does not, or that is named twice.
 
     Args:
-        outputs: The files to write; None: not asked for.
         inputs: Files that are read, and folders of photos: no photo is replaced.
         overwrite: Whether the files may exist.
-
-    Raises:
-        UsageError: If an output is an input or another output, or exists and ``overwrite`` is False.
-        SceneError: If an output cannot be written.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -111,10 +92,6 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
     """Refuse an output folder that holds files, unless ``overwrite``, or the photos, or that cannot be written.
 
     The folder is made with the first file in it, so that a run that fails before leaves none.
-
-    Raises:
-        UsageError: If the folder is one of the inputs, or holds files and ``overwrite`` is False.
-        SceneError: If it cannot be made or written, or is a file.
     """
     try:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
@@ -140,11 +117,7 @@ def source_of(ply: Path) -> Path | None:
 
 
 def check_cameras(files: SceneFiles) -> None:
-    """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for.
-
-    Raises:
-        SceneError: If there are none.
-    """
+    """Refuse a scene with neither cameras, beside it or inside, nor photos that they can be estimated for."""
     from gsmerge.io.cameras.sharp import read_sharp
 
     if files.cameras is None and files.images is None and read_sharp(files.ply) is None:

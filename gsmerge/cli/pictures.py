@@ -20,9 +20,6 @@ def picture_stems(names: Sequence[str]) -> list[str]:
 
     The image's own name where that tells the views apart, else its path with ``_`` between the folders, else the
     number of the view.
-
-    Args:
-        names: Image names as camera files give them, with or without folders and extension.
     """
     from gsmerge.io.photos import IMAGE_SUFFIXES
 
@@ -49,11 +46,7 @@ def png_bytes(picture: Picture) -> bytes:
 
 
 def write_picture(path: Path, picture: Picture, *, overwrite: bool) -> None:
-    """Write an 8 bit RGB picture as PNG, atomically; its folder is made if it is not there.
-
-    Raises:
-        SceneError: If the file cannot be written.
-    """
+    """Write an 8 bit RGB picture as PNG, atomically; its folder is made if it is not there."""
     from gsmerge.io import atomic_output
 
     data = png_bytes(picture)
@@ -66,14 +59,7 @@ def write_picture(path: Path, picture: Picture, *, overwrite: bool) -> None:
 
 
 def report_pictures(args: Args, pictures: Sequence[Path], facts: Mapping[str, Any], line: str) -> None:
-    """Say which pictures were written, or would be: as JSON on stdout, or as a line on stderr.
-
-    Args:
-        args: Of the command; ``output`` is the picture or their folder.
-        pictures: The pictures.
-        facts: Further entries of the JSON document.
-        line: What the pictures are, in a few words.
-    """
+    """Say which pictures were written, or would be: as JSON with further ``facts``, or as a line."""
     from gsmerge.report import document_head
 
     if args.json or args.dry_run:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli.console import print_document
 from gsmerge.cli.options import Args, usage_errors
@@ -11,37 +12,82 @@ from gsmerge.cli.options import Args, usage_errors
 if TYPE_CHECKING:
     from gsmerge.io import ReadHints, SceneFiles
     from gsmerge.options import CompactOptions
+    from gsmerge.types import PixelScene, UnalignedScene
 
 
 def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
     """Print what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
     from gsmerge.compact_file import read_input
-    from gsmerge.options import to_schema
     from gsmerge.report import document_head
-    from gsmerge.runtime.estimate import plan_document, plan_lines
+
+    given = read_input(files, opacity=args.opacity, hints=hints)
+    _, unused = choose_baseline(settings, given.scene)
+    with usage_errors():
+        document = plan_document(files, given.scene, settings, out, [*given.notes, *unused])
+    print_document({**document_head(), **document}, plan_lines(document), as_json=args.json)
+
+
+def plan_document(
+    files: SceneFiles, scene: PixelScene | UnalignedScene, settings: CompactOptions, out: Path, notes: Sequence[str]
+) -> dict[str, Any]:
+    """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types."""
+    from gsmerge.options import to_schema
+    from gsmerge.runtime.estimate import estimate_run, fit_of, is_robust
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
 
-    given = read_input(files, opacity=args.opacity, hints=hints)
-    scene, cameras = given.scene, given.scene.cameras
-    with usage_errors():
-        budget = budget_count(scene, settings)
-    _, unused = choose_baseline(settings, scene)
-    document = plan_document(
-        {name: path and str(path) for name, path in vars(files).items()},
-        (len(cameras), cameras.height, cameras.width),
-        settings.resolved(photos=scene.images is not None),
-        output_path=out,
-        per_view=superpixels_per_view(scene, settings) if len(scene) else 0,
-        photos=scene.images is not None,
-        threads=settings.threads or available_threads(),
-        fit_steps=settings.fit.steps,
-        default_count=default_count(scene, settings),
-        budget=budget,
-        notes=[*given.notes, *unused],
-        count=scene.num_gaussians,
-        num_rest=3 * scene.gaussians.shN.shape[1],
-    )
-    schema = {"options": to_schema(document["options"])}
-    print_document({**document_head(), **document, **schema}, plan_lines(document), as_json=args.json)
+    photos, grid = scene.images is not None, (len(scene), scene.cameras.height, scene.cameras.width)
+    options, budget = settings.resolved(photos=photos), budget_count(scene, settings)
+    pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
+    num_gaussians = scene.num_gaussians or pixels
+    max_count = default_count(scene, settings) if budget is None else budget
+    if settings.method.startswith("unmerged"):
+        max_count = pixels
+    per_view = None  # a budget distributes them by what it needs
+    if budget is None and options["budget"] != "auto":
+        per_view = superpixels_per_view(scene, settings) if len(scene) else 0
+    paths = {name: path and str(path) for name, path in vars(files).items()}
+    return {
+        "dry_run": True,
+        "input": {
+            **paths, "num_gaussians": num_gaussians, "num_views": grid[0], "height": grid[1], "width": grid[2],
+        },
+        "output": {"path": str(out), "num_gaussians_at_most": min(num_gaussians, max_count)},
+        "method": settings.method,
+        "superpixels_per_view": per_view,
+        "robust": is_robust(options, photos=photos),
+        "fit": fit_of(options, photos=photos),
+        "estimate": estimate_run(
+            grid, options, pixels, photos=photos, threads=settings.threads or available_threads(),
+            fit_steps=settings.fit.steps, num_rest=3 * scene.gaussians.shN.shape[1],
+        ),
+        "options": to_schema(options),
+        "notes": list(notes),
+    }  # fmt: skip
+
+
+def plan_lines(plan: Mapping[str, Any]) -> list[str]:
+    """The plan for people."""
+    from gsmerge.report import human_bytes
+    from gsmerge.runtime.estimate import memory_problems
+
+    scene, estimate, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
+    superpixels = "where the scene needs them"
+    if per_view is not None:
+        superpixels = f"{per_view:,} per view, {plan['options']['k']} Gaussian(s) each"
+    steps = [
+        f"superpixels  {superpixels}",
+        f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
+        f" across views: {plan['options']['match']}",
+        f"networks     {plan['options']['checkpoint']}",
+    ]
+    return [
+        f"would read   {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
+        f"would write  {plan['output']['path']}: at most {plan['output']['num_gaussians_at_most']:,} Gaussians",
+        *(steps if plan["method"] == "gsmerge" else [f"method       {plan['method']}"]),
+        f"fit          {plan['fit']}",
+        f"estimate     about {estimate['seconds']:.0f} s, {human_bytes(estimate['memory_bytes'])} of memory",
+        *(f"memory       {problem}" for problem in memory_problems(estimate)),
+        *(f"note         {note}" for note in plan["notes"]),
+    ]

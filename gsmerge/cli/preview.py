@@ -6,8 +6,9 @@ from pathlib import Path
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import check_cameras, check_outputs, check_picture, input_files
+from gsmerge.cli.paths import check_cameras, check_outputs, input_files
 from gsmerge.cli.pictures import report_pictures, write_picture
+from gsmerge.errors import UsageError
 
 
 @opt.command(
@@ -27,7 +28,8 @@ def preview(args: opt.Args) -> None:
 
     files = args.files(scenes[0])
     check_outputs((args.output,), (*scenes, *input_files(files)), overwrite=args.overwrite)
-    check_picture(args.output)
+    if args.output.suffix.lower() != ".png":
+        raise UsageError(f"{args.output}: expected a name that ends in .png")
     check_cameras(files)
     plys = [read_ply_with_hints(files.ply, opacity=args.opacity, hints=hints)]
     plys += [read_ply(path, opacity=args.opacity) for path in scenes[1:]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,6 @@ MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 
 if TYPE_CHECKING:
     from gsmerge.io import CamerasInScene, PlyScene, SceneFiles
-    from gsmerge.types import Cameras, Gaussians
 
 
 @opt.command(
@@ -39,6 +37,9 @@ if TYPE_CHECKING:
 def render(args: opt.Args) -> None:
     """Render a scene from every camera, one PNG each."""
     from gsmerge.io import find_scene_files, read_ply
+    from gsmerge.measure.preview import to_picture
+    from gsmerge.render import render as render_views
+    from gsmerge.runtime.threads import use_threads
 
     files = args.files(args.scene)
     source = args.frame_of or source_of(files.ply)
@@ -51,7 +52,19 @@ def render(args: opt.Args) -> None:
     pictures = [args.output / f"{stem}.png" for stem in picture_stems(placed.views.names)]
     say_notes(notes, quiet=args.silent)
     if not args.dry_run:
-        _write_renders(args, placed.gaussians, views, pictures)
+        with (
+            use_threads(args.threads) as count,
+            announce_compilation(quiet=args.silent),
+            stage_progress(quiet=args.silent) as progress,
+        ):
+            for first in range(0, len(views), count):  # as many views at once as threads, which keeps the memory low
+                some = slice(first, first + count)
+                renders = render_views(
+                    placed.gaussians, views[some], background=args.background, antialiased=args.antialiased
+                ).images
+                for path, image in zip(pictures[some], renders, strict=True):
+                    write_picture(path, to_picture(image), overwrite=args.overwrite)
+                progress("render", min(first + count, len(views)), len(views))
     facts = {"width": views.width, "height": views.height, "num_gaussians": ply.info.count, "notes": notes}
     report_pictures(args, pictures, facts, f"{len(views)} pictures of {views.width} x {views.height}")
 
@@ -65,25 +78,3 @@ def _place(ply: PlyScene, like: SceneFiles) -> CamerasInScene:
         return place_cameras_in_scene(ply, like, hints=hints, photos=False)
     placed = place_cameras_in_scene(read_ply(like.ply), like, hints=hints, photos=False)
     return replace(placed, gaussians=ply.gaussians, notes=(*ply_notes(ply.info), *placed.notes))
-
-
-def _write_renders(args: opt.Args, gaussians: Gaussians, views: Cameras, pictures: Sequence[Path]) -> None:
-    """Render and write, as many views at once as there are threads, which keeps the memory low."""
-    from gsmerge.measure.preview import to_picture
-    from gsmerge.render import render as render_views
-    from gsmerge.runtime.threads import use_threads
-
-    with (
-        use_threads(args.threads) as count,
-        announce_compilation(quiet=args.silent),
-        stage_progress(quiet=args.silent) as progress,
-    ):
-        for first in range(0, len(views), count):
-            some = slice(first, first + count)
-            renders = render_views(
-                gaussians, views[some], background=args.background, antialiased=args.antialiased
-            ).images
-            for path, image in zip(pictures[some], renders, strict=True):
-                write_picture(path, to_picture(image), overwrite=args.overwrite)
-            if progress is not None:
-                progress("render", min(first + count, len(views)), len(views))

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
 from gsmerge.cli.paths import check_folder, input_files
 from gsmerge.cli.pictures import picture_stems, report_pictures, write_picture
-
-if TYPE_CHECKING:
-    from gsmerge.stages.segment import SegmentOptions
-    from gsmerge.types import PixelScene
 
 KINDS = ("borders", "means", "saliency")
 
@@ -28,8 +22,11 @@ KINDS = ("borders", "means", "saliency")
 )
 def segment(args: opt.Args) -> None:
     """Draw the superpixels of every view: their borders, their mean colours, and the saliency that seeds them."""
+    from gsmerge.measure.preview import draw_borders, draw_heat, draw_means
+    from gsmerge.render.photos import scene_pictures
     from gsmerge.runtime.threads import use_threads
-    from gsmerge.stages.segment import SegmentOptions, count_for
+    from gsmerge.stages.segment import SegmentOptions, count_for, saliency
+    from gsmerge.stages.segment import segment as segment_images
 
     with opt.usage_errors():
         options = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))
@@ -44,25 +41,12 @@ def segment(args: opt.Args) -> None:
     counts: Sequence[int] = [per_view] * len(stems)
     if not args.dry_run:
         with use_threads(args.threads), announce_compilation(quiet=args.silent):
-            counts = _write_overlays(scene, options, pictures, overwrite=args.overwrite)
+            images, paths = scene_pictures(scene), iter(pictures)
+            groups = segment_images(images, options)
+            counts = groups.counts
+            for image, labels in zip(images, groups.labels, strict=True):
+                for drawn in (draw_borders(image, labels), draw_means(image, labels), draw_heat(saliency(image))):
+                    write_picture(next(paths), drawn, overwrite=args.overwrite)
     facts = {"superpixels": counts, "options": vars(options), "notes": load.notes}
     line = f"{len(pictures)} pictures, {min(counts)} to {max(counts)} superpixels per view"
     report_pictures(args, pictures, facts, line)
-
-
-def _write_overlays(
-    scene: PixelScene, options: SegmentOptions, pictures: Sequence[Path], *, overwrite: bool
-) -> Sequence[int]:
-    """Segment and draw; returns the number of superpixels of every view."""
-    from gsmerge.measure.preview import draw_borders, draw_heat, draw_means
-    from gsmerge.render.photos import scene_pictures
-    from gsmerge.stages.segment import saliency
-    from gsmerge.stages.segment import segment as segment_images
-
-    images = scene_pictures(scene)
-    groups = segment_images(images, options)
-    paths = iter(pictures)
-    for image, labels in zip(images, groups.labels, strict=True):
-        for drawn in (draw_borders(image, labels), draw_means(image, labels), draw_heat(saliency(image))):
-            write_picture(next(paths), drawn, overwrite=overwrite)
-    return groups.counts

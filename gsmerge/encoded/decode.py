@@ -22,25 +22,15 @@ from gsmerge.types import Gaussians
 
 @dataclass(frozen=True, eq=False)
 class DecodePlan:
-    """What a file is decoded to.
+    """What a file is decoded to."""
 
-    Args:
-        counts: ``[g]`` most Gaussians of each group.
-        min_contribution: See :class:`StoredSettings`; 0: contributions are not measured.
-        notes: What differs from what was asked for, one sentence each.
-    """
-
-    counts: np.ndarray
-    min_contribution: float
-    notes: tuple[str, ...] = ()
+    counts: np.ndarray  # [g] most Gaussians of each group
+    min_contribution: float  # See StoredSettings; 0: contributions are not measured
+    notes: tuple[str, ...] = ()  # What differs from what was asked for, one sentence each
 
 
 def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | None = None) -> DecodePlan:
-    """How many Gaussians each group becomes, see :func:`decode_scene`.
-
-    Raises:
-        UsageError: As :func:`decode_scene`.
-    """
+    """How many Gaussians each group becomes, see :func:`decode_scene`."""
     s = encoded.settings
     if budget is not None and k is not None:
         raise UsageError("expected one of k and budget, got both")
@@ -92,11 +82,7 @@ def _distribute(encoded: Encoded, total: int) -> DecodePlan:
 
 
 def decode_scene(
-    encoded: Encoded,
-    *,
-    k: int | None = None,
-    budget: int | str | None = None,
-    threads: int | None = None,
+    encoded: Encoded, *, k: int | None = None, budget: int | str | None = None, threads: int | None = None
 ) -> Gaussians:
     """The Gaussians of an encoded scene, in the scene's own world frame. No fit follows, as there are no photos.
 

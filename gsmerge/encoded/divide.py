@@ -13,14 +13,7 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 
 def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: Rule) -> Division:
-    """All children of every group, up to ``max_k`` of each; the backing layer is never divided.
-
-    Args:
-        features: g Feature Gaussians with their members.
-        members: The scene's Gaussians.
-        max_k: Most children of a group, 1 to 8.
-        rule: How children are pooled.
-    """
+    """All children of every group, up to ``max_k`` of each; the backing layer is never divided."""
     count = len(features)
     rows = np.flatnonzero(~features.backing.numpy())
     sizes = np.diff(features.starts.numpy())[rows][:, None]
@@ -58,14 +51,10 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: R
 
 
 def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which Gaussians stand for each group, and the group ``[n]`` of each, rising.
-
-    Args:
-        division: The children of g groups.
-        counts: ``[g]`` most Gaussians of each, at least 1.
+    """Which Gaussians stand for each of g groups, at most ``counts [g]`` of it, and the rising group of each.
 
     Returns:
-        ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children.
+        ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children, and ``[n]`` groups.
     """
     splits, slots = division.splits.numpy().astype(np.int64), division.slots.numpy().astype(np.int64)
     count, uniform = len(splits), division.uniform.numpy()

@@ -69,11 +69,7 @@ def encode_scene(
 
 
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
-    """The options without a fit.
-
-    Raises:
-        UsageError: If a fit, another method, a quality or levels are asked for.
-    """
+    """The options without a fit."""
     fit = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
     for name in (*fit, *options.whole_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")

@@ -20,62 +20,41 @@ class Division:
 
     The members of a group are halved again and again (:mod:`gsmerge.stages.decode`), so the children of K are those of
     K - 1 with one of them replaced by its halves. A third of the members' bytes, and nothing to pool when decoding.
-
-    Args:
-        splits: ``[g]`` uint8, times that each group is split.
-        slots: ``[s]`` uint8, which child, counted in order from 0, each split replaces; group by group.
-        uniform: ``[w]`` int64, rising: the groups whose members are all alike. Asked for more, they give one child.
-        children: 2s + w Gaussians, canonical: two for each split, then one for each of ``uniform``.
-        growth_order: ``[d]`` int64, the group that each further Gaussian goes to, where it helps most first.
     """
 
-    splits: Tensor
-    slots: Tensor
+    splits: Tensor  # [g] uint8, times that each group is split
+    slots: Tensor  # [s] uint8, which child, counted in order from 0, each split replaces; group by group
+    # [w] int64, rising: the groups whose members are all alike. Asked for more, they give one child.
     uniform: Tensor
-    children: Gaussians
-    growth_order: Tensor
+    children: Gaussians  # 2s + w Gaussians, canonical: two for each split, then one for each of `uniform`
+    growth_order: Tensor  # [d] int64, the group that each further Gaussian goes to, where it helps most first
 
 
 @dataclass(frozen=True, eq=False)
 class StoredHeads:
-    """Networks whose decoder heads correct the children, and what they know of the groups.
+    """Networks whose decoder heads correct the children, and what they know of the groups."""
 
-    Args:
-        networks: All of a checkpoint's networks.
-        views: ``[g]`` int64, the view that each group's frame belongs to.
-        group: ``[g,n]`` the numbers that describe each group.
-    """
-
-    networks: Networks
-    views: Tensor
-    group: Tensor
+    networks: Networks  # All of a checkpoint's networks
+    views: Tensor  # [g] int64, the view that each group's frame belongs to
+    group: Tensor  # [g,n] the numbers that describe each group
 
 
 @dataclass(frozen=True)
 class StoredSettings:
-    """What decoding needs to know of the encoding.
+    """What decoding needs to know of the encoding."""
 
-    Args:
-        num_input: Gaussians of the scene.
-        k: Gaussians of each group by default, or ``"auto"`` where the budget was: ``target_count`` in all.
-        max_k: Most children of a group that are stored.
-        min_opacity: Gaussians below this opacity are left out.
-        min_contribution: Gaussians that add less than this to every pixel of every view that they lie in are left out,
-            where no number is to be met; 0: none are.
-        target_count: Gaussians that a budget asked for, without those that no view sees; None without one.
-        num_slots: Of an unaligned scene, its groups and the empty superpixels whose Gaussians other groups get;
-            None: K Gaussians for each group.
-        knee_count: Gaussians at the knee of the scene's own curve of distortion: ``--budget auto`` without photos.
-    """
-
-    num_input: int
-    k: int | str
-    max_k: int
-    min_opacity: float
+    num_input: int  # Gaussians of the scene
+    k: int | str  # Gaussians of each group by default, or `"auto"` where the budget was: `target_count` in all
+    max_k: int  # Most children of a group that are stored
+    min_opacity: float  # Gaussians below this opacity are left out
+    # Gaussians that add less than this to every pixel of every view that they lie in are left out, where no number is
+    # to be met; 0: none are
     min_contribution: float
-    target_count: int | None
-    num_slots: int | None
-    knee_count: int
+    target_count: int | None = None  # Gaussians that a budget asked for, without those that no view sees
+    # Of an unaligned scene, its groups and the empty superpixels whose Gaussians other groups get; None: K Gaussians
+    # for each group
+    num_slots: int | None = None
+    knee_count: int = 0  # Gaussians at the knee of the scene's own curve of distortion: `--budget auto` without photos
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -71,20 +71,9 @@ def write_gsm(
     *,
     overwrite: bool,
 ) -> None:
-    """Write a ``.gsm`` file: what both kinds have, and ``entries`` and ``tensors`` of one kind.
+    """Write a ``.gsm`` file: what both kinds have, and header ``entries`` and ``tensors`` by key of one kind.
 
-    Args:
-        path: The file; complete, or what it was before.
-        kind: ``ENCODED`` or ``STATE``.
-        stored: The content.
-        features: Its groups.
-        children: The prefix of their children's keys, and the children.
-        entries: Further entries of the header.
-        tensors: Further tensors by key.
-        overwrite: Replace an existing file.
-
-    Raises:
-        SceneError: If the file exists or cannot be written.
+    ``children``: the prefix of the children's keys, and the children.
     """
     frame, cameras, settings = stored.frame, stored.cameras, asdict(stored.settings)
     header = {
@@ -111,11 +100,7 @@ def write_gsm(
 
 
 def save_encoded(
-    path: str | PathLike[str],
-    encoded: Encoded,
-    *,
-    overwrite: bool = False,
-    source: Mapping[str, Any] | None = None,
+    path: str | PathLike[str], encoded: Encoded, *, overwrite: bool = False, source: Mapping[str, Any] | None = None
 ) -> None:
     """Write an encoded scene.
 
@@ -149,18 +134,11 @@ def save_encoded(
 
 @dataclass(frozen=True, eq=False)
 class GsmFile:
-    """The content of a ``.gsm`` file, checked as it is taken.
-
-    Args:
-        path: The file.
-        kind: ``ENCODED`` or ``STATE``.
-        header: Its header, each entry of its type.
-        tensors: Tensors by key.
-    """
+    """The content of a ``.gsm`` file, checked as it is taken."""
 
     path: Path
-    kind: str
-    header: Mapping[str, Any]
+    kind: str  # `ENCODED` or `STATE`
+    header: Mapping[str, Any]  # Its header, each entry of its type
     tensors: Mapping[str, Tensor]
 
     def error(self, problem: str) -> SceneError:
@@ -168,11 +146,7 @@ class GsmFile:
         return SceneError(self.path, problem, REMEDY)
 
     def tensor(self, key: str, dtype: torch.dtype, *shape: int | None) -> Tensor:
-        """A tensor of a type and shape (None: any size), finite.
-
-        Raises:
-            SceneError: If it is missing, another one, or not finite.
-        """
+        """A tensor of a type and shape (None: any size), finite."""
         tensor = self.tensors.get(key)
         expected = f"{key}: expected {str(dtype).removeprefix('torch.')} {['n' if n is None else n for n in shape]}"
         if tensor is None:
@@ -238,12 +212,7 @@ class GsmFile:
 
 
 def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
-    """Read a ``.gsm`` file of one of some kinds.
-
-    Raises:
-        SceneError: If there is no such file, it is damaged or of another format or a newer schema, or its header lacks
-            an entry.
-    """
+    """Read a ``.gsm`` file of one of some kinds."""
     path = Path(path)
     check_file(path)
     try:
@@ -289,11 +258,7 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
 
 
 def read_encoded(file: GsmFile) -> Encoded:
-    """The encoded scene of a file of that kind.
-
-    Raises:
-        SceneError: As :func:`load_encoded`.
-    """
+    """The encoded scene of a file of that kind."""
     features, settings = file.features(), file.settings()
     common = file.common(features.shN.shape[1])
     return Encoded(

@@ -71,12 +71,7 @@ class Compactor:
         return report
 
     def decode(
-        self,
-        *,
-        k: int | None = None,
-        budget: int | str | None = None,
-        progress: Progress | None = None,
-        **fit: Any,
+        self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
     ) -> Gaussians:
         """The Gaussians so far, see :func:`gsmerge.online.decode.decode_stored`.
 

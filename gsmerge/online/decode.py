@@ -44,11 +44,7 @@ def default_fit(stored: Encoded | OnlineState) -> FitOptions:
 
 
 def check_fit(stored: Encoded | OnlineState, options: FitOptions) -> None:
-    """Refuse a fit without photos.
-
-    Raises:
-        UsageError: If a fit is asked for and there are no photos.
-    """
+    """Refuse a fit without photos."""
     if options.fit != "none" and not num_photos(stored):
         raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
 
@@ -63,16 +59,11 @@ def decode_stored(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> DecodeResult:
-    """A state as Gaussians in the world frame, fitted to the photos that it has stored; or an encoded scene.
+    """A state as Gaussians in the world frame, fitted to its photos; or an encoded scene, which has none.
 
     Args:
-        stored: A state of one or more batches, or an encoded scene, which has no photos.
-        k: As of :func:`gsmerge.decode_scene`.
-        budget: As there. A full fit begins with fewer and grows to the number.
+        k, budget: As of :func:`gsmerge.decode_scene`. A full fit begins with fewer and grows to the number.
         options: Of the fit; None: the full one at its defaults where there are photos, otherwise none.
-        seed: Of the fit.
-        threads: Threads to use; None: all processors.
-        progress: As of :func:`gsmerge.compact`.
 
     Raises:
         UsageError: If a fit is asked for and there are no photos, or K or the budget is out of range.

@@ -52,33 +52,19 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelSc
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What became of a batch of views.
-
-    Args:
-        num_views: Views of the batch.
-        num_input: Gaussians of the batch.
-        num_new: Groups that it became, merged across its own views.
-        num_covered: Of these, left out because the state shows their pixels as well.
-        num_joined: Of the rest, those that were merged into groups of the state.
-        num_hidden: Of the rest, left out because none of the batch's views shows them.
-        num_groups: Groups of the state afterwards.
-        seconds: Wall time of each stage.
-        choices: What the stages decided.
-        notes: Warnings, one sentence each.
-        options: All settings, by their names in reports.
-    """
+    """What became of a batch of views."""
 
     num_views: int
-    num_input: int
-    num_new: int
-    num_covered: int
-    num_joined: int
-    num_hidden: int
-    num_groups: int
-    seconds: Mapping[str, float]
-    choices: Mapping[str, Any]
-    notes: tuple[str, ...]
-    options: Mapping[str, Any]
+    num_input: int  # Gaussians of the batch
+    num_new: int  # Groups that it became, merged across its own views
+    num_covered: int  # Of these, left out because the state shows their pixels as well
+    num_joined: int  # Of the rest, those that were merged into groups of the state
+    num_hidden: int  # Of the rest, left out because none of the batch's views shows them
+    num_groups: int  # Groups of the state afterwards
+    seconds: Mapping[str, float]  # Wall time of each stage
+    choices: Mapping[str, Any]  # What the stages decided
+    notes: tuple[str, ...]  # Warnings, one sentence each
+    options: Mapping[str, Any]  # All settings, by their names in reports
 
 
 def extend(
@@ -166,11 +152,7 @@ def _add_batch(
 
 
 def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, options: CompactOptions, max_k: int) -> None:
-    """Refuse what no state can have.
-
-    Raises:
-        UsageError: If a setting or the harmonics do not fit.
-    """
+    """Refuse what no state can have."""
     for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
@@ -190,13 +172,7 @@ def _enter(
 ) -> tuple[GroupSet, dict[str, int]]:
     """The state's groups with new ones among them, and how many were merged and how many no view shows.
 
-    Args:
-        groups: The state's groups.
-        new: The batch's groups.
-        prepared: The batch.
-        photos: Its photos.
-        rows: The state's groups that its views may see.
-        max_k: Most children of a group.
+    ``rows``: the state's groups that the batch's views may see.
     """
     options = prepared.options
     partners = find_partners(take(groups.features, rows), new.features, options.match)
@@ -218,11 +194,6 @@ def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: Ma
     """``[n]`` int64: the state's group that shows the same surface as each new one, -1 for none; no group gets two.
 
     Matched as across the views of one batch, the state being one view and the batch another.
-
-    Args:
-        features: The state's groups that the batch's views see.
-        new: n new groups, merged among themselves.
-        options: Of matching across views.
     """
     both = FeatureGaussians.concat([features, new])
     sides = (torch.arange(len(both)) >= len(features)).long()
@@ -233,14 +204,7 @@ def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: Ma
 
 
 def merge_into(groups: GroupSet, new: GroupSet, rows: Tensor, max_k: int) -> GroupSet:
-    """The state's groups, some of them merged with new ones: moments add up, in place.
-
-    Args:
-        groups: The state's groups.
-        new: n new groups.
-        rows: ``[n]`` int64 the group that each is merged into, all different.
-        max_k: Most children of a group.
-    """
+    """Merge n new groups into those of the state at ``rows [n]`` int64, all different: moments add up, in place."""
     if len(rows) == 0:
         return groups
     old = select_groups(groups, rows)
@@ -262,9 +226,6 @@ def _first_state(groups: GroupSet, prepared: PreparedScene, max_k: int) -> Onlin
         max_k=max_k,
         min_opacity=options.decode.min_opacity,
         min_contribution=options.fit.min_contribution if prepared.given.images is not None else 0.0,
-        target_count=None,
-        num_slots=None,
-        knee_count=0,
     )
     return OnlineState(
         groups=groups,

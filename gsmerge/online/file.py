@@ -29,16 +29,7 @@ from gsmerge.types import Cameras
 
 
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
-    """Write a state, bit for bit as it is in memory.
-
-    Args:
-        path: The file, ``.gsm`` by convention; complete, or what it was before.
-        state: Of one or more batches.
-        overwrite: Replace an existing file.
-
-    Raises:
-        SceneError: If the file exists or cannot be written.
-    """
+    """Write a state, bit for bit as it is in memory."""
     groups, replay = state.groups, state.replay
     tensors = {
         "children.counts": groups.features.starts.diff().to(torch.uint8),
@@ -63,11 +54,7 @@ def load_state(path: str | PathLike[str]) -> OnlineState:
 
 
 def load_stored(path: str | PathLike[str]) -> Encoded | OnlineState:
-    """An encoded scene or a state, whichever the file holds.
-
-    Raises:
-        SceneError: As :func:`load_state`.
-    """
+    """An encoded scene or a state, whichever the file holds."""
     file = read_gsm(path, ENCODED, STATE)
     if file.kind == ENCODED:
         return read_encoded(file)
@@ -114,21 +101,14 @@ def extend_file(
     progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Add a batch of views to the state in a file, or make the file if there is none.
+    """Add a batch of views to the state in a file, or make the file if there is none -> the report, plain JSON types.
 
     The file is replaced when all is done, and not at all if anything goes wrong or another process has changed it.
 
     Args:
         path: The state, or an encoded scene.
-        files: The new views.
         settings: As of :class:`gsmerge.Compactor`; by default the state's own.
-        opacity: How opacities are stored.
-        hints: What is known of the batch's file and need not be recognised.
-        progress: As of :func:`gsmerge.compact`.
         seconds_before: Wall time by name of what the caller did before.
-
-    Returns:
-        The report, in plain JSON types.
 
     Raises:
         SceneError: If the state or the scene cannot be read, or the state cannot be written or was changed meanwhile.

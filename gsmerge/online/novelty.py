@@ -49,12 +49,6 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
     """``[v,h,w]`` float32 mean squared colour error of every pixel, plus the squared transmittance.
 
     The transmittance counts holes, which a black photo would hide.
-
-    Args:
-        gaussians: Canonical Gaussians.
-        photos: The views, usually at half size.
-        height: Of the result.
-        width: Of the result.
     """
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
@@ -65,13 +59,7 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
 
 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
-    """``[g]`` mean of the pixels' errors over the members of every group; a member without a pixel counts as 1.
-
-    Args:
-        features: g Feature Gaussians, each with at least one member.
-        members: The scene's Gaussians that they point to.
-        errors: ``[v,h,w]``.
-    """
+    """``[g]`` mean of the pixels' errors ``[v,h,w]`` over each group's members; one without a pixel counts as 1."""
     rows = features.members.numpy()
     pixels = rows if members.pixels is None else members.pixels[rows]
     each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)
@@ -89,13 +77,7 @@ def novel_rows(
 ) -> Tensor:
     """Rows of a batch's groups that show something which the state does not show as well.
 
-    Args:
-        there: The state's Gaussians in view.
-        features: The batch's groups.
-        members: The Gaussians that they point to.
-        photos: The batch's photos at half the state's size.
-        cameras: The batch's own cameras.
-        options: The errors that count as shown well.
+    ``there``: the state's Gaussians in view; ``photos``: the batch's, at half the state's size.
     """
     if options.tolerance == 0:
         return torch.arange(len(features))

@@ -50,9 +50,6 @@ def merge_settings(
     """All settings: as given, otherwise those that the state was made with, otherwise the defaults.
 
     By default colours are fitted batch by batch; the full fit comes when decoding.
-
-    Raises:
-        ValueError: If a setting is unknown or out of range.
     """
     names = OnlineOptions.__dataclass_fields__.keys()
     known = names | CompactOptions().to_dict().keys()

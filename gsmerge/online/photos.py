@@ -76,12 +76,7 @@ def update_replay(
 ) -> Replay:
     """The stored photos with new ones among them: every n-th of all views, n a power of two.
 
-    Args:
-        replay: Those stored so far.
-        batch_photos: The new ones.
-        view_ids: ``[s]`` the view of each new one; of a view that is stored already, the first photo stays.
-        num_views: Views in all.
-        max_photos: Most photos that are stored.
+    ``view_ids [s]``: the view of each new one; of a view that is stored already, the first photo stays.
     """
     ids, rows = np.unique(view_ids, return_index=True)
     new = ~np.isin(ids, replay.views)
@@ -105,16 +100,6 @@ def fit_batch_colors(
     The normal equations of earlier photos are stored as their diagonal (``GroupSet.color_precision``) about the colours
     that solve them: ``color_precision |colour - fitted colour|^2`` is added to the equations of the new photos, so that
     no earlier photo is needed again.
-
-    Args:
-        groups: The state's groups.
-        batch_photos: The new photos.
-        options: Of the colour fit.
-        seed: Chooses the held-out blocks.
-
-    Returns:
-        The groups, the new photos added to their colour precision, and what was done. Where held-out blocks did not
-        get better, the colours stay and their precision grows all the same.
     """
     rows = rows_in_view(groups.features, batch_photos.cameras)
     in_view, photos = select_groups(groups, rows), batch_photos.photos(2)

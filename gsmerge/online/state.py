@@ -25,15 +25,10 @@ CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Photos of earlier views.
+    """Photos of earlier views."""
 
-    Args:
-        images: ``[r,h,w,3]`` uint8, of the size of the state's cameras.
-        views: ``[r]`` int64, rising: which of the state's views they are.
-    """
-
-    images: np.ndarray
-    views: np.ndarray
+    images: np.ndarray  # [r,h,w,3] uint8, of the size of the state's cameras
+    views: np.ndarray  # [r] int64, rising: which of the state's views they are
 
     def __len__(self) -> int:
         return len(self.views)
@@ -46,21 +41,17 @@ def no_photos(cameras: Cameras) -> Replay:
 
 @dataclass(frozen=True, eq=False)
 class GroupSet:
-    """Groups with the Gaussians that they divide into.
+    """Groups with the Gaussians that they divide into."""
 
-    Args:
-        features: g Feature Gaussians, canonical, with gains and spreads of one and without latents: what gains,
-            spreads and networks did to them is in their moments. Their members are rows of ``children``.
-        children: The Gaussians of the finest division, group by group.
-        fitted_sh0: ``[g,1,3]`` base colours (sh0) that fit the photos so far. ``features.sh0`` stays as exported, for
-            the full fit to start from.
-        color_precision: ``[g]`` how much earlier photos say about each fitted colour: the diagonal of their normal
-            equations, which is the sum of the squares of the group's blending weights over their half-size pixels.
-    """
-
+    # g Feature Gaussians, canonical, with gains and spreads of one and without latents: what gains, spreads and
+    # networks did to them is in their moments. Their members are rows of `children`.
     features: FeatureGaussians
-    children: Gaussians
+    children: Gaussians  # The Gaussians of the finest division, group by group
+    # [g,1,3] base colours (sh0) that fit the photos so far. `features.sh0` stays as exported, for the full fit to
+    # start from.
     fitted_sh0: Tensor
+    # [g] how much earlier photos say about each fitted colour: the diagonal of their normal equations, which is the
+    # sum of the squares of the group's blending weights over their half-size pixels
     color_precision: Tensor
 
     def __len__(self) -> int:
@@ -73,14 +64,10 @@ class OnlineState(StoredScene):
 
     The frame is that of the first batch; the cameras are those of all views so far, at the size of the first batch's;
     ``about`` also has the numbers of every batch.
-
-    Args:
-        groups: The groups.
-        replay: Photos of some of the views.
     """
 
     groups: GroupSet
-    replay: Replay
+    replay: Replay  # Photos of some of the views
 
     def __len__(self) -> int:
         return len(self.groups)
@@ -94,15 +81,7 @@ class OnlineState(StoredScene):
 def bake(
     features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int, rule: Rule = "depth"
 ) -> GroupSet:
-    """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more.
-
-    Args:
-        features: g Feature Gaussians with their members.
-        members: The Gaussians that they point to.
-        networks: Networks whose heads correct what is decoded; None: none do.
-        max_k: Most children that are stored of a group.
-        rule: How children are pooled.
-    """
+    """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -218,12 +197,7 @@ def with_fitted_colors(groups: GroupSet) -> GroupSet:
 
 
 def to_encoded(state: OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """The state as an encoded scene, which decodes at any K and budget.
-
-    Args:
-        state: Of one or more batches.
-        fitted_colors: Use the colours that fit the photos; otherwise those of the exports.
-    """
+    """The state as an encoded scene, in the colours that fit the photos or else in those of the exports."""
     groups = with_fitted_colors(state.groups) if fitted_colors else state.groups
     features = groups.features
     return Encoded(

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import harmonics
-from gsmerge.render.plan import Array, ViewPlan, pieces
+from gsmerge.render.plan import Array, ViewPlan, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
-
-
-def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
-    """Ranges of tiles with about equally many intersections."""
-    num = len(pieces(len(plan.members), threads))
-    cuts = np.searchsorted(plan.offsets, len(plan.members) * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
-    return list(pairwise(edges.tolist()))
 
 
 def background_color(background: ArrayLike) -> Array:
@@ -51,7 +41,7 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
         )
 
     with use_threads() as threads:
-        parallel_map(tiles, _tile_ranges(plan, threads))
+        parallel_map(tiles, tile_ranges(plan, threads))
     return image, transmittance
 
 
@@ -103,7 +93,7 @@ def splat_adjoint(plan: ViewPlan, image: Array) -> Array:
     with use_threads() as threads:
         for first in range(0, image.shape[2], kernels.CHANNELS):
             part = np.ascontiguousarray(image[..., first : first + kernels.CHANNELS], np.float32)
-            parallel_map(tiles, _tile_ranges(plan, threads))
+            parallel_map(tiles, tile_ranges(plan, threads))
             kernels.add_slots(plan.members, slots, plan.ids, first, sums)
     return sums
 

@@ -59,7 +59,6 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
         shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
         colors: ``[n,3]``, any sign, float32.
         camera: As :meth:`gsmerge.render.photos.Photos.camera` gives it.
-        background: ``[3]`` float32.
 
     Returns:
         ``[h,w,3]`` on the tensors' device, differentiable in all of them, and ``[n]`` bool: which Gaussians have a

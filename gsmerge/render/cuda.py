@@ -83,12 +83,8 @@ def rasterize(
         colors: ``[n,3]``, taken as they are, or with ``sh_degree`` ``[n,k,3]`` spherical harmonics.
         cameras: World-to-camera matrices ``[c,4,4]``, intrinsics ``[c,3,3]``, width and height.
         background: ``[3]``.
-        sh_degree: Degree of the spherical harmonics; None: ``colors`` are colours.
         eps2d: Dilation of the footprints, pixels squared.
         antialiased: Lower the opacity by what the dilation adds to the footprint.
-        near: Nearest depth drawn.
-        far: Farthest depth drawn.
-        with_depths: Also the mean depth.
 
     Returns:
         Images, alphas and depths, on the device of the tensors, the depths without gradients; and ``[c,n]`` bool: which
@@ -139,14 +135,7 @@ def _empty(tensors: tuple[Tensor, ...], backgrounds: Tensor, size: tuple[int, in
 
 
 def render_cuda(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    background: Array,
-    *,
-    antialiased: bool,
-    near: float,
-    far: float,
-    with_depths: bool,
+    gaussians: Gaussians, cameras: Cameras, background: Array, *, near: float, far: float, **options: Any
 ) -> Rendering:
     """:func:`gsmerge.render` by gsplat; same arguments, except for the checked ``[3]`` background.
 
@@ -164,10 +153,9 @@ def render_cuda(
         (local, cameras.Ks, cameras.width, cameras.height),
         torch.from_numpy(background),
         sh_degree=gaussians.sh_degree,
-        antialiased=antialiased,
         near=near,
         far=far,
-        with_depths=with_depths,
+        **options,
     )
     return drawn
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from gsmerge.kernels.raster import blend_backward, harmonics, project_backward
 from gsmerge.render.blend import view_colors
-from gsmerge.render.plan import Array, ViewPlan, pieces
+from gsmerge.render.plan import Array, ViewPlan, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
@@ -28,57 +28,31 @@ WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another 
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients of a loss with respect to the Gaussians of a plan.
+    """Gradients of a loss with respect to the Gaussians of a plan."""
 
-    Args:
-        ids: ``[m]`` int32, ascending: the Gaussians that the rows belong to; all others have none.
-        means: ``[m,3]`` float32, through geometry alone (colours seen from elsewhere: :func:`color_gradients`).
-        quats: ``[m,4]`` float32, with respect to the quaternions as they are, of whatever length.
-        scales: ``[m,3]`` float32, with respect to linear scales.
-        opacities: ``[m]`` float32.
-        colors: ``[m,3]`` float32, with respect to the colours in this view, as they are blended.
-        viewmat: ``[4,4]`` float64, last row 0; None if not asked for.
-    """
-
-    ids: Array
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    colors: Array
-    viewmat: Array | None
+    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    means: Array  # [m,3] float32, through geometry alone (colours seen from elsewhere: color_gradients)
+    quats: Array  # [m,4] float32, with respect to the quaternions as they are, of whatever length
+    scales: Array  # [m,3] float32, with respect to linear scales
+    opacities: Array  # [m] float32
+    colors: Array  # [m,3] float32, with respect to the colours in this view, as they are blended
+    viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
 
 
 @dataclass(frozen=True, eq=False)
 class ColorGradients:
-    """Gradients of a loss through the colours that the Gaussians of a plan show its view.
+    """Gradients of a loss through the colours that the Gaussians of a plan show its view."""
 
-    Args:
-        ids: ``[m]`` int32, ascending: the Gaussians that the rows belong to; all others have none.
-        sh0: ``[m,1,3]`` float32.
-        shN: ``[m,k-1,3]`` float32.
-        means: ``[m,3]`` float32, through the viewing direction alone.
-    """
-
-    ids: Array
-    sh0: Array
-    shN: Array
-    means: Array
+    ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
+    sh0: Array  # [m,1,3] float32
+    shN: Array  # [m,k-1,3] float32
+    means: Array  # [m,3] float32, through the viewing direction alone
 
 
 def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
     return np.ascontiguousarray(array, np.float32)
-
-
-def _tile_ranges(plan: ViewPlan, threads: int) -> list[tuple[int, int]]:
-    """Ranges of tiles with about equally many intersections, some per thread."""
-    count = len(plan.members)
-    num = 1 if threads == 1 else max(1, min(4 * threads, count // WORTH))
-    cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
-    return list(pairwise(edges.tolist()))
 
 
 def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
@@ -123,7 +97,7 @@ def gradients_of(
         tints[slice(*span)] = sums[slice(*span), :3]
 
     with use_threads() as threads:
-        parallel_map(tiles, _tile_ranges(plan, threads))
+        parallel_map(tiles, tile_ranges(plan, threads, WORTH))
         parallel_map(project, _blocks(m, threads))
     viewmat = None
     if with_viewmat:

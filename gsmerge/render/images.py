@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,14 +44,7 @@ def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array
 def draw_views(
     plan_one: Callable[[int], ViewPlan], shape: tuple[int, int, int], background: Array, with_depths: bool
 ) -> Rendering:
-    """Draw the plans of ``c`` views.
-
-    Args:
-        plan_one: Plans the view of a number.
-        shape: Views, height and width.
-        background: ``[3]`` float32.
-        with_depths: Also draw depths.
-    """
+    """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width)."""
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.zeros((*shape, 1), np.float32) if with_depths else None
 
@@ -63,21 +57,14 @@ def draw_views(
             weighted = blend(plan, colors, np.zeros(3, np.float32))[0][..., :1]
             np.divide(weighted, alphas[view], out=depths[view], where=alphas[view] > 0)
 
-    if shape[0] == 1:
-        one(0)  # not through the pool, so that the pieces of the one view can share it
-    else:
-        parallel_map(one, range(shape[0]))
+    parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
     return Rendering(
         torch.from_numpy(images), torch.from_numpy(alphas), None if depths is None else torch.from_numpy(depths)
     )
 
 
 def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device:
-    """The device of all tensors.
-
-    Raises:
-        ValueError: If there are several.
-    """
+    """The device of all tensors."""
     devices = {tensor.device for tensor in (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)}
     if len(devices) > 1:
         named = " and ".join(sorted(map(str, devices)))
@@ -121,25 +108,19 @@ def render(
         GsmergeError: If CUDA tensors are given and gsplat is not installed.
     """
     under = background_color(background.detach().cpu() if isinstance(background, Tensor) else background)
+    options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
     if one_device(gaussians, cameras).type == "cuda":
         from gsmerge.render.cuda import render_cuda
 
-        return render_cuda(
-            gaussians, cameras, under, antialiased=antialiased, near=near, far=far, with_depths=with_depths
-        )
+        return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
     inputs = (*vars(gaussians).values(), cameras.viewmats)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         from gsmerge.render.autograd import render_differentiable  # compiled only for those who train
 
-        return render_differentiable(
-            gaussians, cameras, under, antialiased=antialiased, near=near, far=far, with_depths=with_depths
-        )
+        return render_differentiable(gaussians, cameras, under, with_depths=with_depths, **options)
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
     def plan_one(view: int) -> ViewPlan:
-        return plan_view(
-            splats, viewmats[view], Ks[view], cameras.width, cameras.height,
-            antialiased=antialiased, near=near, far=far,
-        )  # fmt: skip
+        return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
 
     return draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)

@@ -26,19 +26,13 @@ EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 @dataclass(frozen=True)
 class Photos:
-    """V photos of one size.
+    """V photos of one size."""
 
-    Args:
-        images: ``[v,h,w,3]`` float32, sRGB in [0, 1].
-        viewmats: ``[v,4,4]`` world to camera.
-        Ks: ``[v,3,3]`` intrinsics at this size.
-        eps2d: Low-pass variance in square pixels of this size: it stays that of the full-size image, so that
-            scales are judged against the filter that they will be rendered with.
-    """
-
-    images: np.ndarray
-    viewmats: np.ndarray
-    Ks: np.ndarray
+    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]
+    viewmats: np.ndarray  # [v,4,4] world to camera
+    Ks: np.ndarray  # [v,3,3] intrinsics at this size
+    # Low-pass variance in square pixels of this size: it stays that of the full-size image, so that scales are judged
+    # against the filter that they will be rendered with
     eps2d: float
 
     def __len__(self) -> int:
@@ -80,11 +74,7 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
 
 
 def scene_photos(scene: PixelScene | UnalignedScene, level: float = 1) -> Photos:
-    """The scene's photos, each side divided by ``level`` (area averages).
-
-    Raises:
-        ValueError: If the scene has no images.
-    """
+    """The scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
     return photos_of(scene.images.numpy(), scene.cameras, level)
@@ -104,11 +94,9 @@ def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
     """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
     viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     w, h = cameras.width, cameras.height
-    size = (w, h) if level == 1 else (max(1, round(w / level)), max(1, round(h / level)))
-    black = np.broadcast_to(np.float32(0), (len(cameras), size[1], size[0], 3))
-    if level == 1:
-        return Photos(black, viewmats, Ks, EPS2D)
-    sx, sy = size[0] / w, size[1] / h
+    width, height = max(1, round(w / level)), max(1, round(h / level))
+    black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))
+    sx, sy = width / w, height / h
     return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
 
 
@@ -125,16 +113,11 @@ def photo_errors(
     """Render some Gaussians into the photos' cameras and score every picture, several views at once.
 
     Args:
-        gaussians: n Gaussians.
-        photos: V photos.
         score: Called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
         views: Of the photos, in the order of the result; None: all.
         near: Near plane, in the Gaussians' unit.
         colors: ``[n,3]`` in place of the Gaussians' harmonics.
         keep: View -> ``[n]`` mask of the Gaussians that are drawn in it; None: all.
-
-    Returns:
-        The score of each view.
     """
     splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,25 +25,15 @@ MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Gaussians as the kernels take them: contiguous float32 arrays.
+    """Gaussians as the kernels take them: contiguous float32 arrays."""
 
-    Args:
-        means: ``[n,3]`` world positions less ``origin``.
-        quats: ``[n,4]`` wxyz.
-        scales: ``[n,3]`` linear.
-        opacities: ``[n]`` in [0, 1].
-        sh0: ``[n,1,3]``.
-        shN: ``[n,k-1,3]``.
-        origin: ``[3]`` float64, subtracted from the means before they were rounded to float32.
-    """
-
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    sh0: Array
-    shN: Array
-    origin: Array
+    means: Array  # [n,3] world positions less `origin`
+    quats: Array  # [n,4] wxyz
+    scales: Array  # [n,3] linear
+    opacities: Array  # [n] in [0, 1]
+    sh0: Array  # [n,1,3]
+    shN: Array  # [n,k-1,3]
+    origin: Array  # [3] float64, subtracted from the means before they were rounded to float32
 
     def __len__(self) -> int:
         return len(self.means)
@@ -50,35 +41,20 @@ class Splats:
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """What is drawn where in one view.
-
-    Args:
-        splats: The Gaussians.
-        ids: ``[m]`` int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
-        footprints: ``[m,8]`` float32, see :mod:`gsmerge.kernels.raster.project`.
-        depths: ``[m]`` float32, camera z.
-        members: ``[intersections]`` int32 rows of ``ids``, tile after tile, nearest first.
-        offsets: ``[tiles+1]`` int64 starts of the tiles' lists.
-        eye: ``[3]`` float32, the camera's centre less ``splats.origin``.
-        opacities: ``[n]`` float32, those that are drawn.
-        camera: The view's numbers in the order of :mod:`gsmerge.kernels.raster.project`, float32.
-        viewmat: ``[4,4]`` float64, world to camera.
-        width: Image width, pixels.
-        height: Image height, pixels.
-    """
+    """What is drawn where in one view."""
 
     splats: Splats
-    ids: Array
-    footprints: Array
-    depths: Array
-    members: Array
-    offsets: Array
-    eye: Array
-    opacities: Array
-    camera: Array
-    viewmat: Array
-    width: int
-    height: int
+    ids: Array  # [m] int32, ascending: the Gaussians that may touch the image. (A few at its border may miss it.)
+    footprints: Array  # [m,8] float32, see gsmerge.kernels.raster.project
+    depths: Array  # [m] float32, camera z
+    members: Array  # [intersections] int32 rows of `ids`, tile after tile, nearest first
+    offsets: Array  # [tiles+1] int64 starts of the tiles' lists
+    eye: Array  # [3] float32, the camera's centre less `splats.origin`
+    opacities: Array  # [n] float32, those that are drawn
+    camera: Array  # The view's numbers in the order of gsmerge.kernels.raster.project, float32
+    viewmat: Array  # [4,4] float64, world to camera
+    width: int  # pixels
+    height: int  # pixels
 
     @property
     def columns(self) -> int:
@@ -113,9 +89,6 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
         gaussians: n Gaussians; means may be float64, for scenes in geographic coordinates.
         origin: ``[3]`` world point that becomes the arrays' zero. None: the world's zero, unless the scene is far
             away from it compared with its size.
-
-    Returns:
-        The arrays.
     """
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
     means = gaussians.means
@@ -132,10 +105,24 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     )
 
 
+def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
+    """Pieces of work for the pool, some per thread as they may take unequally long, each of about ``least`` or more."""
+    return 1 if threads == 1 else max(1, min(4 * threads, count // least))
+
+
 def pieces(count: int, threads: int) -> list[tuple[int, int]]:
-    """Ranges for the pool, some per thread as they may take unequally long; no result depends on where they end."""
-    num = 1 if threads == 1 else max(1, min(4 * threads, count // PIECE))
+    """Ranges for the pool; no result depends on where they end."""
+    num = num_pieces(count, threads)
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
+
+
+def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
+    """Ranges of tiles with about equally many intersections, at least about ``least``, for the pool."""
+    count = len(plan.members)
+    num = num_pieces(count, threads, least)
+    cuts = np.searchsorted(plan.offsets, count * np.arange(1, num) / num)
+    edges = np.unique(np.concatenate([[0], cuts, [len(plan.offsets) - 1]]))
+    return list(pairwise(edges.tolist()))
 
 
 def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool) -> Array:
@@ -218,11 +205,7 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
 
 
 def check_range(near: float, far: float, eps2d: float) -> None:
-    """Refuse a depth range or a dilation that makes no sense.
-
-    Raises:
-        ValueError: If it does not.
-    """
+    """Refuse a depth range or a dilation that makes no sense."""
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
 

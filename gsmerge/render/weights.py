@@ -20,29 +20,17 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class ViewWeights:
-    """W of one view, stored by tile and Gaussian.
+    """W of one view, stored by tile and Gaussian."""
 
-    Args:
-        ids: ``[m]`` int32: the Gaussians that may touch the image.
-        members: ``[intersections]`` int32 rows of ``ids``.
-        offsets: ``[tiles + 1]`` int64 starts of the tiles' lists in ``members``.
-        columns: Tiles per row.
-        starts: ``[intersections + 1]`` int64 into ``lanes`` and ``weights``.
-        lanes: Pixel of each entry within its tile, row-major, uint8.
-        weights: Blending weight of each entry, float32.
-        height: Image height, pixels.
-        width: Image width, pixels.
-    """
-
-    ids: Array
-    members: Array
-    offsets: Array
-    columns: int
-    starts: Array
-    lanes: Array
-    weights: Array
-    height: int
-    width: int
+    ids: Array  # [m] int32: the Gaussians that may touch the image
+    members: Array  # [intersections] int32 rows of `ids`
+    offsets: Array  # [tiles + 1] int64 starts of the tiles' lists in `members`
+    columns: int  # Tiles per row
+    starts: Array  # [intersections + 1] int64 into `lanes` and `weights`
+    lanes: Array  # Pixel of each entry within its tile, row-major, uint8
+    weights: Array  # Blending weight of each entry, float32
+    height: int  # pixels
+    width: int  # pixels
 
 
 def view_weights(plan: ViewPlan) -> ViewWeights:

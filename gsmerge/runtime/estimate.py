@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
-from gsmerge.runtime.memory import human_bytes, machine_memory
+from gsmerge.runtime.memory import machine_memory
 
 MAX_SCORED_VIEWS = 24  # views that whole scenes are scored by
 
@@ -40,10 +38,7 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
 
     Args:
         pixels: Of all views together, or Gaussians where they are more.
-        view_pixels: Of one view.
         options: All settings by flat name, with the checkpoint that is used.
-        photos: Whether the scene has photos.
-        fit_steps: Steps of the full fit.
     """
     method, fit, views = options["method"], fit_of(options, photos=photos), pixels / max(view_pixels, 1)
     if method == "gsmerge":
@@ -66,21 +61,13 @@ def score_cost(views: float) -> float:
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0) -> int:
     """Memory that a scene takes, imports included, within a factor of about two.
 
-    Args:
-        pixels: As of :func:`work_seconds`.
-        photos: Whether the scene has photos.
-        num_rest: Columns of higher harmonics.
+    ``pixels`` as of :func:`work_seconds`; ``num_rest``: columns of higher harmonics.
     """
     return BYTES_FIXED + round((BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos) * pixels)
 
 
 def memory_problem(needed: int, available: int | None) -> str | None:
-    """A sentence where a scene is not likely to fit into the machine's memory; None where it does.
-
-    Args:
-        needed: Bytes, by :func:`memory_bytes`.
-        available: Bytes that the machine has; None: not known.
-    """
+    """A sentence where the bytes of :func:`memory_bytes` are not likely to fit into the machine; None if they do."""
     if available is None or needed <= available:
         return None
     return (
@@ -114,11 +101,7 @@ def estimate_run(
 
     Args:
         grid: Views, height and width.
-        options: All settings by flat name, as of ``CompactOptions.resolved()``.
-        num_pixels: Of all views together, or Gaussians where they are more.
-        photos: Whether the scene has photos.
-        threads: Threads that run.
-        fit_steps: Steps of the full fit.
+        options: As of :func:`work_seconds`, and so are ``num_pixels`` (its ``pixels``), ``photos`` and ``fit_steps``.
         num_rest: Columns of higher harmonics.
 
     Returns:
@@ -133,87 +116,7 @@ def estimate_run(
     }
 
 
-def plan_document(
-    files: Mapping[str, str | None],
-    grid: tuple[int, int, int],
-    options: Mapping[str, Any],
-    *,
-    output_path: Path,
-    per_view: int,
-    photos: bool,
-    threads: int,
-    fit_steps: int,
-    default_count: int,
-    budget: int | None = None,
-    notes: Sequence[str] = (),
-    count: int | None = None,
-    num_rest: int = 0,
-) -> dict[str, Any]:
-    """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types.
-
-    Args:
-        files: Paths of the ``ply``, the ``cameras`` and the ``images``.
-        grid: Views, height and width of the Gaussian grid.
-        options: All settings by flat name, as of ``CompactOptions.resolved()``.
-        output_path: The ``.ply`` that would be written.
-        per_view: Superpixels per view; a budget distributes them differently.
-        photos: Whether the scene has photos; robust merging and the fit need them.
-        threads: Threads that would run.
-        fit_steps: Steps of the full fit.
-        default_count: Gaussians that superpixels and K ask for.
-        budget: Gaussians that a budget, a file size or a preset asks for; None without any.
-        notes: Of the reader.
-        count: Gaussians of the file; None: one for each pixel of the grid.
-        num_rest: Columns of higher harmonics.
-
-    Returns:
-        The plan, without the head of a document; ``estimate`` is as of :func:`estimate_run`.
-    """
-    views, height, width = grid
-    pixels = max(views * height * width, count or 0)
-    method = options["method"]
-    max_count = default_count if budget is None else budget
-    max_count = pixels if method.startswith("unmerged") else max_count
-    return {
-        "dry_run": True,
-        "input": {**files, "num_gaussians": count or pixels, "num_views": views, "height": height, "width": width},
-        "output": {"path": os.fspath(output_path), "num_gaussians_at_most": min(count or pixels, max_count)},
-        "method": method,
-        "superpixels_per_view": per_view if budget is None and options["budget"] != "auto" else None,
-        "robust": is_robust(options, photos=photos),
-        "fit": fit_of(options, photos=photos),
-        "estimate": estimate_run(
-            grid, options, pixels, photos=photos, threads=threads, fit_steps=fit_steps, num_rest=num_rest
-        ),
-        "options": dict(options),
-        "notes": list(notes),
-    }
-
-
 def memory_problems(estimate: Mapping[str, Any]) -> list[str]:
     """That an estimated run is not likely to fit into this machine's memory; nothing where it does."""
     problem = memory_problem(estimate["memory_bytes"], estimate["machine_memory_bytes"])
     return [] if problem is None else [problem]
-
-
-def plan_lines(plan: Mapping[str, Any]) -> list[str]:
-    """The plan for people."""
-    scene, estimate, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
-    superpixels = "where the scene needs them"
-    if per_view is not None:
-        superpixels = f"{per_view:,} per view, {plan['options']['k']} Gaussian(s) each"
-    steps = [
-        f"superpixels  {superpixels}",
-        f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
-        f" across views: {plan['options']['match']}",
-        f"networks     {plan['options']['checkpoint']}",
-    ]
-    return [
-        f"would read   {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
-        f"would write  {plan['output']['path']}: at most {plan['output']['num_gaussians_at_most']:,} Gaussians",
-        *(steps if plan["method"] == "gsmerge" else [f"method       {plan['method']}"]),
-        f"fit          {plan['fit']}",
-        f"estimate     about {estimate['seconds']:.0f} s, {human_bytes(estimate['memory_bytes'])} of memory",
-        *(f"memory       {problem}" for problem in memory_problems(estimate)),
-        *(f"note         {note}" for note in plan["notes"]),
-    ]

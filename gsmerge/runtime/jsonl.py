@@ -22,23 +22,14 @@ except ImportError:  # not a POSIX system: one process at a time
 
 @dataclass(frozen=True)
 class Lines:
-    """What a file of JSON lines holds.
+    """What a file of JSON lines holds."""
 
-    Args:
-        values: One per line that could be read.
-        notes: Lines that were dropped, one sentence each.
-    """
-
-    values: tuple[dict[str, Any], ...]
-    notes: tuple[str, ...]
+    values: tuple[dict[str, Any], ...]  # One per line that could be read
+    notes: tuple[str, ...]  # Lines that were dropped, one sentence each
 
 
 def read_lines(path: Path) -> Lines:
-    """Read a file of JSON lines; what a killed run left half-written is dropped, and said.
-
-    Raises:
-        SceneError: If the file cannot be read.
-    """
+    """Read a file of JSON lines; what a killed run left half-written is dropped, and said."""
     values: list[dict[str, Any]] = []
     notes, last = [], 0
     for number, (end, value) in enumerate(each_line(path), 1):
@@ -57,9 +48,6 @@ def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] 
 
     Yields:
         The byte after the line, and what it holds; None if it is damaged.
-
-    Raises:
-        SceneError: If the file cannot be read.
     """
     if not path.exists():
         return

@@ -38,10 +38,8 @@ def release_memory() -> None:
     threads, this is a tenth of the peak. Does nothing on other systems.
     """
     if sys.platform == "linux":
-        try:
+        with suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
-        except (OSError, AttributeError):
-            return
 
 
 def human_bytes(count: float) -> str:

@@ -20,19 +20,12 @@ STAGES = (
 
 @dataclass
 class RunLog:
-    """Clock and record of one run.
+    """Clock and record of one run."""
 
-    Args:
-        progress: Called with (stage, done, total).
-        seconds: Wall time of each stage.
-        choices: What the stages decided.
-        notes: Things worth telling, one sentence each.
-    """
-
-    progress: Progress | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    choices: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    progress: Progress | None = None  # Called with (stage, done, total)
+    seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
+    choices: dict[str, Any] = field(default_factory=dict)  # What the stages decided
+    notes: list[str] = field(default_factory=list)  # Things worth telling, one sentence each
 
     def fit_progress(self, step: int, steps: int, photos: float, held_out: float) -> None:
         """One step of the fit is done."""
@@ -46,11 +39,6 @@ class RunLog:
         self.choices["fit"] = asdict(report)
         if not report.accepted:
             self.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
-
-    def curve_progress(self, done: int, total: int) -> None:
-        """One point of the curve is measured."""
-        if self.progress:
-            self.progress("curve: what each count brings", done, total)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

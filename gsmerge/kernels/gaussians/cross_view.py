@@ -24,17 +24,12 @@ def sum_cross_view(
         own: ``[g]`` int64 view of each, which is left out.
         viewmats: ``[v,4,4]`` float64.
         Ks: ``[v,3,3]`` float64.
-        width: Of all views, pixels.
-        height: The same.
         means: ``[v h w,3]`` float32 Gaussians, one per pixel.
         opacities: ``[v h w]`` float32.
         sh0: ``[v h w,1,3]`` float32.
-        color_scale: Value of the first harmonic.
         near: Largest difference of the logarithms of two depths of one surface.
         far: Larger differences are clipped to this.
         min_opacity: More transparent Gaussians show no surface.
-        first: First point.
-        last: Last point, exclusive.
         out: ``[g,6]`` float64, added to: views that see the point; of these, those whose surface is at it, behind it,
             in front of it; absolute difference of colours where it is at it, difference of the logarithms of depths.
     """

@@ -11,16 +11,10 @@ DIGIT = 11  # bits sorted per pass at most: 2048 counters and their streams stay
 
 @kernel
 def depth_order(bits):
-    """Stable order by the bit patterns of positive floats, nearest first.
+    """Stable order by the bit patterns ``[m]`` uint32 of positive floats, nearest first: ``[m]`` int32 positions.
 
     A least-significant-digit radix sort. Only the bits in which the range of values differs are sorted, in as few
     and as even passes as possible.
-
-    Args:
-        bits: ``[m]`` uint32.
-
-    Returns:
-        ``[m]`` int32 positions.
     """
     m = bits.shape[0]
     order = np.empty(m, np.int32)
@@ -64,15 +58,9 @@ def depth_order(bits):
 
 @kernel
 def count_tiles(boxes, lines, columns):
-    """Number of boxes over each tile.
+    """``[lines * columns]`` int64 boxes over each tile.
 
-    Args:
-        boxes: ``[m,4]`` int16 first and (exclusive) last tile column, first and last tile row.
-        lines: Rows of tiles.
-        columns: Tiles per row.
-
-    Returns:
-        ``[lines * columns]`` int64.
+    ``boxes [m,4]`` int16: first and (exclusive) last tile column, first and last tile row.
     """
     # Differences at the boxes' corners, then running sums: no loop over tiles, so nothing to mispredict.
     corners = np.zeros((lines + 1, columns + 1), np.int64)
@@ -99,7 +87,6 @@ def deal_tiles(order, boxes, columns, cursors, members):
     Args:
         order: ``[m]`` int32 Gaussians in depth order.
         boxes: ``[m,4]`` int16 their boxes, in the same order.
-        columns: Tiles per row.
         cursors: ``[tiles]`` int64 where each list goes on, advanced.
         members: ``[intersections]`` int32, written.
     """

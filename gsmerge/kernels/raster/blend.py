@@ -135,20 +135,7 @@ def _blend(state, batch, count, y_low, y_high):
 
 @kernel
 def blend(footprints, colors, members, offsets, columns, first, last, background, image, transmittance):
-    """Blend a range of tiles into an image.
-
-    Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        colors: ``[m,3]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        first: First tile.
-        last: Last tile, exclusive.
-        background: ``[3]`` float32.
-        image: ``[h,w,3]`` float32, written in the tiles' pixels.
-        transmittance: ``[h,w]`` float32, likewise.
-    """
+    """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``."""
     height, width = transmittance.shape
     state = np.empty(4 * PLANE, np.float32)
     batch = np.empty((BATCH, 12), np.float32)
@@ -211,15 +198,7 @@ def _sum_weights(state, batch, count, y_low, y_high, slots, start):
 def weighted_sums(footprints, members, offsets, columns, first, last, image, slots):
     """Per intersection of a range of tiles: the weights times up to four channels of an image, summed.
 
-    Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        first: First tile.
-        last: Last tile, exclusive.
-        image: ``[h,w,c]`` float32, c <= CHANNELS.
-        slots: ``[intersections,CHANNELS]`` float32, written in the tiles' part.
+    ``image [h,w,c]``, c <= CHANNELS; ``slots [intersections,CHANNELS]`` is written in the tiles' part.
     """
     height, width, channels = image.shape
     state = np.empty(6 * PLANE, np.float32)
@@ -246,14 +225,9 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
 
 @kernel
 def add_slots(members, slots, ids, first, sums):
-    """Add the intersections' sums to their Gaussians, in the order of the lists.
+    """Add the intersections' ``slots [intersections,CHANNELS]`` to ``sums [n,c]`` from channel ``first`` on.
 
-    Args:
-        members: ``[intersections]`` int32.
-        slots: ``[intersections,CHANNELS]`` float32.
-        ids: ``[m]`` int32.
-        first: First channel of ``sums`` to add to.
-        sums: ``[n,c]`` float32, added to.
+    They are added in the order of the lists.
     """
     num = min(CHANNELS, sums.shape[1] - first)
     last = members.shape[0] - 1
@@ -285,16 +259,9 @@ def _mass_and_peak(state, bits, batch, count, y_low, y_high, start, members, tot
 
 @kernel
 def contributions(footprints, members, offsets, columns, height, width, totals):
-    """Sum and maximum over the pixels of every Gaussian's weight.
+    """Add every Gaussian's weights over the pixels to ``totals[:, 0]``; raise ``totals[:, 1]`` to the largest of them.
 
-    Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        height: Of the image, pixels.
-        width: Of the image, pixels.
-        totals: ``[m,2]`` float32: sums, added to, and maxima, raised.
+    ``totals [m,2]`` float32.
     """
     state = np.empty(3 * PLANE, np.float32)
     bits = state.view(np.int32)

@@ -141,13 +141,6 @@ def blend_backward(
     """Gradient sums of a range of tiles, one row per intersection.
 
     Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        colors: ``[m,3]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        first: First tile.
-        last: Last tile, exclusive.
         image: ``[h,w,3]`` float32, the blended image, background included.
         transmittance: ``[h,w]`` float32, what is left of it.
         grad_image: ``[h,w,3]`` float32, gradient with respect to ``image``.
@@ -178,15 +171,7 @@ def blend_backward(
 
 @kernel
 def gather_slots(members, slots, first, last, sums):
-    """Add up the rows of the Gaussians first to last, in the order of the lists.
-
-    Args:
-        members: ``[intersections]`` int32.
-        slots: ``[intersections,SUMS]`` float32.
-        first: First Gaussian.
-        last: Last Gaussian, exclusive.
-        sums: ``[m,SUMS]`` float32, added to.
-    """
+    """Add the ``slots [intersections,SUMS]`` of some Gaussians to ``sums [m,SUMS]``, in the order of the lists."""
     num = members.shape[0]
     for i in range(num):
         k = members[i]

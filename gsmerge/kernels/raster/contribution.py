@@ -66,10 +66,6 @@ def add_row(footprints, members, offsets, columns, line, labels, heads, pairs, n
     """Append the pairs of a row of tiles.
 
     Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
         line: The row.
         labels: ``[h,w]`` int32.
         heads: ``[m]`` int32, each Gaussian's last pair, -1 for none; updated.
@@ -123,7 +119,6 @@ def settle_row(bottom, footprints, heads, pairs, room, active, num_active, total
 
     Args:
         bottom: First row of pixels that is still to come.
-        footprints: ``[m,FOOTPRINT]`` float32.
         heads: ``[m]`` int32, each Gaussian's last pair, -1 for none; updated.
         pairs: ``[room,PAIR]`` float64.
         room: Rows of the array of pairs to begin with, at least as many as there are superpixels.

@@ -54,18 +54,7 @@ def _basis(x, y, z, degree, basis):
 
 @kernel
 def view_colors(means, sh0, shN, ids, eye, first, last, colors):
-    """Colours of a range of the listed Gaussians as seen from ``eye``, not below 0.
-
-    Args:
-        means: ``[n,3]`` float32.
-        sh0: ``[n,1,3]`` float32.
-        shN: ``[n,k-1,3]`` float32.
-        ids: ``[m]`` int32.
-        eye: ``[3]`` float32.
-        first: Start of the range.
-        last: End of the range, exclusive.
-        colors: ``[m,3]`` float32, written.
-    """
+    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``, not below 0."""
     basis = np.zeros(25, np.float32)
     num = shN.shape[1]
     degree = _degree(num)
@@ -129,12 +118,6 @@ def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors,
     """Gradients of a range of the listed Gaussians through their colours seen from ``eye``.
 
     Args:
-        means: ``[n,3]`` float32.
-        shN: ``[n,k-1,3]`` float32.
-        ids: ``[m]`` int32.
-        eye: ``[3]`` float32.
-        first: Start of the range.
-        last: End of the range, exclusive.
         colors: ``[m,3]`` float32, as seen; no gradient passes where they are 0.
         grad_colors: ``[m,3]`` float32.
         grad_sh0: ``[m,1,3]`` float32, written.

@@ -81,20 +81,11 @@ def _cull_block(block, camera):
 
 @kernel
 def cull(means, scales, opacities, keep, camera, first, last, ids):
-    """List the Gaussians of a range that may touch the image.
+    """List the Gaussians of a range that may touch the image -> their number.
 
     Args:
-        means: ``[n,3]``.
-        scales: ``[n,3]``.
-        opacities: ``[n]``.
         keep: ``[n]`` uint8, 0 drops a Gaussian; an empty array keeps all.
-        camera: ``[CAMERA]`` float32.
-        first: Start of the range.
-        last: End of the range, exclusive.
         ids: ``[last - first + 1]`` int32, written: ascending.
-
-    Returns:
-        The number of ids written.
     """
     block = np.zeros(7 * BLOCK, np.float32)
     count = 0
@@ -236,12 +227,8 @@ def project(means, quats, scales, lnops, ids, camera, footprints, depths, boxes)
     """Project the listed Gaussians.
 
     Args:
-        means: ``[n,3]``.
         quats: ``[n,4]`` wxyz; normalised here.
-        scales: ``[n,3]``.
         lnops: ``[m]`` ln of the opacities of the listed ones.
-        ids: ``[m]`` int32, from :func:`cull`.
-        camera: ``[CAMERA]`` float32.
         footprints: ``[m,FOOTPRINT]`` float32, written.
         depths: ``[m]`` float32, written: camera z.
         boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0

@@ -175,13 +175,7 @@ def project_backward(
     """Gradients of a range of the listed Gaussians.
 
     Args:
-        means: ``[n,3]``.
-        quats: ``[n,4]`` wxyz, of any length above 0.
-        scales: ``[n,3]``.
-        opacities: ``[n]``.
-        ids: ``[m]`` int32.
         sums: ``[m,SUMS]`` float32, see :mod:`gsmerge.kernels.raster.blend_backward`.
-        camera: ``[CAMERA]`` float32.
         first: Start of the range, a multiple of BLOCK.
         last: End of the range, exclusive.
         grad_means: ``[m,3]`` float32, written.

@@ -32,14 +32,6 @@ def _grown(lanes, weights, count):
 def list_weights(footprints, members, offsets, columns, height, width):
     """All weights of a view that are not zero.
 
-    Args:
-        footprints: ``[m,FOOTPRINT]`` float32.
-        members: ``[intersections]`` int32 tile lists.
-        offsets: ``[tiles + 1]`` int64 starts of the lists.
-        columns: Tiles per row.
-        height: Of the image, pixels.
-        width: Of the image, pixels.
-
     Returns:
         ``starts [intersections + 1]`` int64, ``lanes`` uint8 (pixel within its tile, row-major), ``weights`` float32.
     """

@@ -117,10 +117,7 @@ def label_pass(labels, colours, rows, table, foreign, precision):
 def infer_labels(labels, colours, count):
     """Improve padded labels in place, as many rounds as a superpixel's side has pixels; returns them.
 
-    Args:
-        labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; they stay so.
-        colours: ``[h,w,3]`` float32, CIELAB / 100.
-        count: Number of regions.
+    Each of the ``count`` regions is 4-connected and not empty, and stays so. ``colours [h,w,3]`` are CIELAB / 100.
     """
     height, width, _ = colours.shape
     table = simple_point_table()

@@ -67,9 +67,6 @@ def sweep(labels, pixels, rows, table, spread, backward):
 
     A pixel goes from region A to a 4-neighbour's region B if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²`` and A stays
     connected without it. It needs a neighbour of its own label, so that no region can run empty.
-
-    Returns:
-        How many pixels changed their region.
     """
     height, width, _ = pixels.shape
     one = np.float32(1)
@@ -106,14 +103,10 @@ CONNECTIVITY = connectivity_table()
 
 
 def refine(labels, pixels, count, num_sweeps, spread):
-    """Sweep in place, forth and back, until nothing moves or ``num_sweeps`` are done; returns the labels.
+    """Sweep in place, forth and back, until nothing moves or ``num_sweeps`` are done; returns the padded labels.
 
-    Args:
-        labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; they stay so.
-        pixels: ``[h,w,3]`` float32.
-        count: Number of regions.
-        num_sweeps: Passes over the picture.
-        spread: Square root of the weight of squared pixels against squared colours, float32.
+    Each of the ``count`` regions is 4-connected and not empty, and stays so. ``spread``: square root of the weight of
+    squared pixels against squared colours, float32.
     """
     rows = region_rows(labels, pixels, count, count, spread)
     num_pixels = rows[:, NUM_PIXELS]

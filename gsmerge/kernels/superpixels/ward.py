@@ -151,7 +151,6 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
     Args:
         pairs: From :func:`adjacent_pairs`; overwritten.
         rows: ``[2·leaves,8]`` rows of the leaves; those of the merged regions are filled in.
-        num_leaves: Regions at the start.
         num_merges: Merges wanted; the regions must be connected.
         ceiling: First ceiling of the cost, squared colour times pixels.
 
@@ -195,8 +194,6 @@ def merge_regions(labels, pixels, num_regions, count, spread):
 
     Args:
         labels: Padded labels 0 to ``num_regions - 1``, each region 4-connected.
-        pixels: ``[h,w,3]`` float32.
-        num_regions: Regions at the start.
         count: Regions wanted, 1 to ``num_regions``.
         spread: Square root of the weight of squared pixels against squared colours, float32.
 

@@ -13,8 +13,6 @@ from gsmerge.runtime.estimate import (
     MAX_SCORED_VIEWS,
     memory_bytes,
     memory_problem,
-    plan_document,
-    plan_lines,
     score_cost,
     work_seconds,
 )
@@ -65,55 +63,3 @@ def test_the_machines_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     assert machine_memory() is None or machine_memory() > peak_memory()
     limit.write_text("123456789\n")
     assert machine_memory() == 123456789
-
-
-def plan(*, photos: bool = True, views: int = 12, count: int | None = None, **settings: Any) -> dict[str, Any]:
-    options = CompactOptions().with_settings(settings)
-    return plan_document(
-        {"ply": "scene.ply", "cameras": "transforms.json", "images": None},
-        (views, 100, 200),
-        options.resolved(photos=photos),
-        output_path=Path("small.ply"),
-        per_view=800,
-        photos=photos,
-        threads=2,
-        fit_steps=options.fit.steps,
-        default_count=views * 800 * options.decode.k,
-        budget=count,
-    )
-
-
-def test_plan_counts() -> None:
-    assert plan(k=2)["output"]["num_gaussians_at_most"] == 12 * 800 * 2
-    assert plan(views=1, k=8)["output"]["num_gaussians_at_most"] == 6400
-    assert plan()["input"]["num_gaussians"] == 240_000
-    assert plan(budget="auto")["output"]["num_gaussians_at_most"] == 12 * 800
-
-
-def test_plan_of_a_budget() -> None:
-    document = plan(budget="2%", count=4800)
-    assert document["output"]["num_gaussians_at_most"] == 4800
-    assert document["superpixels_per_view"] is None
-    assert any("at most 4,800" in line for line in plan_lines(document))
-    assert all(plan_lines(plan(budget="auto")))
-
-
-def test_plan_says_what_will_not_run() -> None:
-    def runs(**settings: Any) -> tuple[bool, str]:
-        document = plan(**settings)
-        return document["robust"], document["fit"]
-
-    assert runs() == (False, "full")
-    assert runs(fit="color") == (True, "color")
-    assert runs(fit="color", robust=False) == (False, "color")
-    assert runs(fit="none", effort="draft") == (False, "none")
-    assert runs(robust=True) == (True, "full")
-    assert runs(photos=False) == (False, "none")
-    assert runs(photos=False, robust=True) == (False, "none")
-
-
-def test_plan_of_less_work_takes_less() -> None:
-    full, lean = plan()["estimate"], plan(robust=False, fit="none")["estimate"]
-    assert lean["seconds"] < full["seconds"]
-    assert plan(photos=False)["estimate"]["memory_bytes"] < full["memory_bytes"]
-    assert all(line for line in plan_lines(plan()))

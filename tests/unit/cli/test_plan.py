@@ -1,0 +1,66 @@
+"""What ``--dry-run`` says of a scene before it is worked on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsmerge import Cameras, CompactOptions, Gaussians, PixelScene
+from gsmerge.cli.plan import plan_document, plan_lines
+from gsmerge.io import SceneFiles
+
+HEIGHT, WIDTH = 100, 200
+
+
+def plan(*, photos: bool = True, views: int = 12, **settings: Any) -> dict[str, Any]:
+    shape = (views, HEIGHT, WIDTH)
+    n = views * HEIGHT * WIDTH
+    sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, 0, 3))
+    scene = PixelScene(
+        gaussians=Gaussians(*(torch.zeros(size) for size in sizes)),
+        cameras=Cameras(torch.eye(4).expand(views, 4, 4), torch.eye(3).expand(views, 3, 3), WIDTH, HEIGHT),
+        images=torch.zeros(*shape, 3) if photos else None,
+        valid=torch.ones(shape, dtype=torch.bool),
+        names=tuple(map(str, range(views))),
+    )
+    options = CompactOptions().with_settings({"superpixels": 800, "threads": 2} | settings)
+    files = SceneFiles(Path("scene.ply"), Path("transforms.json"), None)
+    return plan_document(files, scene, options, Path("small.ply"), [])
+
+
+def test_plan_counts() -> None:
+    assert plan(k=2)["output"]["num_gaussians_at_most"] == 12 * 800 * 2
+    assert plan(views=1, k=8)["output"]["num_gaussians_at_most"] == 6400
+    assert plan()["input"]["num_gaussians"] == 240_000
+    assert plan(budget="auto")["output"]["num_gaussians_at_most"] == 12 * 800
+
+
+def test_plan_of_a_budget() -> None:
+    document = plan(budget="2%")
+    assert document["output"]["num_gaussians_at_most"] == 4800
+    assert document["superpixels_per_view"] is None
+    assert any("at most 4,800" in line for line in plan_lines(document))
+    assert all(plan_lines(plan(budget="auto")))
+
+
+def test_plan_says_what_will_not_run() -> None:
+    def runs(**settings: Any) -> tuple[bool, str]:
+        document = plan(**settings)
+        return document["robust"], document["fit"]
+
+    assert runs() == (False, "full")
+    assert runs(fit="color") == (True, "color")
+    assert runs(fit="color", robust=False) == (False, "color")
+    assert runs(fit="none", effort="draft") == (False, "none")
+    assert runs(robust=True) == (True, "full")
+    assert runs(photos=False) == (False, "none")
+    assert runs(photos=False, robust=True) == (False, "none")
+
+
+def test_plan_of_less_work_takes_less() -> None:
+    full, lean = plan()["estimate"], plan(robust=False, fit="none")["estimate"]
+    assert lean["seconds"] < full["seconds"]
+    assert plan(photos=False)["estimate"]["memory_bytes"] < full["memory_bytes"]
+    assert all(line for line in plan_lines(plan()))
