@@ -21,7 +21,7 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
     from gsmerge.report import document_head
     from gsmerge.runtime.estimate import plan_document, plan_lines
     from gsmerge.runtime.threads import available_threads
-    from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
+    from gsmerge.stages.group import budget_count, largest_count, superpixels_per_view
 
     given = read_input(files, opacity=args.opacity, hints=hints)
     scene, cameras = given.scene, given.scene.cameras
@@ -37,7 +37,7 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
         photos=scene.images is not None,
         threads=settings.threads or available_threads(),
         fit_steps=settings.fit.steps,
-        default_count=default_count(scene, settings),
+        default_count=largest_count(scene, settings),
         budget=budget,
         notes=[*given.notes, *unused],
         count=scene.num_gaussians,

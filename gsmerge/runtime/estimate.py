@@ -15,7 +15,7 @@ MAX_SCORED_VIEWS = 24  # views that whole scenes are scored by
 IMPORT_SECONDS = 1.5
 # Processor seconds per million pixels of all views together, or per million Gaussians, which is the same number:
 COST_READ = 0.7
-COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
+COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "bass-adaptive": 6.0, "slic": 4.5, "grid": 0.0}
 COST_MERGE = 0.5
 COST_NETWORKS = 2.8  # at the default superpixels
 COST_SCORE = 0.07  # for each scored view: rendering from input and output
@@ -160,7 +160,7 @@ def plan_document(
         photos: Whether the scene has photos; robust merging and the fit need them.
         threads: Threads that would run.
         fit_steps: Steps of the full fit.
-        default_count: Gaussians that superpixels and K ask for.
+        default_count: Most Gaussians that superpixels and K give.
         budget: Gaussians that a budget, a file size or a preset asks for; None without any.
         notes: Of the reader.
         count: Gaussians of the file; None: one for each pixel of the grid.
@@ -201,7 +201,10 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     scene, estimate, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
     superpixels = "where the scene needs them"
     if per_view is not None:
-        superpixels = f"{per_view:,} per view, {plan['options']['k']} Gaussian(s) each"
+        chosen = plan["options"]
+        adapts = chosen["segmentation"] == "bass-adaptive" and not str(chosen["superpixels"]).isdecimal()
+        start = " at the start" if adapts else ""
+        superpixels = f"{per_view:,} per view{start}, {chosen['k']} Gaussian(s) each"
     steps = [
         f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
