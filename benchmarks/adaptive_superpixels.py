@@ -46,7 +46,7 @@ def scores(photo: np.ndarray, labels: np.ndarray, seconds: float) -> list[float]
     return [proxy_psnr(photo, labels), splat_psnr(photo, labels), 1e3 * seconds]
 
 
-def measure(photo: np.ndarray, start: int, adapt: bool) -> tuple[int, list[list[float]]]:
+def measure(photo: np.ndarray, start: int, adapt: float | None) -> tuple[int, list[list[float]]]:
     """The number of superpixels, and PSNR, PSNR of Gaussians and milliseconds of every method."""
     rows, count = [], start
     for method in METHODS:
@@ -70,7 +70,7 @@ def main() -> None:
         superpixels(photos[0], 100, method)  # compiles
     print(f"{len(photos)} photos")
     for share in options.share or (0.02, 0.044, 0.087):
-        for adapt in (True, False):
+        for adapt in (1.0, None):
             starts = [round(share * photo.shape[0] * photo.shape[1]) for photo in photos]
             counts, rows = zip(*[measure(p, n, adapt) for p, n in zip(photos, starts, strict=True)], strict=True)
             ratio, values = np.divide(counts, starts), np.array(rows)

@@ -129,8 +129,12 @@ def segment_scene(prepared: PreparedScene, count: int | None) -> Segmentation:
     if count is None:
         each = max(1, int(limits.per_view * limits.share))
         num_coarse = min(round(backing_share(prepared) * each), each - 1)
-        groups = segment(pictures, options.segment, each - num_coarse, adapt=options.segment.adapts)
-        count = round(limits.default * (len(groups) + num_coarse * views) / (each * views))
+        num_fine, count = each - num_coarse, limits.default
+        if options.segment.adapts:  # to the number in the end, of which the fit begins with a share
+            groups = segment(pictures, options.segment, limits.per_view, adapt=num_fine / limits.per_view)
+            count = round(limits.default * len(groups) / (num_fine * views))
+        else:
+            groups = segment(pictures, options.segment, num_fine)
         if count <= limits.max_count or not options.segment.adapts:
             return Segmentation(groups, _coarse(pictures, options, num_coarse), count, exact=False)
         count = limits.max_count

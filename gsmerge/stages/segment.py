@@ -113,14 +113,14 @@ def count_for(options: SegmentOptions, height: int, width: int) -> int:
     return max(1, int(options.share * height * width))
 
 
-def segment(images: Tensor, options: SegmentOptions, count: int | None = None, *, adapt: bool = False) -> Groups:
+def segment(images: Tensor, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None) -> Groups:
     """Cut every view into superpixels, several views at once: the same number in each, unless they adapt.
 
     Args:
         images: ``[v,h,w,3]`` float in [0, 1] or uint8.
         options: How, and how many.
         count: Superpixels of each view; None to follow ``options``.
-        adapt: Whether ``count`` is only where ``bass-adaptive`` starts from.
+        adapt: With a number, ``count`` is only where ``bass-adaptive`` starts from; see :func:`superpixels`.
 
     Raises:
         ValueError: If the images have the wrong shape or range, or fewer pixels than ``count``.
@@ -129,7 +129,7 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None, *
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
     _, height, width, _ = images.shape
     if count is None:
-        count, adapt = count_for(options, height, width), options.adapts
+        count, adapt = count_for(options, height, width), 1.0 if options.adapts else None
     kind, effort, compactness = options.segmentation, options.effort, options.compactness
 
     def one_view(image: Tensor) -> Tensor:
@@ -147,7 +147,7 @@ def superpixels(
     *,
     effort: str = "default",
     compactness: float = 1e-5,
-    adapt: bool = False,
+    adapt: float | None = None,
 ) -> Tensor:
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
 
@@ -157,8 +157,8 @@ def superpixels(
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
-        adapt: Whether ``bass-adaptive`` keeps the number that it comes to from ``count``: between a quarter and four
-            times as many, at most one per pixel.
+        adapt: Of ``bass-adaptive`` only: the share that is left of the number that it comes to from ``count``, which
+            is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
 
     Returns:
         ``[h,w]`` int32, dense from 0; the same on every run.
@@ -266,7 +266,7 @@ def _rdseg(pixels: np.ndarray, count: int, effort: str, compactness: float) -> n
     return refine(labels, pixels, count, NUM_SWEEPS, spread)
 
 
-def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: bool) -> np.ndarray:
+def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
     """BASS from hexagonal or from saliency seeds; padded labels."""
     from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
     from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
@@ -279,7 +279,7 @@ def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: bool) -> np.
     colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
     labels = pad_labels(voronoi(seeds, height, width))
     if segmentation == "bass-adaptive":
-        return adapt_labels(labels, colours, count, MAX_FACTOR, exact=not adapt)[0]
+        return adapt_labels(labels, colours, count, MAX_FACTOR, adapt)[0]
     return infer_labels(labels, colours, count)
 
 

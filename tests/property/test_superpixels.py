@@ -71,11 +71,11 @@ def test_adaptive_count_is_bounded(picture: str) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for start in counts_of(height * width):
-        labels = superpixels(image, start, "bass-adaptive", adapt=True)
+        labels = superpixels(image, start, "bass-adaptive", adapt=1.0)
         count = int(labels.max()) + 1
         assert_partition(labels, height, width, count)
         assert -(-start // 4) <= count <= min(4 * start, height * width)
-        assert torch.equal(labels, superpixels(image.copy(), start, "bass-adaptive", adapt=True))
+        assert torch.equal(labels, superpixels(image.copy(), start, "bass-adaptive", adapt=1.0))
 
 
 @pytest.mark.parametrize("compactness", [0.0, 1e-3, 1.0])

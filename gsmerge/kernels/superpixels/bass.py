@@ -152,7 +152,7 @@ def move_prior():
     return np.array([np.log(ALPHA), PRIOR_SHAPE, PRIOR_SHAPE * variance, MEAN_DEVIATION**2 / variance])
 
 
-def adapt_labels(labels, colours, count, factor, *, exact):
+def adapt_labels(labels, colours, count, factor, share):
     """Improve padded labels while superpixels split and merge by the Hastings ratio.
 
     Args:
@@ -160,7 +160,8 @@ def adapt_labels(labels, colours, count, factor, *, exact):
         colours: ``[h,w,3]`` float32, CIELAB / 100.
         count: Regions at the start.
         factor: Most times that their number grows or falls, an integer; there is never more than one per pixel.
-        exact: Whether the number returns to ``count`` in the end, by the moves of the highest ratios.
+        share: Of the number that they come to, the part that is left in the end; None: exactly ``count``. It is met by
+            the moves of the highest ratios.
 
     Returns:
         (labels, count): padded labels, dense from 0, each region 4-connected and none empty, and how many there are.
@@ -175,8 +176,9 @@ def adapt_labels(labels, colours, count, factor, *, exact):
         else:
             labels, areas = merge(labels, colours, areas, prior, most=len(areas) - least)
         improve_labels(labels, colours, areas)
-    if exact and len(areas) != count:
-        labels, areas = _meet_count(labels, colours, areas, prior, count)
+    target = count if share is None else max(1, round(share * len(areas)))
+    if len(areas) != target:
+        labels, areas = _meet_count(labels, colours, areas, prior, target)
         improve_labels(labels, colours, areas)
     return labels, len(areas)
 

@@ -171,11 +171,11 @@ def patchwork(height: int, width: int) -> np.ndarray:
 def test_adaptive_superpixels_follow_the_picture(start: int) -> None:
     """As many superpixels as patches, wherever it starts from; a flat picture keeps few."""
     image = patchwork(48, 64)
-    labels = superpixels(image, start, "bass-adaptive", adapt=True).numpy()
+    labels = superpixels(image, start, "bass-adaptive", adapt=1.0).numpy()
     assert len(np.unique(labels)) == 12 * 16
     for k in range(12 * 16):
         assert np.ptp(image[labels == k], axis=0).max() == 0
-    flat = superpixels(np.full_like(image, 0.5), start, "bass-adaptive", adapt=True)
+    flat = superpixels(np.full_like(image, 0.5), start, "bass-adaptive", adapt=1.0)
     assert start / 4 <= int(flat.max()) + 1 < start
     assert int(superpixels(image, start, "bass-adaptive").max()) + 1 == start
 
@@ -188,7 +188,8 @@ def test_adaptive_counts_differ_from_view_to_view() -> None:
     assert groups.counts[0] != groups.counts[1] == 48  # patches
     for view in range(2):
         assert torch.equal(groups.labels[view].unique(), torch.arange(groups.counts[view]))
-    assert segment(images, share, 76, adapt=True).counts == groups.counts
+    assert segment(images, share, 76, adapt=1.0).counts == groups.counts
+    assert segment(images, share, 76, adapt=0.5).counts == tuple(round(n / 2) for n in groups.counts)
     # An exact number, however it is asked for, is met.
     assert segment(images, share, 76).counts == (76, 76)
     assert segment(images, SegmentOptions(superpixels=76, segmentation="bass-adaptive")).counts == (76, 76)
