@@ -277,8 +277,8 @@ _TABLE = (
     ),
     panel(
         MERGING,
-        option("segmentation", ("rdseg", "bass", "bass-st", "slic", "grid"), "Superpixel method.", shown="rdseg",
-               rare=True),
+        option("segmentation", ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid"), "Superpixel method.",
+               shown="rdseg", rare=True),
         option("robust", bool, "Choose among merges by comparing them with the photos.", "--robust/--no-robust",
                shown="unless --fit full or a draft", rare=True),
         option("match", ("overlap", "aabb", "none"), "How Gaussians of different views are matched and merged.",

@@ -35,13 +35,13 @@ def plan_document(
     from gsmerge.options import to_schema
     from gsmerge.runtime.estimate import estimate_run, fit_of, is_robust
     from gsmerge.runtime.threads import available_threads
-    from gsmerge.stages.group import budget_count, default_count, superpixels_per_view
+    from gsmerge.stages.group import budget_count, largest_count, superpixels_per_view
 
     photos, grid = scene.images is not None, (len(scene), scene.cameras.height, scene.cameras.width)
     options, budget = settings.resolved(photos=photos), budget_count(scene, settings)
     pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
     num_gaussians = scene.num_gaussians or pixels
-    max_count = default_count(scene, settings) if budget is None else budget
+    max_count = largest_count(scene, settings) if budget is None else budget
     if settings.method.startswith("unmerged"):
         max_count = pixels
     per_view = None  # a budget distributes them by what it needs
@@ -75,7 +75,9 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     scene, estimate, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
     superpixels = "where the scene needs them"
     if per_view is not None:
-        superpixels = f"{per_view:,} per view, {plan['options']['k']} Gaussian(s) each"
+        chosen = plan["options"]
+        adapts = chosen["segmentation"] == "bass-adaptive" and not str(chosen["superpixels"]).isdecimal()
+        superpixels = f"{per_view:,} per view{' at the start' * adapts}, {chosen['k']} Gaussian(s) each"
     steps = [
         f"superpixels  {superpixels}",
         f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"

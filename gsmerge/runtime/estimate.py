@@ -13,7 +13,7 @@ MAX_SCORED_VIEWS = 24  # views that whole scenes are scored by
 IMPORT_SECONDS = 1.5
 # Processor seconds per million pixels of all views together, or per million Gaussians, which is the same number:
 COST_READ = 0.7
-COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "slic": 4.5, "grid": 0.0}
+COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "bass-adaptive": 6.0, "slic": 4.5, "grid": 0.0}
 COST_MERGE = 0.5
 COST_NETWORKS = 2.8  # at the default superpixels
 COST_SCORE = 0.07  # for each scored view: rendering from input and output

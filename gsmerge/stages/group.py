@@ -13,7 +13,7 @@ from gsmerge.stages.assign import seen_depths
 from gsmerge.stages.choose_merge import MIN_VIEWS, photos_choose
 from gsmerge.stages.fit import start_share
 from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
-from gsmerge.stages.segment import count_for, segment
+from gsmerge.stages.segment import MAX_FACTOR, count_for, segment
 from gsmerge.types import Groups, PixelScene, Segmentation, UnalignedScene
 
 if TYPE_CHECKING:
@@ -79,6 +79,12 @@ def default_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -
     return round(total * options.decode.mean_k)
 
 
+def largest_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int:
+    """Most Gaussians that ``superpixels`` and K give: more than they ask for where superpixels adapt."""
+    default, max_count, _ = _counts(scene, options)
+    return min(MAX_FACTOR * default, max_count) if options.segment.adapts else default
+
+
 def budget_count(scene: PixelScene | UnalignedScene, options: CompactOptions) -> int | None:
     """The number of Gaussians that a budget, a size or a device sets; None where ``superpixels`` and K do.
 
@@ -115,15 +121,24 @@ def segment_scene(prepared: PreparedScene, count: int | None) -> Segmentation:
     """Superpixels of every view: as many as the options say, or cut to become exactly ``count`` Gaussians.
 
     A count is cut from the region tree, in which a plain wall ends up with few superpixels and a fern with many; from
-    a finer tree where the scene's own does not reach it.
+    a finer tree where the scene's own does not reach it. Superpixels that adapt change the number of Gaussians as
+    they change their own; where that is above what a budget allows, it is cut to the largest one allowed.
     """
     limits, options, pictures = prepared.limits, prepared.options, prepared.pictures
+    views = len(pictures)
     if count is None:
         each = max(1, int(limits.per_view * limits.share))
         num_coarse = min(round(backing_share(prepared) * each), each - 1)
-        groups = segment(pictures, options.segment, each - num_coarse)
-        return Segmentation(groups, _coarse(pictures, options, num_coarse), limits.default, exact=False)
-    views, tree = len(pictures), prepared.tree
+        num_fine, count = each - num_coarse, limits.default
+        if options.segment.adapts:  # to the number in the end, of which the fit begins with a share
+            groups = segment(pictures, options.segment, limits.per_view, adapt=num_fine / limits.per_view)
+            count = round(limits.default * len(groups) / (num_fine * views))
+        else:
+            groups = segment(pictures, options.segment, num_fine)
+        if count <= limits.max_count or not options.segment.adapts:
+            return Segmentation(groups, _coarse(pictures, options, num_coarse), count, exact=False)
+        count = limits.max_count
+    tree = prepared.tree
     first = max(views, int(count * limits.share))
     if tree is None or first > len(tree):
         tree = scene_tree(prepared, count)

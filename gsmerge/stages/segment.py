@@ -3,9 +3,13 @@
 The default, ``rdseg``, spends the superpixels where they lower the squared colour error most: rectangles cut best
 first (more than asked for), merged with Ward's rule to the exact number, then exact moves of border pixels. ``bass``
 is Bayesian adaptive superpixel segmentation from a hexagonal grid, ``bass-st`` the same from seeds drawn by the
-Shi-Tomasi response, as in the paper, ``slic`` the common baseline, and ``grid`` plain rectangles: where they are a
-few pixels large and no fit follows, they are as good and cost nothing. Whichever it is, there are exactly as many
-superpixels as asked for, none is empty, each is 4-connected, and a run repeats bit for bit.
+Shi-Tomasi response, as in the paper, ``bass-adaptive`` the same with splits and merges, ``slic`` the common baseline,
+and ``grid`` plain rectangles: where they are a few pixels large and no fit follows, they are as good and cost nothing.
+No superpixel is empty, each is 4-connected, and a run repeats bit for bit.
+
+There are exactly as many superpixels as asked for, with one exception: from a share of the pixels, ``bass-adaptive``
+comes to a number of its own in each view, at most four times more or fewer. Where a number is asked for, here or by a
+budget, its moves go on to that number, those of the highest Hastings ratio first.
 """
 
 from __future__ import annotations
@@ -26,13 +30,14 @@ from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Groups
 
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic", "grid")
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
 # Effort -> (rectangles per superpixel, sweeps before merging).
 EFFORTS = {"draft": (1.0, 0), "fast": (1.0, 0), "default": (2.0, 0), "best": (3.0, 1)}
 NUM_SWEEPS = 2
 BLOCK = 32  # side of the squares that the cutting starts from, pixels
 PIXEL_START = 0.45  # above this many rectangles per pixel, merging starts from the pixels themselves
 RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictures do
+MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
 
 SHARE = "4.4%"  # superpixels per pixel by default
 
@@ -42,8 +47,9 @@ class SegmentOptions:
     """How to cut views into superpixels.
 
     Args:
-        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%".
-        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
+        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%". A share is where
+            ``bass-adaptive`` starts from.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
             [0, 1]. At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.
@@ -78,6 +84,11 @@ class SegmentOptions:
         """Superpixels per pixel; the default where a number of them is asked for."""
         return parse_share(SHARE if self.per_view is not None else str(self.superpixels))
 
+    @property
+    def adapts(self) -> bool:
+        """Whether views choose their number of superpixels: ``bass-adaptive`` from a share of the pixels."""
+        return self.segmentation == "bass-adaptive" and self.per_view is None
+
 
 def _check(segmentation: str, effort: str, compactness: float) -> None:
     if segmentation not in SEGMENTATIONS:
@@ -102,28 +113,31 @@ def count_for(options: SegmentOptions, height: int, width: int) -> int:
     return max(1, int(options.share * height * width))
 
 
-def segment(images: Tensor, options: SegmentOptions, count: int | None = None) -> Groups:
-    """Cut every view into the same number of superpixels, several views at once.
+def segment(images: Tensor, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None) -> Groups:
+    """Cut every view into superpixels, several views at once: the same number in each, unless they adapt.
 
     Args:
         images: ``[v,h,w,3]`` float in [0, 1] or uint8.
         options: How, and how many.
         count: Superpixels of each view; None to follow ``options``.
+        adapt: With a number, ``count`` is only where ``bass-adaptive`` starts from; see :func:`superpixels`.
 
     Raises:
         ValueError: If the images have the wrong shape or range, or fewer pixels than ``count``.
     """
     if images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images: expected shape [v, h, w, 3], got {list(images.shape)}")
-    num_views, height, width, _ = images.shape
-    count = count_for(options, height, width) if count is None else count
+    _, height, width, _ = images.shape
+    if count is None:
+        count, adapt = count_for(options, height, width), 1.0 if options.adapts else None
+    kind, effort, compactness = options.segmentation, options.effort, options.compactness
 
     def one_view(image: Tensor) -> Tensor:
-        return superpixels(image, count, options.segmentation, effort=options.effort, compactness=options.compactness)
+        return superpixels(image, count, kind, effort=effort, compactness=compactness, adapt=adapt)
 
     labels = parallel_map(one_view, images.unbind(0))
     stacked = torch.stack(labels) if labels else torch.empty((0, height, width), dtype=torch.int32)
-    return Groups(stacked, (count,) * num_views)
+    return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
 
 
 def superpixels(
@@ -133,18 +147,21 @@ def superpixels(
     *,
     effort: str = "default",
     compactness: float = 1e-5,
+    adapt: float | None = None,
 ) -> Tensor:
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
 
     Args:
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
         count: Superpixels, 1 to h·w.
-        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``slic`` or ``grid``.
+        segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
-        compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the two BASS methods).
+        compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
+        adapt: Of ``bass-adaptive`` only: the share that is left of the number that it comes to from ``count``, which
+            is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
 
     Returns:
-        ``[h,w]`` int32, 0 to ``count - 1``; the same on every run.
+        ``[h,w]`` int32, dense from 0; the same on every run.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -169,7 +186,7 @@ def superpixels(
     elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
-        labels = _bass(pixels, count, salient=segmentation == "bass-st")
+        labels = _bass(pixels, count, segmentation, adapt)
     return torch.from_numpy(np.ascontiguousarray(labels[1:-1, 1:-1]))
 
 
@@ -249,18 +266,21 @@ def _rdseg(pixels: np.ndarray, count: int, effort: str, compactness: float) -> n
     return refine(labels, pixels, count, NUM_SWEEPS, spread)
 
 
-def _bass(pixels: np.ndarray, count: int, salient: bool) -> np.ndarray:
+def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
     """BASS from hexagonal or from saliency seeds; padded labels."""
-    from gsmerge.kernels.superpixels.bass import infer_labels  # compiled only when used
+    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels  # compiled only when used
     from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density, seeds_from_density, voronoi
 
     height, width, _ = pixels.shape
-    if salient:
-        seeds = seeds_from_density(seed_density(_corner_response(pixels), count), count)
-    else:
+    if segmentation == "bass":
         seeds = hexagonal_seeds(height, width, count)
+    else:
+        seeds = seeds_from_density(seed_density(_corner_response(pixels), count), count)
     colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
-    return infer_labels(pad_labels(voronoi(seeds, height, width)), colours, count)
+    labels = pad_labels(voronoi(seeds, height, width))
+    if segmentation == "bass-adaptive":
+        return adapt_labels(labels, colours, count, MAX_FACTOR, adapt)[0]
+    return infer_labels(labels, colours, count)
 
 
 def _slic(pixels: np.ndarray, count: int, compactness: float) -> np.ndarray:

@@ -270,7 +270,7 @@ def slow_parameters(colours: np.ndarray, labels: np.ndarray, count: int) -> list
 
 
 def test_bass_parameters(pixels: np.ndarray, labels: np.ndarray) -> None:
-    rows = bass.fit_regions(pad_labels(labels), pixels, 30)
+    rows = bass.fit_regions(pad_labels(labels), pixels, np.full(30, labels.size / 30))
     for row, (colour, place, covariance) in zip(rows, slow_parameters(pixels, labels, 30), strict=True):
         inverse = np.linalg.inv(covariance)
         expected = [*colour, *place, inverse[0, 0], 2 * inverse[0, 1], inverse[1, 1], np.log(np.linalg.det(covariance))]
@@ -308,7 +308,7 @@ def slow_label_pass(colours: np.ndarray, labels: np.ndarray, count: int, deviati
 def test_bass_label_pass(pixels: np.ndarray, labels: np.ndarray) -> None:
     padded, deviation = pad_labels(labels), 0.2
     foreign = np.array([8 - mask.bit_count() for mask in range(256)], np.float32)
-    rows = bass.fit_regions(padded, pixels, 30)
+    rows = bass.fit_regions(padded, pixels, np.full(30, labels.size / 30))
     precision = np.float32(1 / deviation**2)
     changed = bass.label_pass(padded, pixels, rows, bass.simple_point_table(), foreign, precision)
     expected = slow_label_pass(pixels, labels, 30, deviation)
@@ -323,7 +323,7 @@ def test_bass_leaves_a_pixel_that_would_part_a_rival(corner: int, expected: int)
     colours = np.repeat(np.array([0.5, 1.0, 0.0], np.float32)[labels][..., None], 3, 2)
     colours[1, 1] = 1
     padded, foreign = pad_labels(labels), np.array([8 - mask.bit_count() for mask in range(256)], np.float32)
-    rows = bass.fit_regions(padded, colours, 3)
+    rows = bass.fit_regions(padded, colours, np.full(3, 3.0))
     bass.label_pass(padded, colours, rows, bass.simple_point_table(), foreign, np.float32(100))
     assert padded[2, 2] == expected
     assert np.array_equal(padded[1:-1, 1:-1], slow_label_pass(colours, labels, 3, 0.1))

@@ -66,6 +66,17 @@ def test_methods_rank_as_published() -> None:
     assert scores[0] > scores[1] + 2
 
 
+def test_splits_and_merges_pay() -> None:
+    """At the same number, BASS with the moves describes a photo better than without, in either form."""
+    image = photos()["coffee"]
+    for density in (5_000, 12_000):
+        for adapt in (1.0, None):
+            labels = superpixels(image, count_at(image, density), "bass-adaptive", adapt=adapt).numpy()
+            fixed = superpixels(image, int(labels.max()) + 1, "bass-st").numpy()
+            assert proxy_psnr(image, labels) > proxy_psnr(image, fixed) + 1
+            assert splat_psnr(image, labels) > splat_psnr(image, fixed)
+
+
 def test_presets_trade_time_for_quality() -> None:
     image = photos()["china"]
     count = count_at(image, 12_000)

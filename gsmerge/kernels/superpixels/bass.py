@@ -1,9 +1,8 @@
-"""Bayesian adaptive superpixel segmentation (Uziel et al. 2019) with a fixed number of superpixels.
+"""Bayesian adaptive superpixel segmentation (Uziel et al. 2019), with a fixed number of superpixels or adaptively.
 
 Hard expectation maximisation of Gaussians in colour (fixed deviation) and position (normal-inverse-Wishart prior),
-with a Potts term on the borders. A pixel may change its label only where no label is taken apart. The splits and
-merges of the paper are left out, as they would change the number of superpixels; the pixels at the picture's edge
-take part, and no region can run empty.
+with a Potts term on the borders. A pixel may change its label only where no label is taken apart; the pixels at the
+picture's edge take part, and no region can run empty. The adaptive form splits and merges between the rounds.
 """
 
 from __future__ import annotations
@@ -11,12 +10,18 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.kernels.jit import kernel
+from gsmerge.kernels.superpixels.moves import merge, split
 from gsmerge.kernels.superpixels.sweeps import ring_mask
 
 COLOUR_DEVIATION = 0.018 / 2  # CIELAB / 100
 POTTS = 0.5
 PRIOR_WEIGHT = 50  # pseudo-observations of the shape prior per pixel of a superpixel's expected area
 NUM_PASSES = 4  # label passes per update of the parameters
+NUM_ROUNDS = 12  # of the adaptive form: splits and merges in turn
+# Prior of the moves. The concentration, at the lower end of the authors' 0.01 to 100. Pseudo-observations of a colour's
+# variance, so many that it is all but fixed, as in the label passes (with 1e4 a superpixel of much variance would
+# rather keep it than pay for it twice, at up to 0.2 dB). The deviation of mean colours in a picture, CIELAB / 100.
+ALPHA, PRIOR_SHAPE, MEAN_DEVIATION = 0.01, 1e6, 0.5
 XX, XY, YY, LOG_DET, ROW = 5, 6, 7, 8, 9  # columns after the mean (three colours, x, y)
 
 
@@ -32,12 +37,14 @@ def simple_point_table():
 
 
 @kernel
-def fit_regions(labels, colours, count):
+def fit_regions(labels, colours, areas):
     """``[count,9]`` float32 parameters of every region: means, inverse covariance and its determinant's logarithm.
 
-    The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and A = h·w / count.
+    The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and the area A of ``areas``
+    ``[count]`` float64 that the region is expected to have, pixels.
     """
     height, width, _ = colours.shape
+    count = len(areas)
     sums = np.zeros((count, 9))
     for y in range(height):
         for x in range(width):
@@ -51,9 +58,8 @@ def fit_regions(labels, colours, count):
             sums[label, YY] += y * y
             sums[label, 8] += 1.0
     rows = np.empty((count, ROW), np.float32)
-    area = height * width / count
     for label in range(count):
-        n = sums[label, 8]
+        n, area = sums[label, 8], areas[label]
         for i in range(5):
             rows[label, i] = sums[label, i] / n
         mean_x, mean_y = sums[label, 3] / n, sums[label, 4] / n
@@ -120,12 +126,66 @@ def infer_labels(labels, colours, count):
     Each of the ``count`` regions is 4-connected and not empty, and stays so. ``colours [h,w,3]`` are CIELAB / 100.
     """
     height, width, _ = colours.shape
+    areas = np.full(count, height * width / count)
+    for _ in range(max(1, round((height * width / count) ** 0.5))):
+        improve_labels(labels, colours, areas)
+    return labels
+
+
+def improve_labels(labels, colours, areas):
+    """Fit the regions' parameters and pass over the labels, in place; ``areas`` as of :func:`fit_regions`."""
     table = simple_point_table()
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
-    for _ in range(max(1, round((height * width / count) ** 0.5))):
-        rows = fit_regions(labels, colours, count)
-        for _ in range(NUM_PASSES):
-            if label_pass(labels, colours, rows, table, foreign, precision) == 0:
-                break
-    return labels
+    rows = fit_regions(labels, colours, areas)
+    for _ in range(NUM_PASSES):
+        if label_pass(labels, colours, rows, table, foreign, precision) == 0:
+            break
+
+
+def move_prior():
+    """``[4]`` float64 log α, a, b and v of the moves, whose colours deviate as much as those of the label passes."""
+    variance = COLOUR_DEVIATION**2
+    return np.array([np.log(ALPHA), PRIOR_SHAPE, PRIOR_SHAPE * variance, MEAN_DEVIATION**2 / variance])
+
+
+def adapt_labels(labels, colours, count, factor, share):
+    """Improve padded labels while superpixels split and merge by the Hastings ratio.
+
+    Args:
+        labels: Padded labels 0 to ``count - 1``, each region 4-connected and none empty; overwritten.
+        colours: ``[h,w,3]`` float32, CIELAB / 100.
+        count: Regions at the start.
+        factor: Most times that their number grows or falls, an integer; there is never more than one per pixel.
+        share: Of the number that they come to, the part that is left in the end; None: exactly ``count``. It is met by
+            the moves of the highest ratios.
+
+    Returns:
+        (labels, count): padded labels, dense from 0, each region 4-connected and none empty, and how many there are.
+    """
+    height, width, _ = colours.shape
+    areas, prior = np.full(count, height * width / count), move_prior()
+    least, most = -(-count // factor), min(height * width, count * factor)
+    improve_labels(labels, colours, areas)
+    for i in range(NUM_ROUNDS):
+        if i % 2 == 0:
+            labels, areas = split(labels, colours, areas, prior, across=i % 4 == 2, most=most - len(areas))
+        else:
+            labels, areas = merge(labels, colours, areas, prior, most=len(areas) - least)
+        improve_labels(labels, colours, areas)
+    target = count if share is None else max(1, round(share * len(areas)))
+    if len(areas) != target:
+        labels, areas = _meet_count(labels, colours, areas, prior, target)
+        improve_labels(labels, colours, areas)
+    return labels, len(areas)
+
+
+def _meet_count(labels, colours, areas, prior, count):
+    """Merge or split, the highest ratios first, to exactly ``count`` regions, at most one per pixel."""
+    across = False
+    while len(areas) > count:
+        labels, areas = merge(labels, colours, areas, prior, most=len(areas) - count, least=-np.inf)
+    while len(areas) < count:
+        labels, areas = split(labels, colours, areas, prior, across, count - len(areas), least=-np.inf)
+        across = not across
+    return labels, areas

@@ -28,8 +28,8 @@ def merge_cost(rows, u, v):
     return (d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4) / (rows[u, INVERSE] + rows[v, INVERSE])
 
 
-@kernel
-def _tie(u, v):
+@kernel(part=True)
+def pair_tie(u, v):
     """A small number in (0, TIE_BREAK] that depends on the pair only."""
     mixed = np.uint32(u) * np.uint32(2654435761) ^ np.uint32(v) * np.uint32(40503)
     mixed ^= mixed >> np.uint32(15)
@@ -97,7 +97,7 @@ def _weigh(pairs, costs, num_pairs, parked, parked_costs, num_parked, rows, pare
         u, v = pairs[e, 0], pairs[e, 1]
         u = parents[u] if parents[u] >= 0 else u
         v = parents[v] if parents[v] >= 0 else v
-        cost = merge_cost(rows, u, v) + _tie(u, v)
+        cost = merge_cost(rows, u, v) + pair_tie(u, v)
         outer, cheap = u != v, cost <= ceiling
         parked[num_parked, 0], parked[num_parked, 1], parked_costs[num_parked] = u, v, cost
         num_parked += outer & (not cheap)

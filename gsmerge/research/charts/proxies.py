@@ -20,7 +20,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.segment import superpixels
 from gsmerge.views import pick_views
 
-SEGMENTATIONS = ("rdseg", "bass-st", "bass", "slic")
+SEGMENTATIONS = ("rdseg", "bass-adaptive", "bass-st", "bass", "slic")
 SHARES = (0.0025, 0.005, 0.01, 0.02, 0.044, 0.1)  # superpixels per pixel
 
 

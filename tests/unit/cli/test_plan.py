@@ -37,6 +37,13 @@ def test_plan_counts() -> None:
     assert plan(budget="auto")["output"]["num_gaussians_at_most"] == 12 * 800
 
 
+def test_plan_says_where_adaptive_superpixels_start() -> None:
+    adaptive = {"segmentation": "bass-adaptive"}
+    assert any("800 per view at the start, 1" in line for line in plan_lines(plan(**adaptive, superpixels="4%")))
+    assert any("800 per view, 1" in line for line in plan_lines(plan(**adaptive)))
+    assert any("800 per view, 1" in line for line in plan_lines(plan(superpixels="4%")))
+
+
 def test_plan_of_a_budget() -> None:
     document = plan(budget="2%")
     assert document["output"]["num_gaussians_at_most"] == 4800

@@ -76,7 +76,7 @@ def test_image_is_checked(image: np.ndarray, message: str) -> None:
     [
         (
             {"segmentation": "watershed"},
-            "segmentation: expected one of rdseg, bass, bass-st, slic, grid, got 'watershed'",
+            "segmentation: expected one of rdseg, bass, bass-st, bass-adaptive, slic, grid, got 'watershed'",
         ),
         ({"effort": "slow"}, "effort: expected one of draft, fast, default, best, got 'slow'"),
         ({"compactness": -1.0}, r"compactness: expected a number in \[0, 1\], got -1.0"),
@@ -160,3 +160,43 @@ def test_hexagonal_rows_are_shifted() -> None:
     assert len(rows) == 5
     assert np.diff(rows[0]) == pytest.approx(5)
     assert rows[1][0] - rows[0][0] == pytest.approx(2.5, abs=0.6)
+
+
+def patchwork(height: int, width: int) -> np.ndarray:
+    """Tones that change every four pixels."""
+    return np.kron(random_image(height // 4, width // 4), np.ones((4, 4, 1), np.float32))
+
+
+@pytest.mark.parametrize("start", [80, 150, 250])
+def test_adaptive_superpixels_follow_the_picture(start: int) -> None:
+    """As many superpixels as patches, wherever it starts from; a flat picture keeps few."""
+    image = patchwork(48, 64)
+    labels = superpixels(image, start, "bass-adaptive", adapt=1.0).numpy()
+    assert len(np.unique(labels)) == 12 * 16
+    for k in range(12 * 16):
+        assert np.ptp(image[labels == k], axis=0).max() == 0
+    flat = superpixels(np.full_like(image, 0.5), start, "bass-adaptive", adapt=1.0)
+    assert start / 4 <= int(flat.max()) + 1 < start
+    assert int(superpixels(image, start, "bass-adaptive").max()) + 1 == start
+
+
+def test_adaptive_counts_differ_from_view_to_view() -> None:
+    images = torch.full((2, 24, 32, 3), 0.5)
+    images[1] = torch.from_numpy(patchwork(24, 32))
+    share = SegmentOptions(superpixels="10%", segmentation="bass-adaptive")
+    groups = segment(images, share)
+    assert groups.counts[0] != groups.counts[1] == 48  # patches
+    for view in range(2):
+        assert torch.equal(groups.labels[view].unique(), torch.arange(groups.counts[view]))
+    assert segment(images, share, 76, adapt=1.0).counts == groups.counts
+    assert segment(images, share, 76, adapt=0.5).counts == tuple(round(n / 2) for n in groups.counts)
+    # An exact number, however it is asked for, is met.
+    assert segment(images, share, 76).counts == (76, 76)
+    assert segment(images, SegmentOptions(superpixels=76, segmentation="bass-adaptive")).counts == (76, 76)
+
+
+@pytest.mark.parametrize("segmentation", sorted(set(SEGMENTATIONS) - {"bass-adaptive"}))
+def test_other_segmentations_do_not_adapt(segmentation: str) -> None:
+    options = SegmentOptions(superpixels="10%", segmentation=segmentation)
+    assert not options.adapts
+    assert segment(torch.from_numpy(random_image(24, 32))[None], options).counts == (76,)
