@@ -25,10 +25,10 @@ def room(num_views: int = 6, width: int = 36, height: int = 24, **settings: Any)
 
 def parts_of(scene: PixelScene, size: int, *, backwards: bool = False) -> list[PixelScene]:
     """The scene's views in batches of a size, the first or the last first."""
-    found = [
+    actual = [
         scenes.take_views(scene, range(first, min(first + size, len(scene)))) for first in range(0, len(scene), size)
     ]
-    return found[::-1] if backwards else found
+    return actual[::-1] if backwards else actual
 
 
 def fed(batches: Iterable[PixelScene], **settings: Any) -> Compactor:

@@ -28,10 +28,10 @@ def records(folder: Path) -> list[dict[str, Any]]:
 
 def statuses(folder: Path) -> dict[str, list[str]]:
     """What was recorded of every result, in order."""
-    found: dict[str, list[str]] = {}
+    actual: dict[str, list[str]] = {}
     for record in records(folder):
-        found.setdefault(record["output"], []).append(record["status"])
-    return found
+        actual.setdefault(record["output"], []).append(record["status"])
+    return actual
 
 
 def results(folder: Path) -> dict[str, str]:
@@ -61,13 +61,13 @@ def finish(*arguments: object) -> int:
 
 def holders(folder: Path) -> list[int]:
     """Processes that hold the locks of scenes."""
-    found = []
+    actual = []
     for path in (folder / ".batch").glob("*.lock"):
         try:
-            found += [json.loads(path.read_text())["pid"]] if path.name != "run.lock" else []
+            actual += [json.loads(path.read_text())["pid"]] if path.name != "run.lock" else []
         except (OSError, ValueError):
             continue  # it is being written, or has just gone
-    return found
+    return actual
 
 
 class InlinePool:

@@ -117,7 +117,7 @@ def views_of(
     """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
     lens = photograph.Lens(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
     assert np.allclose(cameras.Ks.numpy(), lens.intrinsics)
-    packed, found = shapes.pack([surface.shape for surface in surfaces]), []
+    packed, actual = shapes.pack([surface.shape for surface in surfaces]), []
     for viewmat in cameras.viewmats.double().numpy():
         c2w = np.linalg.inv(viewmat)
         hits = photograph.trace(packed, c2w, lens, 1)
@@ -125,8 +125,8 @@ def views_of(
         places = world_points(hits.depth, c2w, lens)
         shades = np.stack([surface.texture(places.reshape(-1, 3)) for surface in surfaces])
         colors = shades[hits.ids.ravel(), np.arange(hits.ids.size)].reshape(places.shape)
-        found.append((c2w, hits, np.clip(colors, 0, 1)))
-    return lens, found
+        actual.append((c2w, hits, np.clip(colors, 0, 1)))
+    return lens, actual
 
 
 def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Lens) -> np.ndarray:
@@ -138,9 +138,9 @@ def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Lens) -> n
 
 def trace(surfaces: Sequence[Surface], cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World positions ``[v,hw,3]``, depths ``[v,hw]`` and colours ``[v,hw,3]`` of every pixel's centre."""
-    lens, found = views_of(surfaces, cameras)
-    points = np.stack([world_points(hits.depth, c2w, lens).reshape(-1, 3) for c2w, hits, _ in found])
-    return points, np.stack([h.depth.ravel() for _, h, _ in found]), np.stack([c.reshape(-1, 3) for *_, c in found])
+    lens, actual = views_of(surfaces, cameras)
+    points = np.stack([world_points(hits.depth, c2w, lens).reshape(-1, 3) for c2w, hits, _ in actual])
+    return points, np.stack([h.depth.ravel() for _, h, _ in actual]), np.stack([c.reshape(-1, 3) for *_, c in actual])
 
 
 def make_scene(
@@ -170,17 +170,17 @@ def make_scene(
         sh_degree=degree, harmonics=0.05,
     )  # fmt: skip
     rng = np.random.default_rng(seed)
-    lens, found = views_of(surfaces, cameras)
-    images = [colors.astype(np.float32) for *_, colors in found]
+    lens, actual = views_of(surfaces, cameras)
+    images = [colors.astype(np.float32) for *_, colors in actual]
     parts = [
         pixel_gaussians(TrueView(image, hits.depth, hits.normals, c2w), lens, errors, rng)
-        for image, (c2w, hits, _) in zip(images, found, strict=True)
+        for image, (c2w, hits, _) in zip(images, actual, strict=True)
     ]
     gaussians = Gaussians.concat(parts)
     means = gaussians.means.double()
     if not noise:  # exactly on the surfaces, so that what is equal is so in float64
         means = torch.from_numpy(
-            np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in found])
+            np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in actual])
         )
     gaussians = nudged(replace(gaussians, means=means))
     valid = torch.ones((len(cameras), cameras.height, cameras.width), dtype=torch.bool)

@@ -16,9 +16,9 @@ DENSITIES = (5_000, 12_000, 23_000)
 
 def photos() -> dict[str, np.ndarray]:
     """Six photos, ``[h,w,3]`` uint8, the longer side 476 pixels."""
-    found = {name: getattr(skimage.data, name)() for name in ("astronaut", "coffee", "chelsea", "rocket")}
-    found |= {name: sklearn.datasets.load_sample_image(f"{name}.jpg") for name in ("china", "flower")}
-    return {name: _shrink(image) for name, image in found.items()}
+    actual = {name: getattr(skimage.data, name)() for name in ("astronaut", "coffee", "chelsea", "rocket")}
+    actual |= {name: sklearn.datasets.load_sample_image(f"{name}.jpg") for name in ("china", "flower")}
+    return {name: _shrink(image) for name, image in actual.items()}
 
 
 def _shrink(image: np.ndarray) -> np.ndarray:

@@ -42,19 +42,19 @@ def with_settings(**changes: Any) -> Spoil:
 
 def without(name: str) -> Spoil:
     def spoil(path: Path) -> None:
-        told = header(path)
-        with_text(json.dumps({key: value for key, value in told.items() if key != name}))(path)
+        said = header(path)
+        with_text(json.dumps({key: value for key, value in said.items() if key != name}))(path)
 
     return spoil
 
 
 def with_tensor(name: str, change: Callable[[Tensor], Tensor] | None) -> Spoil:
     def spoil(path: Path) -> None:
-        (form, told), tensors = entry(path), load_file(path)
+        (form, said), tensors = entry(path), load_file(path)
         tensor = tensors.pop(name)
         if change is not None:
             tensors[name] = change(tensor)
-        save_file(tensors, path, {form: json.dumps(told)})
+        save_file(tensors, path, {form: json.dumps(said)})
 
     return spoil
 

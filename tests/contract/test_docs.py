@@ -243,10 +243,10 @@ def test_version_is_the_same_everywhere(root: Path) -> None:
 
 def test_constraints_pin_every_dependency(root: Path) -> None:
     project = (root / "pyproject.toml").read_text().split("[project.scripts]")[0]
-    wanted = set(re.findall(r'"([a-z][a-z0-9-]+)>=', project.split("dependencies = [")[1]))
+    expected = set(re.findall(r'"([a-z][a-z0-9-]+)>=', project.split("dependencies = [")[1]))
     pinned = dict(re.findall(r"^([a-z0-9-]+)==(\S+)$", (root / "constraints.txt").read_text(), re.MULTILINE))
-    assert len(wanted) > 10
-    assert wanted - set(pinned) == set()
+    assert len(expected) > 10
+    assert expected - set(pinned) == set()
 
 
 def test_architecture_names_every_module(root: Path) -> None:

@@ -42,18 +42,18 @@ def kernels(root: Path) -> Iterator[tuple[str, ast.FunctionDef, str]]:
 
 
 def test_what_kernels_call_is_inlined(root: Path) -> None:
-    found = list(kernels(root))
-    names = {name for name, _, _ in found}
+    actual = list(kernels(root))
+    names = {name for name, _, _ in actual}
     called = {
         call.func.id
-        for _, node, _ in found
+        for _, node, _ in actual
         for call in ast.walk(node)
         if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
     } & names
     assert len(called) > 10
     loose = {
         name
-        for name, _, decorator in found
+        for name, _, decorator in actual
         if name in called
         and not name.startswith("_")
         and "part=True" not in decorator

@@ -60,9 +60,9 @@ def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run:
     assert sorted(results(out)) == names
     assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}
     assert sorted(path.name for path in out.iterdir()) == ["batch.jsonl", *names, "summary.csv"]
-    found = {row["output"]: row for row in rows(out)}
-    assert "truncated or damaged" in found["bad.ply"]["error"]
-    assert int(found["room1.ply"]["num_input"]) == 3 * 48 * 32
+    actual = {row["output"]: row for row in rows(out)}
+    assert "truncated or damaged" in actual["bad.ply"]["error"]
+    assert int(actual["room1.ply"]["num_input"]) == 3 * 48 * 32
     assert run("compact", rooms / "room1", "-o", tmp_path / "one.ply", *FAST, "-q").code == 0
     assert (tmp_path / "one.ply").read_bytes() == (out / "room1.ply").read_bytes()
 
@@ -97,7 +97,7 @@ def test_a_mended_scene_is_done_and_json_is_a_line_each(rooms: Path, out: Path, 
     assert [line["status"] for line in lines].count("skipped") == 4
     again = batch(run, mended, out, "--rerun", "--quiet")
     assert (again.code, again.out, again.err) == (0, "", "")
-    assert [found.count("done") for found in statuses(out).values()] == [2] * 5
+    assert [actual.count("done") for actual in statuses(out).values()] == [2] * 5
 
 
 def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path, run: Run) -> None:
@@ -122,15 +122,15 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
     for name, path in cameras.items():
         shutil.copytree(rooms / name, tmp_path / "in" / name)
         (tmp_path / "in" / name / "transforms.json").rename(path)
-    told = ("--cameras", f"{tmp_path}/{{stem}}.json", "--name", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
-    outcome = batch(run, tmp_path / "in", tmp_path / "out", *told)
+    message = ("--cameras", f"{tmp_path}/{{stem}}.json", "--name", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
+    outcome = batch(run, tmp_path / "in", tmp_path / "out", *message)
     assert outcome.code == 0, outcome.err
     assert sorted(results(tmp_path / "out")) == ["in/0-room0.k1.ply", "in/1-room1.k1.ply"]
 
 
 def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
-    told = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
-    outcome = run("batch", rooms / "room0", "--output", tmp_path, *told)
+    message = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
+    outcome = run("batch", rooms / "room0", "--output", tmp_path, *message)
     assert outcome.code == 4
     assert "1 of 1 results miss the target" in outcome.err
     assert (tmp_path / "room0.ply").exists()
@@ -155,9 +155,9 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
     ],
 )
 def test_wrong_usage_is_told_at_once(
-    told: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
+    message: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
 ) -> None:
-    outcome = run("batch", rooms, "--output", tmp_path / "out", *told)
+    outcome = run("batch", rooms, "--output", tmp_path / "out", *message)
     assert outcome.code == code
     assert said in outcome.err
     assert outcome.err.count("\n") == 1

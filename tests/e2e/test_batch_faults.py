@@ -24,12 +24,12 @@ PATIENCE = 120  # seconds, on a machine that is busy with other things
 def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
     """What a condition comes to once it holds; None if the process ended before."""
     deadline = time.monotonic() + PATIENCE
-    while not (found := condition()):
+    while not (actual := condition()):
         if process.poll() is not None:
             return None
         assert time.monotonic() < deadline
         time.sleep(0.005)
-    return found
+    return actual
 
 
 def outlive(pids: list[int]) -> bool:
@@ -65,9 +65,9 @@ def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[s
         if sorted(statuses(out)) == NAMES:
             break
     process = start(rooms, "--output", out, *FAST, "--jobs", 2, "--json")
-    told, errors = process.communicate()
+    said, errors = process.communicate()
     assert (process.returncode, errors) == (0, "")
-    assert sorted(json.loads(line)["output"] for line in told.splitlines()) == NAMES
+    assert sorted(json.loads(line)["output"] for line in said.splitlines()) == NAMES
     assert results(out) == undisturbed
     assert statuses(out) == {name: ["done"] for name in NAMES}
 
@@ -75,13 +75,13 @@ def test_killed_again_and_again(rooms: Path, tmp_path: Path, undisturbed: dict[s
 @pytest.mark.slow
 def test_two_runs_share_the_work(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     runs = [start(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "--json") for _ in range(2)]
-    told = [[json.loads(line) for line in process.communicate()[0].splitlines()] for process in runs]
+    said = [[json.loads(line) for line in process.communicate()[0].splitlines()] for process in runs]
     assert [process.returncode for process in runs] == [0, 0]
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
-    for lines in told:
+    for lines in said:
         assert sorted(line["output"] for line in lines) == NAMES
-    assert sum(line["status"] == "done" for lines in told for line in lines) == len(NAMES)
+    assert sum(line["status"] == "done" for lines in said for line in lines) == len(NAMES)
 
 
 @pytest.mark.slow
@@ -120,8 +120,8 @@ def test_a_killed_process_costs_its_scene_alone(
 def test_a_scene_that_takes_too_long_fails_alone(rooms: Path, tmp_path: Path) -> None:
     quick, slow = rooms / "room0", tmp_path / "slow"
     shutil.copytree(rooms / "room1", slow)
-    told = ("--timeout", 3, "--retries", 0, "--jobs", 1, "-q", "--fit-steps", 1_000_000, "--effort", "draft")
-    process = start(slow, "--output", tmp_path / "out", *told)
+    said = ("--timeout", 3, "--retries", 0, "--jobs", 1, "-q", "--fit-steps", 1_000_000, "--effort", "draft")
+    process = start(slow, "--output", tmp_path / "out", *said)
     errors = process.communicate()[1]
     assert process.returncode == 5
     assert "took longer than 3 s (--timeout)" in errors
@@ -134,13 +134,13 @@ def test_ctrl_c_ends_with_what_is_done(rooms: Path, tmp_path: Path, undisturbed:
     process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1)
     until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path), process)
     process.send_signal(signal.SIGINT)
-    told, errors = process.communicate()
+    said, errors = process.communicate()
     assert process.returncode == 130
     assert errors.endswith("gsmerge: error: interrupted\n")
-    done = [name for name, found in statuses(tmp_path).items() if found == ["done"]]
+    done = [name for name, actual in statuses(tmp_path).items() if actual == ["done"]]
     assert 1 <= len(done) < len(NAMES)
-    assert told.splitlines()[-1].startswith("4 scenes: ")
-    assert " left; " in told.splitlines()[-1]
+    assert said.splitlines()[-1].startswith("4 scenes: ")
+    assert " left; " in said.splitlines()[-1]
     assert {name for name in results(tmp_path) if not name.startswith(".batch/")} <= set(NAMES)  # nothing half-done
     assert finish(rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q") == 0
     assert results(tmp_path) == undisturbed
@@ -159,16 +159,16 @@ def limited(limit: int, *arguments: object) -> tuple[int, str]:
 @pytest.mark.slow
 def test_a_full_disk_is_told_and_nothing_is_lost(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Results do not fit and records do; then records do not either."""
-    told = (rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q")
-    code, errors = limited(30_000, *told)
+    said = (rooms, "--output", tmp_path, *FAST, "--jobs", 1, "-q")
+    code, errors = limited(30_000, *said)
     assert code == 5
     assert "4 of 4 scenes failed; the first: " in errors
     assert "room0.ply: could not be written (" in errors
     assert errors.count("\n") == 1
     assert results(tmp_path) == {}
-    code, errors = limited((tmp_path / "batch.jsonl").stat().st_size + 100, *told)
+    code, errors = limited((tmp_path / "batch.jsonl").stat().st_size + 100, *said)
     assert code == 3
     assert "batch.jsonl: the batch cannot go on: " in errors
     assert errors.count("\n") == 1
-    assert finish(*told) == 0
+    assert finish(*said) == 0
     assert results(tmp_path) == undisturbed

@@ -21,11 +21,11 @@ PATIENCE = 180  # seconds, on a machine that is busy with other things
 def test_a_killed_process_is_survived(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     process = start(rooms, "--output", tmp_path, *FAST, "--engine", "ray", "-q")
     deadline = time.monotonic() + PATIENCE
-    while not (found := holders(tmp_path)):
+    while not (actual := holders(tmp_path)):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.005)
-    os.kill(found[0], signal.SIGKILL)
+    os.kill(actual[0], signal.SIGKILL)
     assert (process.communicate()[0], process.returncode) == ("", 0)
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}

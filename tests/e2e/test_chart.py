@@ -135,12 +135,12 @@ def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: li
 def test_what_is_told_of_the_file_counts_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
-    told = ("--order", "none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
-    outcome = run("chart", copied / "room", "--output", copied / "loose", *told)
+    said = ("--order", "none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
+    outcome = run("chart", copied / "room", "--output", copied / "loose", *said)
     assert outcome.code == 5, "nothing to measure from"
     shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
     shutil.copytree(copied / "room" / "targets" / "images", copied / "room" / "images")
-    assert run("chart", copied / "room", "--output", copied / "loose", *told).code == 0
+    assert run("chart", copied / "room", "--output", copied / "loose", *said).code == 0
     records = [record for record in read_runs(copied / "loose")[0].values() if record.error is None]
     assert {record.views for record in records} == {2}
     assert "--order none" in records[0].command

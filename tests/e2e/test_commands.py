@@ -136,11 +136,11 @@ def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
     ],
 )
 def test_what_asks_for_nothing_is_wrong_usage(
-    option: tuple[str, str], told: str, made_scene: Path, tmp_path: Path, run: Run
+    option: tuple[str, str], message: str, made_scene: Path, tmp_path: Path, run: Run
 ) -> None:
     outcome = run("compact", made_scene, "-o", tmp_path / "small.ply", *option)
     assert (outcome.code, outcome.out, outcome.err.count("\n")) == (2, "", 1)
-    assert told in outcome.err
+    assert message in outcome.err
 
 
 def test_a_preview_is_a_png(made_scene: Path, tmp_path: Path, run: Run) -> None:
@@ -151,9 +151,9 @@ def test_a_preview_is_a_png(made_scene: Path, tmp_path: Path, run: Run) -> None:
 
 
 def test_a_plan_tells_what_is_used(made_scene: Path, run: Run) -> None:
-    told = run("compact", made_scene, "--dry-run", "--fit", "none").out
-    assert "across views: overlap" in told
-    assert "networks     shipped" in told
+    message = run("compact", made_scene, "--dry-run", "--fit", "none").out
+    assert "across views: overlap" in message
+    assert "networks     shipped" in message
     assert "across views: none" in run("compact", made_scene, "--dry-run", "--effort", "draft").out
 
 

@@ -63,14 +63,14 @@ def test_encoding_twice_gives_the_same_bytes(encoded: Path, made_scene: Path, tm
 
 
 def test_a_budget_at_decoding_is_met(encoded: Path, tmp_path: Path, run: Run) -> None:
-    found = gsmerge.load_encoded(encoded)
-    outcome = run("decode", encoded, "--budget", len(found) + 100, "-o", tmp_path / "a.ply", "--json")
+    actual = gsmerge.load_encoded(encoded)
+    outcome = run("decode", encoded, "--budget", len(actual) + 100, "-o", tmp_path / "a.ply", "--json")
     document = json.loads(outcome.out)
-    assert document["budget"] == str(len(found) + 100)
-    assert len(found) <= document["output"]["num_gaussians"] <= len(found) + 100
+    assert document["budget"] == str(len(actual) + 100)
+    assert len(actual) <= document["output"]["num_gaussians"] <= len(actual) + 100
     few = run("decode", encoded, "--budget", 10, "-o", tmp_path / "b.ply")
     assert (few.code, few.err.count("\n")) == (2, 1)
-    assert f"expected at least {len(found)}, one for each group, got 10" in few.err
+    assert f"expected at least {len(actual)}, one for each group, got 10" in few.err
 
 
 def test_the_reports(made_scene: Path, tmp_path: Path, run: Run) -> None:

@@ -100,11 +100,11 @@ def test_odd_rows_are_told_by_every_command(command: str, scene_copy: Path, run:
     spoil_rows(scene_copy / "scene.ply")
     outcome = run(*call(command, scene_copy))
     assert outcome.code == 0, outcome.err
-    told = outcome.out if command == "inspect" else outcome.err
-    notes = [line for line in told.splitlines() if line.startswith("note")]
+    said = outcome.out if command == "inspect" else outcome.err
+    notes = [line for line in said.splitlines() if line.startswith("note")]
     assert len(notes) == 3
     parts = ("taken as activated", "1 row(s) with NaN or inf", "1 Gaussian(s) with extreme scales")
-    assert [part for part in parts if part not in told] == []
+    assert [part for part in parts if part not in said] == []
 
 
 def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: Run) -> None:

@@ -127,8 +127,8 @@ def test_quiet_says_nothing(state: Path, walks: list[Path], run: Run) -> None:
 
 def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = tmp_path / "state.gsm"
-    told = (*SMALL, "--fit", "none", "--tolerance", 0, "--max-k", 2, "--replay", 2, "--seed", 5)
-    assert run("extend", state, walks[0], *told).code == 0
+    said = (*SMALL, "--fit", "none", "--tolerance", 0, "--max-k", 2, "--replay", 2, "--seed", 5)
+    assert run("extend", state, walks[0], *said).code == 0
     first = load_state(state).about["options"]
     document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]
     assert document["num_covered"] == 0
@@ -153,9 +153,9 @@ def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path
 def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
     moved = shutil.move(scene / "transforms.json", tmp_path / "poses.json")
-    told = ("--cameras", moved, "--images", scene / "images")
-    assert run("extend", state, scene / "scene.ply", *told).code == 0
-    refused = run("extend", state, scene / "scene.ply", walks[0], *told)
+    said = ("--cameras", moved, "--images", scene / "images")
+    assert run("extend", state, scene / "scene.ply", *said).code == 0
+    refused = run("extend", state, scene / "scene.ply", walks[0], *said)
     assert_refused(refused, 2, "--cameras and --images: expected one batch with them, got several")
 
 
@@ -163,15 +163,15 @@ def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, ru
 
 
 def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, run: Run) -> None:
-    groups, found = len(load_state(states[1])), []
+    groups, actual = len(load_state(states[1])), []
     for k in (1, 2, 4):
         outcome = run("decode", states[1], "--k", k, "--fit", "none", "-o", tmp_path / f"{k}.ply")
         assert (outcome.code, outcome.out.count("\n")) == (0, 1), outcome.err
-        found.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
-    assert found == sorted(found)
-    assert found[0] <= groups < found[2] <= 4 * groups
-    told = ("--budget", groups + 40, "--fit", "none", "-o", tmp_path / "b.ply", "--json")
-    document = json.loads(run("decode", states[1], *told).out)
+        actual.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
+    assert actual == sorted(actual)
+    assert actual[0] <= groups < actual[2] <= 4 * groups
+    said = ("--budget", groups + 40, "--fit", "none", "-o", tmp_path / "b.ply", "--json")
+    document = json.loads(run("decode", states[1], *said).out)
     assert groups < document["output"]["num_gaussians"] <= groups + 40
     assert document["fit"] is None
     assert document["input"]["num_groups"] == groups
@@ -179,10 +179,10 @@ def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, ru
 
 
 def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, run: Run) -> None:
-    told = ("--fit-steps", 4)
+    said = ("--fit-steps", 4)
     for fit in ((), ("--fit", "full"), ("--fit", "color")):
         out = tmp_path / f"{len(listing(tmp_path))}.ply"
-        outcome = run("decode", states[1], *fit, *told, "-o", out, "--json")
+        outcome = run("decode", states[1], *fit, *said, "-o", out, "--json")
         assert (outcome.code, outcome.err) == (0, "")
         document = json.loads(outcome.out)
         assert document["fit"]["method"] in {"full", "color", "none"}
@@ -192,8 +192,8 @@ def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, r
 
 def test_decoding_twice_gives_the_same_bytes(states: list[Path], tmp_path: Path, run: Run) -> None:
     for threads in (1, 2):
-        told = ("--fit-steps", 4, "--threads", threads, "-o", tmp_path / f"{threads}.ply")
-        assert run("decode", states[1], *told).code == 0
+        said = ("--fit-steps", 4, "--threads", threads, "-o", tmp_path / f"{threads}.ply")
+        assert run("decode", states[1], *said).code == 0
     assert (tmp_path / "1.ply").read_bytes() == (tmp_path / "2.ply").read_bytes()
 
 
@@ -289,8 +289,8 @@ def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: P
 def newer(path: Path) -> None:
     """A state of a version to come."""
     size = int.from_bytes(path.read_bytes()[:8], "little")
-    told = json.loads(json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"][STATE])
-    save_file(load_file(path), path, {STATE: json.dumps(told | {"schema": 9, "gsmerge": "9.9"})})
+    said = json.loads(json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"][STATE])
+    save_file(load_file(path), path, {STATE: json.dumps(said | {"schema": 9, "gsmerge": "9.9"})})
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -459,6 +459,6 @@ def test_no_input_was_ever_damaged(walks: list[Path], make_scene: Callable[..., 
     """After everything above: the scenes are what they were made."""
     for number, walk in enumerate(walks):
         fresh = make_scene(tmp_path / f"walk{number}", num_views=3 + number, width=48, height=32, seed=0)
-        wanted = {path.relative_to(fresh): path.read_bytes() for path in fresh.rglob("*") if path.is_file()}
-        found = {path.relative_to(walk): path.read_bytes() for path in walk.rglob("*") if path.is_file()}
-        assert found == wanted
+        expected = {path.relative_to(fresh): path.read_bytes() for path in fresh.rglob("*") if path.is_file()}
+        actual = {path.relative_to(walk): path.read_bytes() for path in walk.rglob("*") if path.is_file()}
+        assert actual == expected

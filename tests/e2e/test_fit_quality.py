@@ -39,10 +39,10 @@ def test_full_fit_reaches_the_floor_with_exactly_the_count(
     compacted: Callable[..., tuple[CompactResult, float]],
     floor: Callable[..., None],
 ) -> None:
-    result, found = compacted(superpixels=superpixels, **settings)
+    result, actual = compacted(superpixels=superpixels, **settings)
     assert result.report.choices["fit"]["method"] == "full"
     assert len(result.gaussians) == NUM_VIEWS * superpixels * settings.get("k", 1)
-    floor(found)
+    floor(actual)
 
 
 @pytest.mark.parametrize("steps", [20, 60])
@@ -50,9 +50,9 @@ def test_short_fits_reach_the_floor(
     steps: int, compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
     """They do not grow: what matching merges, nearly half of them here, is not spent again."""
-    result, found = compacted(superpixels=256, fit_steps=steps)
+    result, actual = compacted(superpixels=256, fit_steps=steps)
     assert 0.5 * NUM_VIEWS * 256 <= len(result.gaussians) <= 0.8 * NUM_VIEWS * 256
-    floor(found)
+    floor(actual)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
@@ -71,18 +71,18 @@ def test_hardly_any_time_costs_little(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
     """A few steps, whatever the machine; here they are a little worse than the merge that the photos choose."""
-    result, found = compacted(superpixels=256, time_budget=1e-3)
+    result, actual = compacted(superpixels=256, time_budget=1e-3)
     assert result.report.choices["fit"]["stopped"] == "time budget spent"
     assert len(result.gaussians) <= NUM_VIEWS * 256
-    floor(found - compacted(superpixels=256, fit="none", checkpoint="none")[1])
+    floor(actual - compacted(superpixels=256, fit="none", checkpoint="none")[1])
 
 
 def test_plain_merging_without_photos(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
-    result, found = compacted(superpixels=256, robust=False, fit="none")
+    result, actual = compacted(superpixels=256, robust=False, fit="none")
     assert len(result.gaussians) <= NUM_VIEWS * 256
-    floor(found)
+    floor(actual)
 
 
 def test_photos_help(

@@ -39,8 +39,8 @@ def test_scenes_are_made_and_counted(generated: Path, tmp_path: Path, run: Run) 
 
 
 def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
-    found = json.loads(run("inspect", made / "scene_0001", "--json").out)
-    assert (found["dialect"], found["num_views"], found["num_missing"], found["notes"]) == ("gsmerge", 3, 0, [])
+    actual = json.loads(run("inspect", made / "scene_0001", "--json").out)
+    assert (actual["dialect"], actual["num_views"], actual["num_missing"], actual["notes"]) == ("gsmerge", 3, 0, [])
     compacted = run("compact", made / "scene_0001", "--superpixels", "5%", "--fit", "none")
     assert compacted.code == 0, compacted.err
     targets = made / "scene_0001" / "targets"
@@ -82,11 +82,11 @@ def test_quiet_says_nothing(tmp_path: Path, run: Run) -> None:
         (("--seed", "1"), 2, "pass --overwrite"),
     ],
 )
-def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], code: int, told: str, made: Path, run: Run) -> None:
+def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], code: int, said: str, made: Path, run: Run) -> None:
     before = listing(made)
     outcome = run("generate", "-o", made, *SMALL, *arguments)
     assert outcome.code == code
-    assert told in outcome.err
+    assert said in outcome.err
     assert outcome.err.count("\n") == 1
     assert listing(made) == before
 

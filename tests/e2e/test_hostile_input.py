@@ -107,10 +107,10 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, ru
 def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> None:
     arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
     with limits():
-        found = run("inspect", "--", arguments[0])
-    assert found.code in (0, 3), found.err
-    if found.code:
-        one_line(found.err)
+        actual = run("inspect", "--", arguments[0])
+    assert actual.code in (0, 3), actual.err
+    if actual.code:
+        one_line(actual.err)
     assert not list(scene.parent.rglob(MARKER))
 
 
@@ -120,8 +120,8 @@ def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
     outcome = run("compact", scene, "-o", scene / "small.ply", "--fit-steps", 2, "--quiet")
     assert outcome.code == 0, outcome.err
     assert "gsmerge: warning" not in outcome.err
-    found = run("inspect", scene / "small.ply", "--json").out
-    assert json.loads(found)["num_nonfinite"] == 0
+    actual = run("inspect", scene / "small.ply", "--json").out
+    assert json.loads(actual)["num_nonfinite"] == 0
 
 
 def test_the_corpus_is_large() -> None:

@@ -39,11 +39,11 @@ def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure,
 def test_a_grid_without_its_order(made_scene: Path, tmp_path: Path, target_psnr: Measure) -> None:
     """About as good as with it."""
     scene = gsmerge.read_scene(made_scene)
-    found = []
+    actual = []
     for name, one in (("grid", scene), ("loose", loose.shuffled(scene))):
         gsmerge.write_ply(tmp_path / f"{name}.ply", gsmerge.compact(one).gaussians)
-        found.append(target_psnr(made_scene / "targets", tmp_path / f"{name}.ply"))
-    assert found[1] > found[0] - 1.0
+        actual.append(target_psnr(made_scene / "targets", tmp_path / f"{name}.ply"))
+    assert actual[1] > actual[0] - 1.0
 
 
 def test_only_a_ply(made: Path, tmp_path: Path, target_psnr: Measure) -> None:

@@ -42,9 +42,9 @@ def test_every_method_writes_a_ply(
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
     out, settings = tmp_path / "small.ply", ["--fit-steps", 8] if method == "unmerged-fit" else []
-    told = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json")
-    assert told.code == 0, told.err
-    document, total = json.loads(told.out), 5 * 96 * 64
+    said = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json")
+    assert said.code == 0, said.err
+    document, total = json.loads(said.out), 5 * 96 * 64
     count = len(read_ply(out).gaussians)
     assert document["options"]["method"] == method
     assert document["output"]["num_gaussians"] == count
@@ -65,10 +65,10 @@ def test_the_program_is_found_on_the_path(
     monkeypatch.delenv("GSMERGE_SPLAT_TRANSFORM", raising=False)
     monkeypatch.setenv("PATH", str(program(tmp_path, FAKE).parent))
     out = tmp_path / "small.ply"
-    told = run("compact", made_scene, "-o", out, "--method", "splat-transform", "--budget", 50, "--json")
-    assert told.code == 0, told.err
+    said = run("compact", made_scene, "-o", out, "--method", "splat-transform", "--budget", 50, "--json")
+    assert said.code == 0, said.err
     assert len(read_ply(out).gaussians) == 50
-    assert "reduce" in json.loads(told.out)["seconds"]
+    assert "reduce" in json.loads(said.out)["seconds"]
 
 
 @pytest.mark.parametrize("named", [None, "no/such/program"])
@@ -78,10 +78,10 @@ def test_a_missing_program_is_told(
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
     before = listing(scene_copy)
-    told = run("compact", scene_copy, "--method", "splat-transform")
-    assert (told.code, told.out, told.err.count("\n")) == (2, "", 1)
-    assert (named or "on PATH or named by GSMERGE_SPLAT_TRANSFORM") in told.err
-    assert "npm install -g @playcanvas/splat-transform" in told.err
+    said = run("compact", scene_copy, "--method", "splat-transform")
+    assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
+    assert (named or "on PATH or named by GSMERGE_SPLAT_TRANSFORM") in said.err
+    assert "npm install -g @playcanvas/splat-transform" in said.err
     assert listing(scene_copy) == before
 
 
@@ -97,9 +97,9 @@ def test_a_failing_program_is_told(
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
     before = listing(scene_copy)
-    told = run("compact", scene_copy, "--method", "splat-transform", "--quiet")
-    assert (told.code, told.out, told.err.count("\n")) == (1, "", 1)
-    assert words in told.err
+    said = run("compact", scene_copy, "--method", "splat-transform", "--quiet")
+    assert (said.code, said.out, said.err.count("\n")) == (1, "", 1)
+    assert words in said.err
     assert listing(scene_copy) == before
 
 
@@ -119,18 +119,18 @@ def test_what_does_not_go_together_is_told(
     arguments: list[object], fragments: list[str], scene_copy: Path, run: Run
 ) -> None:
     for rest in ([], ["--dry-run"]):
-        told = run("compact", scene_copy, *arguments, "--quiet", *rest)
-        assert (told.code, told.out, told.err.count("\n")) == (2, "", 1), told.err
-        assert [part for part in fragments if part not in told.err] == []
+        said = run("compact", scene_copy, *arguments, "--quiet", *rest)
+        assert (said.code, said.out, said.err.count("\n")) == (2, "", 1), said.err
+        assert [part for part in fragments if part not in said.err] == []
     assert not (scene_copy / "scene.compact.ply").exists()
 
 
 @pytest.mark.parametrize("method", ["unmerged-color", "unmerged-fit"])
 def test_missing_photos_are_told(method: str, scene_copy: Path, run: Run) -> None:
     shutil.rmtree(scene_copy / "images")
-    told = run("compact", scene_copy, "--method", method, "--quiet")
-    assert (told.code, told.out, told.err.count("\n")) == (2, "", 1)
-    assert f"method {method}: expected photos, found none; give --images" in told.err
+    said = run("compact", scene_copy, "--method", method, "--quiet")
+    assert (said.code, said.out, said.err.count("\n")) == (2, "", 1)
+    assert f"method {method}: expected photos, found none; give --images" in said.err
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -138,10 +138,10 @@ def test_a_plan_names_the_method(
     method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
-    told = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400)
-    assert told.code == 0, told.err
-    assert (f"method       {method}" in told.out) == (method != "gsmerge")
-    assert ("superpixels " in told.out) == (method == "gsmerge")
+    said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400)
+    assert said.code == 0, said.err
+    assert (f"method       {method}" in said.out) == (method != "gsmerge")
+    assert ("superpixels " in said.out) == (method == "gsmerge")
     document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)
     assert document["method"] == method
     assert document["estimate"]["seconds"] > 0

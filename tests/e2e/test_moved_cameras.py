@@ -51,12 +51,12 @@ def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) 
     """A compact scene that went elsewhere tells no frame by itself."""
     elsewhere = tmp_path / "small.ply"
     assert run("compact", moved_scene, "--fit", "none", "-o", elsewhere, "--quiet").code == 0
-    found = {}
+    actual = {}
     for name, more in (("own", ("--cameras", moved_scene / "transforms.json")), ("like", ("--frame-of", moved_scene))):
         outcome = run("render", elsewhere, "-o", tmp_path / name, *more)
         assert outcome.code == 0, outcome.err
-        found[name] = psnr(tmp_path / name, moved_scene / "images")
-    assert found["like"] > found["own"] + 3
+        actual[name] = psnr(tmp_path / name, moved_scene / "images")
+    assert actual["like"] > actual["own"] + 3
 
 
 def test_preview_and_render_agree_with_photos_that_are_broken(

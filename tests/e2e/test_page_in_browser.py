@@ -61,8 +61,8 @@ def test_keys_move_the_slider(shown: Browser) -> None:
     assert at(shown) == "53%"
     clip = shown.run(f"getComputedStyle({FIRST}.querySelector('.left')).clipPath")
     assert clip == "inset(0px 47% 0px 0px)"
-    told = shown.run(f"{FIRST}.querySelector('input').getAttribute('aria-valuetext')")
-    assert told.startswith("53 % input, the rest gsmerge")
+    said = shown.run(f"{FIRST}.querySelector('input').getAttribute('aria-valuetext')")
+    assert said.startswith("53 % input, the rest gsmerge")
     shown.press("Home", 36)
     assert at(shown) == "0%"
 

@@ -23,9 +23,9 @@ def scene() -> PixelScene:
 
 def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "chain.ply"
-    told = run("compact", made_scene, "-o", out, "--levels", 3, "--fit-steps", 20, "--superpixels", 300, "--json")
-    assert told.code == 0, told.err
-    document = json.loads(told.out)
+    said = run("compact", made_scene, "-o", out, "--levels", 3, "--fit-steps", 20, "--superpixels", 300, "--json")
+    assert said.code == 0, said.err
+    document = json.loads(said.out)
     paths = [out, tmp_path / "chain.level1.ply", tmp_path / "chain.level2.ply"]
     counts = [len(read_ply(path).gaussians) for path in paths]
     assert counts[1:] == [counts[0] // 4, counts[0] // 16]
@@ -38,9 +38,9 @@ def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
 
 def test_no_level_replaces_a_file(made_scene: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "chain.level2.ply").write_text("mine")
-    told = run("compact", made_scene, "-o", tmp_path / "chain.ply", "--levels", 3)
-    assert told.code == 2
-    assert "chain.level2.ply: exists already" in told.err
+    said = run("compact", made_scene, "-o", tmp_path / "chain.ply", "--levels", 3)
+    assert said.code == 2
+    assert "chain.level2.ply: exists already" in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.level2.ply"]
 
 
@@ -54,23 +54,23 @@ def test_the_finest_level_is_the_result_without_levels(scene: PixelScene) -> Non
 def test_a_psnr_is_met_with_few(scene: PixelScene) -> None:
     usual = compact(scene, fit_steps=20)
     assert usual.report.psnr_after is not None
-    wanted = usual.report.psnr_after - 1
-    found = compact(scene, fit_steps=20, quality=f"{wanted}dB")
-    assert found.report.unmet is None
-    assert found.report.psnr_after is not None
-    assert found.report.psnr_after >= wanted
-    assert len(found.gaussians) < len(usual.gaussians)
-    assert found.report.choices["search"]["met"]
+    expected = usual.report.psnr_after - 1
+    actual = compact(scene, fit_steps=20, quality=f"{expected}dB")
+    assert actual.report.unmet is None
+    assert actual.report.psnr_after is not None
+    assert actual.report.psnr_after >= expected
+    assert len(actual.gaussians) < len(usual.gaussians)
+    assert actual.report.choices["search"]["met"]
 
 
 def test_a_target_out_of_reach_ends_with_4(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "best.ply"
-    told = run("compact", made_scene, "-o", out, "--quality", "90dB", "--fit-steps", 8, "--budget", "20KB")
-    assert told.code == 4
-    assert "quality: 90 dB was asked for, the input views reach" in told.err
+    said = run("compact", made_scene, "-o", out, "--quality", "90dB", "--fit-steps", 8, "--budget", "20KB")
+    assert said.code == 4
+    assert "quality: 90 dB was asked for, the input views reach" in said.err
     assert len(read_ply(out).gaussians) > 0
     assert out.stat().st_size <= 20_000
-    assert str(out) in told.out
+    assert str(out) in said.out
 
 
 def test_a_loss_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
@@ -82,9 +82,9 @@ def test_a_loss_spends_less_where_more_may_be_lost(scene: PixelScene) -> None:
 
 
 def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    told = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit-steps", 12)
-    assert told.code == 0, told.err
-    lines = told.out.splitlines()
+    said = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit-steps", 12)
+    assert said.code == 0, said.err
+    lines = said.out.splitlines()
     assert "PSNR" in lines[2]
     assert len(lines) == 7
 
@@ -106,5 +106,5 @@ def test_a_search_keeps_what_reading_had_to_say(scene: PixelScene) -> None:
     means = whole.gaussians.means.clone()
     means[0] = float("nan")
     spoilt = replace(whole, gaussians=replace(whole.gaussians, means=means))
-    found = compact(spoilt, fit_steps=8, quality="10dB")
-    assert any("not finite" in note for note in found.report.notes)
+    actual = compact(spoilt, fit_steps=8, quality="10dB")
+    assert any("not finite" in note for note in actual.report.notes)

@@ -99,11 +99,11 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
 
 def test_settings_and_scenes_are_told_in_one_line(scene_copy: Path, run: Run, tmp_path: Path) -> None:
     config, out = tmp_path / "train.toml", tmp_path / "run"
-    for text, told in (("steps = 0\n", "steps"), ("stride = 3\n", "stride"), ("steps = = 3", "TOML")):
+    for text, said in (("steps = 0\n", "steps"), ("stride = 3\n", "stride"), ("steps = = 3", "TOML")):
         config.write_text(text)
         outcome = run("train", "--data", scene_copy, "--output", out, "--config", config)
         assert outcome.code == 3
-        assert told in outcome.err
+        assert said in outcome.err
         assert outcome.err.count("\n") == 1
     assert run("train", "--data", tmp_path / "nowhere", "--output", out).code == 3
     assert run("train", "--output", out).code == 2
@@ -117,8 +117,8 @@ def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: R
     copytree(scene_copy, out / "not-a-scene-of-the-user")
     held = find_training_scenes([folder / "c"], out)
     assert held == [folder / "c"]
-    found = find_training_scenes([folder, folder / "a"], out, held)
-    assert found == [folder / "a", folder / "deeper/b"]
+    actual = find_training_scenes([folder, folder / "a"], out, held)
+    assert actual == [folder / "a", folder / "deeper/b"]
     assert find_training_scenes([folder / "c"], out, held) == held  # it was named
     config = tmp_path / "train.json"
     config.write_text(json.dumps(CONFIG | {"steps": 1, "save_every": 1}))

@@ -87,9 +87,9 @@ def reference_gradients(
     return [torch.zeros_like(tensor) if tensor.grad is None else tensor.grad for tensor in tensors]
 
 
-def assert_close(found: Sequence[Tensor], wanted: Sequence[Tensor], most: float = 1e-3) -> None:
+def assert_close(actual: Sequence[Tensor], expected: Sequence[Tensor], most: float = 1e-3) -> None:
     """Relative L2 error below ``most``, tensor by tensor."""
-    for name, one, other in zip(NAMES, found, wanted, strict=False):
+    for name, one, other in zip(NAMES, actual, expected, strict=False):
         assert torch.isfinite(one).all(), name
         error, size = float((one.double() - other).norm()), float(other.norm())
         assert error <= most * size + 1e-9, f"{name}: {error:.2g} of {size:.2g}"

@@ -56,15 +56,15 @@ def autograd(image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lamb
 def test_gradient_matches_autograd(size: tuple[int, int], ssim_lambda: float, weighted: bool) -> None:
     image, photo, weight = pictures(size)
     weight = weight if weighted else np.ones_like(weight)
-    found, _ = image_gradient(image, photo, weight, ssim_lambda)
-    wanted = autograd(image, photo, weight, ssim_lambda)
-    assert found.dtype == np.float32
-    assert np.linalg.norm(found - wanted) <= 1e-3 * np.linalg.norm(wanted)
+    actual, _ = image_gradient(image, photo, weight, ssim_lambda)
+    reference = autograd(image, photo, weight, ssim_lambda)
+    assert actual.dtype == np.float32
+    assert np.linalg.norm(actual - reference) <= 1e-3 * np.linalg.norm(reference)
 
 
 def test_gradient_matches_finite_differences() -> None:
     image, photo, weight = pictures((12, 10), seed=1)
-    found, _ = image_gradient(image, photo, weight, 0.2)
+    actual, _ = image_gradient(image, photo, weight, 0.2)
     rng, step = np.random.default_rng(0), 1e-6
     for _ in range(5):
         way = rng.normal(size=image.shape)
@@ -72,7 +72,7 @@ def test_gradient_matches_finite_differences() -> None:
             float(loss(*(torch.from_numpy(a) for a in (image + sign * step * way, photo, weight)), 0.2))
             for sign in (1.0, -1.0)
         ]
-        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((found * way).sum()), rel=2e-3, abs=1e-5)
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((actual * way).sum()), rel=2e-3, abs=1e-5)
 
 
 @pytest.mark.parametrize("cuts", [[0, 20], [0, 7, 20], list(range(21))], ids=str)

@@ -49,9 +49,9 @@ def full(gradients: Any, name: str, n: int) -> np.ndarray:
     return array
 
 
-def assert_near(found: np.ndarray, wanted: np.ndarray, most: float = 1e-3) -> None:
-    assert np.isfinite(found).all()
-    assert np.linalg.norm(found - wanted) <= most * np.linalg.norm(wanted) + 1e-9
+def assert_near(actual: np.ndarray, expected: np.ndarray, most: float = 1e-3) -> None:
+    assert np.isfinite(actual).all()
+    assert np.linalg.norm(actual - expected) <= most * np.linalg.norm(expected) + 1e-9
 
 
 @pytest.mark.parametrize("eps2d", [0.075, 0.3, 1.0])
@@ -59,7 +59,7 @@ def assert_near(found: np.ndarray, wanted: np.ndarray, most: float = 1e-3) -> No
 def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool) -> None:
     gaussians, cameras, colors = random_gaussians(40, 0, 1), turned_cameras(1), normal(40, 3, seed=2)
     grad_left = normal(HEIGHT, WIDTH, seed=3) if with_left else None
-    found = gradients_of_plan(plan_of(gaussians, eps2d=eps2d), colors, grad_left)
+    actual = gradients_of_plan(plan_of(gaussians, eps2d=eps2d), colors, grad_left)
     names = ("means", "quats", "scales", "opacities")
     inputs = [getattr(gaussians, name).double() for name in names] + [torch.from_numpy(colors).double()]
     inputs = [tensor.requires_grad_() for tensor in [*inputs, cameras.viewmats[0].clone()]]
@@ -69,9 +69,9 @@ def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool)
         loss = loss + (drawn.transmittance * torch.from_numpy(grad_left)).sum()
     loss.backward()
     for name, tensor in zip(FIELDS, inputs, strict=False):
-        assert_near(full(found, name, 40), tensor.grad.numpy())
-    assert found.viewmat is not None
-    assert_near(found.viewmat, inputs[-1].grad.numpy())
+        assert_near(full(actual, name, 40), tensor.grad.numpy())
+    assert actual.viewmat is not None
+    assert_near(actual.viewmat, inputs[-1].grad.numpy())
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -79,13 +79,13 @@ def test_colours_of_every_degree(degree: int) -> None:
     gaussians, viewmat = random_gaussians(150, degree, degree), turned_cameras(1).viewmats[0]
     plan = plan_of(gaussians)
     grad_colors = normal(len(plan.ids), 3)
-    found = color_gradients(plan, grad_colors)
+    actual = color_gradients(plan, grad_colors)
     means, sh0, shN = (getattr(gaussians, name).double().requires_grad_() for name in ("means", "sh0", "shN"))
     colors = view_colors(means, torch.cat([sh0, shN], 1), viewmat)
     (colors[torch.from_numpy(plan.ids).long()] * torch.from_numpy(grad_colors)).sum().backward()
     for name, tensor in (("means", means), ("sh0", sh0), ("shN", shN)):
-        wanted = np.zeros(tensor.shape) if tensor.grad is None else tensor.grad.numpy()
-        assert_near(full(found, name, 150), wanted, 1e-5)
+        expected = np.zeros(tensor.shape) if tensor.grad is None else tensor.grad.numpy()
+        assert_near(full(actual, name, 150), expected, 1e-5)
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3, 4])
@@ -95,11 +95,11 @@ def test_used_memory_is_written_again(number: int, enough: bool, degree: int) ->
     plan, other = plan_of(random_gaussians(150, degree, degree)), plan_of(random_gaussians(number, degree, 5))
     assert (len(other.ids) > len(plan.ids)) == enough
     used = color_gradients(other, normal(len(other.ids), 3))
-    wanted = color_gradients(plan, normal(len(plan.ids), 3))
-    found = color_gradients(plan, normal(len(plan.ids), 3), used=used)
-    for one, again in zip(vars(wanted).values(), vars(found).values(), strict=True):
+    expected = color_gradients(plan, normal(len(plan.ids), 3))
+    actual = color_gradients(plan, normal(len(plan.ids), 3), used=used)
+    for one, again in zip(vars(expected).values(), vars(actual).values(), strict=True):
         np.testing.assert_array_equal(one, again)
-    assert np.shares_memory(found.sh0, used.sh0) == enough
+    assert np.shares_memory(actual.sh0, used.sh0) == enough
 
 
 def test_opacities_in_place_of_the_gaussians_own() -> None:
@@ -107,12 +107,12 @@ def test_opacities_in_place_of_the_gaussians_own() -> None:
     gaussians, colors = random_gaussians(40, 0, 4), normal(40, 3)
     keep = np.arange(40) % 4 > 0
     given = gaussians.opacities.numpy() * 0.7
-    found = gradients_of_plan(plan_of(gaussians, opacities=given, keep=keep), colors, None)
-    assert keep[found.ids].all()
+    actual = gradients_of_plan(plan_of(gaussians, opacities=given, keep=keep), colors, None)
+    assert keep[actual.ids].all()
     kept = replace(gaussians, opacities=torch.from_numpy(np.where(keep, given, 0)))
-    wanted = gradients_of_plan(plan_of(kept), colors, None)
+    expected = gradients_of_plan(plan_of(kept), colors, None)
     for name in FIELDS:
-        np.testing.assert_array_equal(full(found, name, 40), full(wanted, name, 40))
+        np.testing.assert_array_equal(full(actual, name, 40), full(expected, name, 40))
 
 
 def test_finite_differences() -> None:
@@ -134,12 +134,12 @@ def test_finite_differences() -> None:
 
     plan = plan_of(start)
     image, left = composite(plan, colors, BACKGROUND)
-    found = plan_gradients(
+    actual = plan_gradients(
         plan, grad_image.astype(np.float32), grad_left.astype(np.float32),
         image=image, transmittance=left, colors=colors,
     )  # fmt: skip
     for name in FIELDS:
-        gradient = full(found, name, n)
+        gradient = full(actual, name, n)
         step = gradient / np.abs(gradient).max()
         size = 5e-3
         change = (loss(name, size * step) - loss(name, -size * step)) / (2 * size)
@@ -210,20 +210,20 @@ def test_finite_input_gives_finite_gradients(
 ) -> None:
     gaussians = change(random_gaussians(60, 2, 11))
     plan = plan_of(gaussians, eps2d=eps2d, antialiased=antialiased)
-    found = gradients_of_plan(plan, normal(60, 3), normal(HEIGHT, WIDTH))
+    actual = gradients_of_plan(plan, normal(60, 3), normal(HEIGHT, WIDTH))
     for name in (*FIELDS, "viewmat"):
-        assert np.isfinite(getattr(found, name)).all(), name
-    for array in vars(color_gradients(plan, found.colors)).values():
+        assert np.isfinite(getattr(actual, name)).all(), name
+    for array in vars(color_gradients(plan, actual.colors)).values():
         assert np.isfinite(array).all()
 
 
 def test_a_view_of_nothing() -> None:
     gaussians = random_gaussians(5)
     plan = plan_of(replace(gaussians, means=gaussians.means - 100))
-    found = gradients_of_plan(plan, normal(5, 3), None)
-    assert len(found.ids) == len(found.means) == len(found.colors) == 0
-    assert found.viewmat is not None
-    assert (found.viewmat == 0).all()
+    actual = gradients_of_plan(plan, normal(5, 3), None)
+    assert len(actual.ids) == len(actual.means) == len(actual.colors) == 0
+    assert actual.viewmat is not None
+    assert (actual.viewmat == 0).all()
 
 
 def test_what_is_planned_and_drawn_is_what_it_was() -> None:

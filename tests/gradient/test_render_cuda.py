@@ -40,17 +40,17 @@ def psnr(one: Tensor, other: Tensor) -> float:
     return float(-10 * (one.double() - other.double()).square().mean().clamp_min(1e-20).log10())
 
 
-def assert_same(found: Rendering, wanted: Rendering, least: float = 80.0) -> None:
+def assert_same(actual: Rendering, expected: Rendering, least: float = 80.0) -> None:
     """Images and alphas to ``least`` dB, mean depths to a thousandth in 99 % of what was drawn."""
-    assert (found.images.shape, found.alphas.shape) == (wanted.images.shape, wanted.alphas.shape)
-    assert found.images.dtype == found.alphas.dtype == torch.float32
-    assert psnr(found.images, wanted.images) >= least
-    assert psnr(found.alphas, wanted.alphas) >= least
-    assert (found.depths is None) == (wanted.depths is None)
-    if found.depths is not None and wanted.depths is not None:
-        assert found.depths.shape == wanted.depths.shape
-        solid = wanted.alphas > 0.1
-        close = torch.isclose(found.depths[solid], wanted.depths[solid], rtol=1e-3)
+    assert (actual.images.shape, actual.alphas.shape) == (expected.images.shape, expected.alphas.shape)
+    assert actual.images.dtype == actual.alphas.dtype == torch.float32
+    assert psnr(actual.images, expected.images) >= least
+    assert psnr(actual.alphas, expected.alphas) >= least
+    assert (actual.depths is None) == (expected.depths is None)
+    if actual.depths is not None and expected.depths is not None:
+        assert actual.depths.shape == expected.depths.shape
+        solid = expected.alphas > 0.1
+        close = torch.isclose(actual.depths[solid], expected.depths[solid], rtol=1e-3)
         assert close.double().mean() > 0.99  # but where a weight falls on the other side of the cut
 
 
@@ -71,10 +71,10 @@ def test_images_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa:
 )
 def test_options_mean_the_same(options: dict[str, Any], fake_gsplat: Calls) -> None:  # noqa: F811
     gaussians, cameras = random_gaussians(40, 1), cameras_of()
-    wanted = render(gaussians, cameras, BACKGROUND, **options)
-    assert_same(by_adapter(gaussians, cameras, **options), wanted)
+    expected = render(gaussians, cameras, BACKGROUND, **options)
+    assert_same(by_adapter(gaussians, cameras, **options), expected)
     if not options.get("with_depths"):
-        assert psnr(wanted.images, render(gaussians, cameras, BACKGROUND).images) < 60  # the option matters here
+        assert psnr(expected.images, render(gaussians, cameras, BACKGROUND).images) < 60  # the option matters here
 
 
 def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
@@ -96,9 +96,9 @@ def test_what_gsplat_is_told(fake_gsplat: Calls) -> None:  # noqa: F811
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
     gaussians, cameras = random_gaussians(40, degree, 1), cameras_of()
-    found, wanted = (gradients(draw, gaussians, cameras) for draw in (by_adapter, on_cpu))
-    assert_close(found, [one.double() for one in wanted])
-    assert all(float(one.norm()) > 0 for one in wanted if one.numel())
+    actual, expected = (gradients(draw, gaussians, cameras) for draw in (by_adapter, on_cpu))
+    assert_close(actual, [one.double() for one in expected])
+    assert all(float(one.norm()) > 0 for one in expected if one.numel())
 
 
 def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  # noqa: F811
@@ -110,8 +110,8 @@ def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  
     far, there = replace(near, means=near.means.double() + place), replace(cameras, viewmats=viewmats)
     assert_same(by_adapter(far, there), by_adapter(near, cameras), least=60)
     assert_same(by_adapter(far, there), render(far, there, BACKGROUND), least=60)
-    found, wanted = (gradients(draw, far, there) for draw in (by_adapter, on_cpu))
-    assert_close(found, [one.double() for one in wanted], most=1e-2)
+    actual, expected = (gradients(draw, far, there) for draw in (by_adapter, on_cpu))
+    assert_close(actual, [one.double() for one in expected], most=1e-2)
 
 
 def test_depths_have_no_gradient(fake_gsplat: Calls) -> None:  # noqa: F811
@@ -133,10 +133,10 @@ def test_nothing_to_draw(with_depths: bool, fake_gsplat: Calls) -> None:  # noqa
     """Background, still differentiable, and gsplat is not asked."""
     gaussians, cameras = random_gaussians(9, 1), cameras_of()
     for some, seen in ((gaussians[:0], cameras), (gaussians, cameras[:0])):
-        found, wanted = (draw(some, seen, with_depths=with_depths) for draw in (by_adapter, on_cpu))
+        actual, expected = (draw(some, seen, with_depths=with_depths) for draw in (by_adapter, on_cpu))
         for name in ("images", "alphas"):
-            assert torch.equal(getattr(found, name), getattr(wanted, name))
-        assert (found.depths is None) == (not with_depths)
+            assert torch.equal(getattr(actual, name), getattr(expected, name))
+        assert (actual.depths is None) == (not with_depths)
     assert all((one == 0).all() for one in gradients(by_adapter, gaussians[:0], cameras))
     assert fake_gsplat == []
 
@@ -155,7 +155,7 @@ def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F
     camera = {"viewmat": viewmat.numpy(), "K": K.numpy(), "width": 37, "height": 21, "eps2d": 0.075}
     background = np.array(BACKGROUND, np.float32)
     grad_image, _ = pixel_gradients(cameras)
-    found = []
+    actual = []
     for fast in (True, False):
         tensors = [t.clone().requires_grad_() for t in (*list(vars(gaussians).values())[:4], colors)]
         shape = (tensors[0], tensors[1], tensors[2], tensors[3])
@@ -168,9 +168,9 @@ def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F
             image = drawn.images[0]
             assert reached.shape == (1, len(tensors[4]))
         (image * grad_image[0]).sum().backward()
-        found.append((image.detach(), [tensor.grad for tensor in tensors]))
-    assert psnr(found[0][0], found[1][0]) > 80
-    assert_close(found[0][1], [one.double() for one in found[1][1]])
+        actual.append((image.detach(), [tensor.grad for tensor in tensors]))
+    assert psnr(actual[0][0], actual[1][0]) > 80
+    assert_close(actual[0][1], [one.double() for one in actual[1][1]])
     assert fake_gsplat[0]["eps2d"] == 0.075
     assert fake_gsplat[0]["sh_degree"] is None
 
@@ -179,10 +179,10 @@ def test_given_colours_and_dilation_pass(fake_gsplat: Calls) -> None:  # noqa: F
 def test_seen_colours(degree: int, fake_gsplat: Calls) -> None:  # noqa: F811
     gaussians, cameras = random_gaussians(20, degree), cameras_of(1)
     harmonics = torch.cat([gaussians.sh0, gaussians.shN], 1)
-    found = harmonic_colors(gaussians.means, harmonics, cameras.centres[0].float())
-    wanted = seen_colors(gaussians.means, gaussians.sh0, gaussians.shN, cameras.viewmats[0].numpy())
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
-    assert (wanted == 0).any()
+    actual = harmonic_colors(gaussians.means, harmonics, cameras.centres[0].float())
+    expected = seen_colors(gaussians.means, gaussians.sh0, gaussians.shN, cameras.viewmats[0].numpy())
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    assert (expected == 0).any()
 
 
 # who draws
@@ -281,10 +281,10 @@ def test_gsplat_draws_the_cpu_s_images(degree: int, antialiased: bool) -> None:
     """60 dB leaves room for weights that fall on the other side of the cut, 1/255, in 6 % of the pixels."""
     gaussians, cameras = random_gaussians(300, degree), cameras_of(3)
     options = {"antialiased": antialiased, "with_depths": True}
-    found = render(gaussians.to("cuda"), cameras.to("cuda"), BACKGROUND, **options)
-    assert found.images.is_cuda
-    found = Rendering(*(part.cpu() for part in vars(found).values()))
-    assert_same(found, render(gaussians, cameras, BACKGROUND, **options), least=60)
+    actual = render(gaussians.to("cuda"), cameras.to("cuda"), BACKGROUND, **options)
+    assert actual.images.is_cuda
+    actual = Rendering(*(part.cpu() for part in vars(actual).values()))
+    assert_same(actual, render(gaussians, cameras, BACKGROUND, **options), least=60)
 
 
 @gpu
@@ -293,17 +293,17 @@ def test_opaque_ones_differ_by_the_clamp_alone() -> None:
     gaussians, cameras = random_gaussians(300), cameras_of(3)
     colors = torch.rand(300, 1, 3, generator=torch.Generator().manual_seed(0))
     gaussians = replace(gaussians, opacities=torch.ones(300), sh0=(colors - 0.5) / 0.28209479177387814)
-    found, wanted = render(gaussians.to("cuda"), cameras.to("cuda")), render(gaussians, cameras)
-    assert psnr(found.images.cpu(), wanted.images) >= 40
+    actual, expected = render(gaussians.to("cuda"), cameras.to("cuda")), render(gaussians, cameras)
+    assert psnr(actual.images.cpu(), expected.images) >= 40
 
 
 @gpu
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gsplat_has_the_cpu_s_gradients(degree: int) -> None:
     gaussians, cameras = random_gaussians(300, degree), cameras_of(3)
-    wanted = gradients(on_cpu, gaussians, cameras)
-    found = gradients(on_cpu, gaussians.to("cuda"), cameras.to("cuda"))
-    assert_close([one.cpu() for one in found], [one.double() for one in wanted], most=1e-2)
+    expected = gradients(on_cpu, gaussians, cameras)
+    actual = gradients(on_cpu, gaussians.to("cuda"), cameras.to("cuda"))
+    assert_close([one.cpu() for one in actual], [one.double() for one in expected], most=1e-2)
 
 
 def on_cpu(gaussians: Gaussians, cameras: Cameras, **options: Any) -> Rendering:
@@ -317,8 +317,8 @@ def gradients(draw: Any, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]
     grads = [one.to(drawn.images) for one in pixel_gradients(cameras)]
     ((drawn.images * grads[0]).sum() + (drawn.alphas * grads[1]).sum()).backward()
     assert len(tensors) + 1 == len(NAMES)
-    found = [torch.zeros_like(one) if one.grad is None else one.grad for one in (*tensors, viewmats)]
-    return [*found[:-1], rigid(found[-1], cameras)]
+    actual = [torch.zeros_like(one) if one.grad is None else one.grad for one in (*tensors, viewmats)]
+    return [*actual[:-1], rigid(actual[-1], cameras)]
 
 
 def rigid(gradient: Tensor, cameras: Cameras) -> Tensor:

@@ -30,18 +30,18 @@ def gradients(
     drawn = render(Gaussians(*tensors), replace(cameras, viewmats=viewmats), background, **options)
     grad_images, grad_alphas = pixel_gradients(cameras, seed)
     ((drawn.images * grad_images).sum() + (drawn.alphas * grad_alphas).sum()).backward()
-    found = [tensor.grad for tensor in (*tensors, viewmats)]
-    assert all(one is not None for one in found)
-    return found
+    actual = [tensor.grad for tensor in (*tensors, viewmats)]
+    assert all(one is not None for one in actual)
+    return actual
 
 
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("seed", range(2))
 def test_every_parameter_and_degree(degree: int, seed: int) -> None:
     gaussians, cameras = random_gaussians(40, degree, 10 * degree + seed), turned_cameras()
-    found, wanted = gradients(gaussians, cameras, seed=seed), reference_gradients(gaussians, cameras, seed=seed)
-    assert_close(found, wanted)
-    for name, one in zip(NAMES, wanted, strict=True):
+    actual, expected = gradients(gaussians, cameras, seed=seed), reference_gradients(gaussians, cameras, seed=seed)
+    assert_close(actual, expected)
+    for name, one in zip(NAMES, expected, strict=True):
         assert float(one.norm()) > 0 or (name == "shN" and degree == 0)
 
 
@@ -117,17 +117,17 @@ def test_what_is_not_drawn_has_no_gradient() -> None:
     gaussians, cameras = random_gaussians(40, 2, 6), turned_cameras(1)
     means, opacities = gaussians.means.clone(), gaussians.opacities.clone()
     means[:10, 2], opacities[10:20] = -3.0, 0.0
-    found = gradients(replace(gaussians, means=means, opacities=opacities), cameras)
-    for name, one in zip(NAMES[:-1], found, strict=False):
+    actual = gradients(replace(gaussians, means=means, opacities=opacities), cameras)
+    for name, one in zip(NAMES[:-1], actual, strict=False):
         assert (one[:20] == 0).all(), name
         assert (one[20:] != 0).any(), name
 
 
 def test_empty_scenes_have_empty_gradients() -> None:
     gaussians, cameras = random_gaussians(3)[:0], turned_cameras()
-    found = gradients(gaussians, cameras)
-    assert [one.shape[0] for one in found] == [0, 0, 0, 0, 0, 0, 2]
-    assert (found[-1] == 0).all()
+    actual = gradients(gaussians, cameras)
+    assert [one.shape[0] for one in actual] == [0, 0, 0, 0, 0, 0, 2]
+    assert (actual[-1] == 0).all()
 
 
 def test_gradients_keep_types_and_only_those_asked_for_are_made() -> None:
@@ -182,12 +182,12 @@ def test_far_away_scenes_keep_their_gradients() -> None:
 
 def test_gradients_descend() -> None:
     """A few steps along the gradient of a squared error take much of it away."""
-    wanted, cameras = random_gaussians(40, 1, 8), turned_cameras()
-    target = render(wanted, cameras).images
-    sh0 = torch.zeros_like(wanted.sh0).requires_grad_()
+    expected, cameras = random_gaussians(40, 1, 8), turned_cameras()
+    target = render(expected, cameras).images
+    sh0 = torch.zeros_like(expected.sh0).requires_grad_()
     errors = []
     for _ in range(30):
-        error = (render(replace(wanted, sh0=sh0), cameras).images - target).square().sum()
+        error = (render(replace(expected, sh0=sh0), cameras).images - target).square().sum()
         (gradient,) = torch.autograd.grad(error, sh0)
         with torch.no_grad():
             sh0 -= 0.05 * gradient

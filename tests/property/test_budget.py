@@ -72,13 +72,13 @@ def test_more_than_there_is_leaves_the_superpixels(seed: int, colours: int) -> N
 @settings(max_examples=5, deadline=None, derandomize=True)
 @given(seeds)
 def test_threads_change_nothing(seed: int) -> None:
-    found = []
+    actual = []
     for threads in (1, 3):
         with use_threads(threads):
             tree = random_tree(seed, 4, 3)
-            found.append((tree.distortions, cut_tree(tree, (len(tree) + 4) // 2).labels))
-    np.testing.assert_array_equal(found[0][0], found[1][0])
-    assert torch.equal(found[0][1], found[1][1])
+            actual.append((tree.distortions, cut_tree(tree, (len(tree) + 4) // 2).labels))
+    np.testing.assert_array_equal(actual[0][0], actual[1][0])
+    assert torch.equal(actual[0][1], actual[1][1])
 
 
 def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:

@@ -78,18 +78,18 @@ def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
 
 @pytest.mark.parametrize("count", [1, 25, 300])
 def test_threads_change_no_owner(count: int) -> None:
-    found = []
+    actual = []
     for threads in (1, 2, 8):
         with use_threads(threads):
-            found.append(find_owners(loose.loosened(TURNED), groups(count)))
-    assert all(owners_equal(a, b) for a, b in itertools.pairwise(found))
+            actual.append(find_owners(loose.loosened(TURNED), groups(count)))
+    assert all(owners_equal(a, b) for a, b in itertools.pairwise(actual))
 
 
 @pytest.mark.parametrize("options", [{"fit": "color"}, {"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
 def test_threads_change_no_bit(options: dict) -> None:
     scene = loose.voxels(ROOM, 0.06)
-    found = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 2, 8)]
-    assert all(scenes.identical(a, b) for a, b in itertools.pairwise(found))
+    actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 2, 8)]
+    assert all(scenes.identical(a, b) for a, b in itertools.pairwise(actual))
 
 
 @FEW
@@ -103,7 +103,7 @@ def test_similarity(seed: int, exponent: float) -> None:
     one, other = (
         compact(loose.loosened(scene), superpixels="10%", robust=False, fit="none").gaussians for scene in (ROOM, moved)
     )
-    wanted = scenes.move_gaussians(one, *transform)
+    expected = scenes.move_gaussians(one, *transform)
     assert abs(len(one) - len(other)) <= 2
-    distances = torch.cdist(other.means.double(), wanted.means.double()).min(1).values / factor
+    distances = torch.cdist(other.means.double(), expected.means.double()).min(1).values / factor
     assert (distances < 1e-3).double().mean() > 0.97

@@ -80,9 +80,9 @@ def random_features(rng: np.random.Generator, count: int) -> FeatureGaussians:
     )  # fmt: skip
 
 
-def as_sets(found: Matches, names: np.ndarray) -> set[frozenset[int]]:
-    clusters = found.clusters.numpy()
-    return {frozenset(names[clusters == c].tolist()) for c in range(found.count)}
+def as_sets(actual: Matches, names: np.ndarray) -> set[frozenset[int]]:
+    clusters = actual.clusters.numpy()
+    return {frozenset(names[clusters == c].tolist()) for c in range(actual.count)}
 
 
 @FEW

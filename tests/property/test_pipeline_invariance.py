@@ -55,8 +55,8 @@ CASES = [
 
 @pytest.mark.parametrize("settings", CASES, ids=str)
 def test_threads_change_no_bit(settings: dict) -> None:
-    found = [scenes.compacted(ROOM, threads=threads, **settings).gaussians for threads in (1, 2, 8)]
-    assert all(identical(a, b) for a, b in itertools.pairwise(found))
+    actual = [scenes.compacted(ROOM, threads=threads, **settings).gaussians for threads in (1, 2, 8)]
+    assert all(identical(a, b) for a, b in itertools.pairwise(actual))
 
 
 @pytest.mark.parametrize("settings", CASES, ids=str)
@@ -65,16 +65,16 @@ def test_runs_repeat(settings: dict) -> None:
 
 
 def test_two_runs_at_once_do_not_disturb_each_other() -> None:
-    wanted = [scenes.compacted(ROOM, k=k).gaussians for k in (1, 2)]
+    expected = [scenes.compacted(ROOM, k=k).gaussians for k in (1, 2)]
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda k: scenes.compacted(ROOM, k=k).gaussians, (1, 2)))
-    assert all(identical(a, b) for a, b in zip(wanted, found, strict=True))
+        actual = list(pool.map(lambda k: scenes.compacted(ROOM, k=k).gaussians, (1, 2)))
+    assert all(identical(a, b) for a, b in zip(expected, actual, strict=True))
 
 
 def test_large_groups_of_tasks_change_no_bit() -> None:
     """More superpixels than one task takes."""
     scene: PixelScene = scenes.make_scene(scenes.wall(), scenes.arc(2, 128, 96))
     options = {"superpixels": "45%", "k": 2, "fit": "none"}
-    found = [scenes.compacted(scene, threads=threads, **options).gaussians for threads in (1, 3)]
-    assert len(found[0]) > 8192
-    assert identical(*found)
+    actual = [scenes.compacted(scene, threads=threads, **options).gaussians for threads in (1, 3)]
+    assert len(actual[0]) > 8192
+    assert identical(*actual)

@@ -40,10 +40,10 @@ def gaussians(draw: st.DrawFn) -> Gaussians:
 def round_trip(before: Gaussians) -> Gaussians:
     with tempfile.TemporaryDirectory() as folder:
         write_ply(Path(folder) / "a.ply", before)
-        found = read_ply(Path(folder) / "a.ply")
-    assert found.valid.all()
-    assert found.info.opacity_encoding == "logit"
-    return found.gaussians
+        actual = read_ply(Path(folder) / "a.ply")
+    assert actual.valid.all()
+    assert actual.info.opacity_encoding == "logit"
+    return actual.gaussians
 
 
 @given(gaussians())

@@ -101,8 +101,8 @@ PLY_SEEDS = [*(ply_seed(form) for form in ("binary_little_endian", "binary_big_e
 
 
 def check_gaussians(path: Path) -> None:
-    found = read_ply(path)
-    gaussians, count = found.gaussians, len(found.gaussians)
+    actual = read_ply(path)
+    gaussians, count = actual.gaussians, len(actual.gaussians)
     assert 0 < count <= path.stat().st_size
     assert gaussians.means.isfinite().all()
     assert (gaussians.scales >= 0).all()
@@ -135,12 +135,12 @@ def test_mutated_cameras_inside_a_ply(data: bytes) -> None:
 
 
 def check_cameras(path: Path) -> None:
-    found: CameraFile = read_cameras(path)
-    assert 0 < len(found) == len(found.viewmats) == len(found.Ks) == len(found.widths) == len(found.heights)
-    assert found.viewmats.isfinite().all()
-    assert found.Ks.isfinite().all()
-    assert (found.Ks[:, 0, 0] > 0).all()
-    assert (found.widths >= 0).all()
+    actual: CameraFile = read_cameras(path)
+    assert 0 < len(actual) == len(actual.viewmats) == len(actual.Ks) == len(actual.widths) == len(actual.heights)
+    assert actual.viewmats.isfinite().all()
+    assert actual.Ks.isfinite().all()
+    assert (actual.Ks[:, 0, 0] > 0).all()
+    assert (actual.widths >= 0).all()
 
 
 POSE = np.eye(4).tolist()
@@ -259,9 +259,9 @@ def test_mutated_npz(data: bytes) -> None:
     st.sampled_from(["c2w", "K", "images", "order", "extrinsics", "intrinsics", "image", "depth"]), arrays(), max_size=5
 ))  # fmt: skip
 @fuzzed
-def test_made_up_npz(found: dict[str, np.ndarray]) -> None:
+def test_made_up_npz(actual: dict[str, np.ndarray]) -> None:
     sound = {"c2w": EYE, "K": K, "images": np.zeros((1, 2, 3, 3), np.uint8), "extrinsics": EYE, "intrinsics": K}
-    attempt("views.npz", npz_seed(**{**sound, **found}), check_npz)
+    attempt("views.npz", npz_seed(**{**sound, **actual}), check_npz)
 
 
 @given(mutated(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n"), mutated(b"20 20 12 8\n"))
@@ -297,7 +297,7 @@ def test_mutated_chunks(data: bytes) -> None:
 @given(st.sampled_from(IMAGE_SEEDS).flatmap(mutated))
 @fuzzed
 def test_mutated_images(data: bytes) -> None:
-    found = attempt("a.png", data, lambda path: read_images([path], ["a.png"]))
-    if found is not None:
-        assert found.shape[0] == 1
-        assert ((found >= 0) & (found <= 1)).all()
+    actual = attempt("a.png", data, lambda path: read_images([path], ["a.png"]))
+    if actual is not None:
+        assert actual.shape[0] == 1
+        assert ((actual >= 0) & (actual <= 1)).all()

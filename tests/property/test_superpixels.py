@@ -51,8 +51,8 @@ def assert_partition(labels: torch.Tensor, height: int, width: int, count: int) 
 
 
 def counts_of(num_pixels: int) -> list[int]:
-    wanted = {1, 2, num_pixels // 10, num_pixels // 3, num_pixels - 1, num_pixels}
-    return sorted(k for k in wanted if k >= 1)
+    expected = {1, 2, num_pixels // 10, num_pixels // 3, num_pixels - 1, num_pixels}
+    return sorted(k for k in expected if k >= 1)
 
 
 @pytest.mark.parametrize("picture", PICTURES)

@@ -29,12 +29,12 @@ def scene() -> PixelScene:
 def test_one_view_at_a_time_or_all(
     scene: PixelScene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]
 ) -> None:
-    found = []
+    actual = []
     for at_once in (1, 2, 100):
         monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
-        found.append(scenes.compacted(scene, **settings).gaussians)
-    assert scenes.identical(found[0], found[1])
-    assert scenes.identical(found[0], found[2])
+        actual.append(scenes.compacted(scene, **settings).gaussians)
+    assert scenes.identical(actual[0], actual[1])
+    assert scenes.identical(actual[0], actual[2])
 
 
 def test_higher_harmonics_are_not_copied() -> None:
@@ -45,8 +45,8 @@ def test_higher_harmonics_are_not_copied() -> None:
 
 
 def test_of_many_gaussians_one_view_at_a_time(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = []
+    actual = []
     for many in (0, 10**9):
         monkeypatch.setattr("gsmerge.stages.assign.ONE_AT_A_TIME", many)
-        found.append(compact(loose.loosened(scene), fit="none", superpixels="10%", unseen="keep").gaussians)
-    assert scenes.identical(found[0], found[1])
+        actual.append(compact(loose.loosened(scene), fit="none", superpixels="10%", unseen="keep").gaussians)
+    assert scenes.identical(actual[0], actual[1])

@@ -43,9 +43,9 @@ class View:
         ridge = np.sqrt(kernels.SLOPE_RIDGE * (z**2).sum())
         rows = np.append(z, 0)[:, None] * np.stack([x, y, np.ones_like(x)], 1)
         system = np.concatenate([rows[:-1], [[ridge, 0, 0], [0, ridge, 0]]])
-        wanted = np.append(np.ones(len(z)), [0, 0])
-        solution = np.linalg.lstsq(system, wanted, rcond=None)[0]
-        return float(((system @ solution - wanted) ** 2).sum())
+        expected = np.append(np.ones(len(z)), [0, 0])
+        solution = np.linalg.lstsq(system, expected, rcond=None)[0]
+        return float(((system @ solution - expected) ** 2).sum())
 
     def error(self, mask: np.ndarray) -> float:
         return self.colour_error(mask) + DEPTH_WEIGHT * self.plane_error(mask)
@@ -107,9 +107,9 @@ def test_growth_of_one_merge(seed: int) -> None:
     rows, _ = view.rows()
     for u, v in itertools.pairwise(range(12)):
         error, place = kernels.merge_growth(rows, u, v, DEPTH_WEIGHT, COMPACTNESS)
-        wanted = view.growths_of(view.labels == u, view.labels == v)
-        assert error == pytest.approx(wanted[0], abs=1e-8)
-        assert place == pytest.approx(COMPACTNESS * wanted[1], abs=1e-8)
+        expected = view.growths_of(view.labels == u, view.labels == v)
+        assert error == pytest.approx(expected[0], abs=1e-8)
+        assert place == pytest.approx(COMPACTNESS * expected[1], abs=1e-8)
 
 
 @pytest.mark.parametrize("max_extent", [1e9, 9.0])
@@ -117,10 +117,10 @@ def test_growth_of_one_merge(seed: int) -> None:
 def test_order_of_merges(seed: int, max_extent: float) -> None:
     view = View(seed)
     parents, heights, growths = view.merges(max_extent)
-    wanted = merge_reference(view, max_extent)
-    assert parents.tolist() == wanted[0]
-    np.testing.assert_allclose(heights, wanted[1], rtol=1e-7)
-    np.testing.assert_allclose(growths, wanted[2], atol=1e-8)
+    expected = merge_reference(view, max_extent)
+    assert parents.tolist() == expected[0]
+    np.testing.assert_allclose(heights, expected[1], rtol=1e-7)
+    np.testing.assert_allclose(growths, expected[2], atol=1e-8)
 
 
 def test_regions_without_pixels_cost_nothing() -> None:
@@ -144,14 +144,14 @@ def test_a_slanted_plane_has_no_depth_error() -> None:
 
 def test_cut_labels() -> None:
     parents = np.array([5, 5, 7, 6, 6, 7, 8, 8, -1], np.int32)  # ((0 1) 2) (3 4)
-    for keep, wanted in (
+    for keep, expected in (
         ([False] * 4, [0, 1, 2, 3, 4]),
         ([True, False, False, False], [0, 0, 1, 2, 3]),
         ([True, True, False, False], [0, 0, 1, 2, 2]),
         ([True] * 3 + [False], [0, 0, 0, 1, 1]),
         ([True] * 4, [0] * 5),
     ):
-        assert kernels.cut_labels(parents, np.array(keep), 5).tolist() == wanted
+        assert kernels.cut_labels(parents, np.array(keep), 5).tolist() == expected
 
 
 class Groups:
@@ -187,12 +187,12 @@ def test_errors_are_those_of_the_children(seed: int) -> None:
     errors = split_errors(*groups.arrays(), 6, 0.7)
     for count in range(1, 7):
         starts, ids, parents = bisect(*groups.arrays(), count)
-        found, number = np.zeros(4), np.zeros(4)
+        actual, number = np.zeros(4), np.zeros(4)
         for child, parent in enumerate(parents):
-            found[parent] += groups.error(ids[starts[child] : starts[child + 1]], 0.003)
+            actual[parent] += groups.error(ids[starts[child] : starts[child + 1]], 0.003)
             number[parent] += 1
         enough = number == count
-        np.testing.assert_allclose(errors[enough, count - 1], found[enough], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(errors[enough, count - 1], actual[enough], rtol=1e-6, atol=1e-9)
         assert np.isnan(errors[~enough, count - 1]).all()
 
 

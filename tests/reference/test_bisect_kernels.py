@@ -66,11 +66,11 @@ class Case:
             self.starts, self.ids, self.means, self.sh, self.opacities, self.centres, self.footprints, count
         )
         assert (np.diff(starts) > 0).all()
-        found: list[list[frozenset[int]]] = [[] for _ in self.groups]
+        actual: list[list[frozenset[int]]] = [[] for _ in self.groups]
         for child, parent in enumerate(parents):
-            found[parent].append(frozenset(ids[starts[child] : starts[child + 1]].tolist()))
+            actual[parent].append(frozenset(ids[starts[child] : starts[child + 1]].tolist()))
         assert (np.diff(parents) >= 0).all()
-        return found
+        return actual
 
     def features(self, group: int, rows: np.ndarray) -> np.ndarray:
         return member_features(self.means, self.sh, self.centres[group], self.footprints[group], rows)
@@ -104,9 +104,9 @@ def test_children_nest(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_error_falls_with_the_number_of_children(seed: int) -> None:
     case = Case(seed)
-    found = {count: case.children(count) for count in (1, 2, 4, 8)}
+    actual = {count: case.children(count) for count in (1, 2, 4, 8)}
     for group, rows in enumerate(case.groups):
-        errors = [case.error(group, found[count][group]) for count in (1, 2, 4, 8)]
+        errors = [case.error(group, actual[count][group]) for count in (1, 2, 4, 8)]
         assert all(later <= earlier + 1e-12 for earlier, later in itertools.pairwise(errors))
         if len(rows) > 8:
             assert errors[1] < 0.75 * errors[0]
@@ -119,9 +119,9 @@ def test_children_match_exact_eigenvectors(seed: int) -> None:
     for count in (2, 4):
         for group, (rows, parts) in enumerate(zip(case.groups, case.children(count), strict=True)):
             runs = split_reference(case.features(group, rows), case.weights(rows), count)
-            wanted = [frozenset(rows[run].tolist()) for run in runs]
-            assert len(parts) == len(wanted)
-            assert case.error(group, parts) <= 1.1 * case.error(group, wanted) + 1e-12
+            expected = [frozenset(rows[run].tolist()) for run in runs]
+            assert len(parts) == len(expected)
+            assert case.error(group, parts) <= 1.1 * case.error(group, expected) + 1e-12
 
 
 def test_two_clear_halves_are_told_apart_by_colour_and_by_place() -> None:

@@ -139,8 +139,8 @@ def test_light_reaches_what_nothing_is_before() -> None:
         u, v, forward = ((points - centre) @ axes[k].T).T
         column, row = np.floor((u / radius + 1) * 4).astype(int), np.floor((v / radius + 1) * 4).astype(int)
         inside = (column >= 0) & (column < 8) & (row >= 0) & (row < 8)
-        found = maps[k][row.clip(0, 7), column.clip(0, 7)]
-        reached = ~inside | (found >= forward - bias)
+        actual = maps[k][row.clip(0, 7), column.clip(0, 7)]
+        reached = ~inside | (actual >= forward - bias)
         slow += weights[k] * np.maximum(0, -(normals @ axes[k][2])) * reached
     assert (slow == 0).any()
     np.testing.assert_allclose(out, slow, atol=1e-5)

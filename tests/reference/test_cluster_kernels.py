@@ -154,9 +154,9 @@ def test_leader_clusters_match(seed: int, most: int) -> None:
     scores = rng.uniform(0, 1, (n, k))
     scores[views[:, None] == views[neighbors]] = -1
     order = rng.permutation(n)
-    found = as_sets(*leader_clusters(order, neighbors, scores, views, 0.4, most))
-    assert found == leaders_reference(order, neighbors, scores, views, 0.4, most)
-    for cluster in found:
+    actual = as_sets(*leader_clusters(order, neighbors, scores, views, 0.4, most))
+    assert actual == leaders_reference(order, neighbors, scores, views, 0.4, most)
+    for cluster in actual:
         assert len(cluster) <= most
         assert len({views[i] for i in cluster}) == len(cluster)
 
@@ -175,9 +175,9 @@ def test_connected_components_match(seed: int) -> None:
     n, k = 80, 3
     neighbors, scores = rng.integers(-1, n, (n, k)), rng.uniform(0, 1, (n, k))
     scores[neighbors < 0] = -1
-    found, count = connected_components(neighbors, scores, 0.7)
+    actual, count = connected_components(neighbors, scores, 0.7)
     rows, columns = np.nonzero(scores >= 0.7)
     edges = coo_matrix((np.ones(len(rows)), (rows, neighbors[rows, columns])), shape=(n, n))
-    wanted_count, wanted = csgraph.connected_components(edges, directed=False)
+    wanted_count, expected = csgraph.connected_components(edges, directed=False)
     assert count == wanted_count
-    assert len(set(zip(found.tolist(), wanted.tolist(), strict=True))) == count
+    assert len(set(zip(actual.tolist(), expected.tolist(), strict=True))) == count

@@ -62,15 +62,15 @@ def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
     n, seed, opacity, size, count = case
     gaussians, labels = random_gaussians(n, seed, opacity, size), some_labels(count)
     plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
-    values, found = view_owners(plan, labels, count)
+    values, actual = view_owners(plan, labels, count)
     sums = superpixel_sums(gaussians, labels)[plan.ids]
     assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
-    seen = found >= 0
+    seen = actual >= 0
     assert (seen == (values > 0)).all()
     # where two superpixels get nearly the same, either may win
-    assert_allclose(sums[seen, found[seen]], sums[seen].max(1), rtol=1e-3, atol=1e-4)
+    assert_allclose(sums[seen, actual[seen]], sums[seen].max(1), rtol=1e-3, atol=1e-4)
     assert sums[~seen].max(initial=0) < 1e-4
-    assert (found[seen] == sums[seen].argmax(1)).mean() > 0.98
+    assert (actual[seen] == sums[seen].argmax(1)).mean() > 0.98
 
 
 def test_pairs_beyond_the_first_room() -> None:
@@ -79,11 +79,11 @@ def test_pairs_beyond_the_first_room() -> None:
     gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
     labels = np.arange(HEIGHT * WIDTH, dtype=np.int32).reshape(HEIGHT, WIDTH)
     plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
-    values, found = view_owners(plan, labels, HEIGHT * WIDTH)
+    values, actual = view_owners(plan, labels, HEIGHT * WIDTH)
     sums = superpixel_sums(gaussians, labels)[plan.ids]
     assert (sums[:, : 16 * WIDTH] > 0).sum() > FIRST_PAIRS
     assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
-    assert_allclose(sums[np.arange(len(found)), found], sums.max(1), rtol=1e-3, atol=1e-4)
+    assert_allclose(sums[np.arange(len(actual)), actual], sums.max(1), rtol=1e-3, atol=1e-4)
 
 
 def test_one_superpixel_gets_all() -> None:

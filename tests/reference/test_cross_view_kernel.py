@@ -19,8 +19,8 @@ def slowly(
 ) -> np.ndarray:
     """``[g,7]``: a loop over points and views."""
     places, depths = project(means, cameras)
-    found = np.zeros((len(means), 7))
-    found[:, 6] = np.log(len(cameras)) / 4
+    actual = np.zeros((len(means), 7))
+    actual[:, 6] = np.log(len(cameras)) / 4
     for i in range(len(means)):
         seen, kinds, color, ratios = 0, [0, 0, 0], 0.0, 0.0
         for v in range(len(cameras)):
@@ -37,8 +37,8 @@ def slowly(
                 color += float(np.abs(SH_C0 * (sh0[i, 0].numpy() - members.sh0[j, 0])).mean())
             ratios += float(np.clip(ratio, -FAR, FAR))
         shares = [kind / max(seen, 1) for kind in kinds]
-        found[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
-    return found
+        actual[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
+    return actual
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,8 @@ def test_every_point_and_view(scene: PixelScene) -> None:
     members = scene_members(scene)
     members.opacities[::7] = 0
     with use_threads(2):
-        found = cross_view_stats(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
-    wanted = slowly(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
-    assert len(np.unique(found[:, 0])) > 3
-    assert (wanted[:, 1:4].max(0) > 0).all()
-    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-5)
+        actual = cross_view_stats(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+    expected = slowly(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
+    assert len(np.unique(actual[:, 0])) > 3
+    assert (expected[:, 1:4].max(0) > 0).all()
+    np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)

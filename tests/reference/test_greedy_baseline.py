@@ -122,8 +122,8 @@ def test_disjoint_pairs_are_those_taken_one_by_one(seed: int, limit: int, equal:
     left = rng.integers(0, 100, 400)
     right = left + rng.integers(1, 100, 400)
     costs = rng.integers(0, 5, 400).astype(float) if equal else rng.normal(size=400)
-    found = greedy.cheapest_disjoint(left, right, costs, limit)
-    assert found.tolist() == slow_matching(left, right, costs, limit)
+    actual = greedy.cheapest_disjoint(left, right, costs, limit)
+    assert actual.tolist() == slow_matching(left, right, costs, limit)
 
 
 def test_every_near_pair_is_there_once() -> None:
@@ -134,8 +134,8 @@ def test_every_near_pair_is_there_once() -> None:
     assert all(i < j for i, j in pairs)
     far = np.linalg.norm(cloud.means[:, None] - cloud.means[None], axis=2)
     nearest = np.argsort(far, 1)[:, 1 : greedy.NEIGHBORS + 1]
-    wanted = {(min(i, int(j)), max(i, int(j))) for i in range(80) for j in nearest[i]}
-    assert set(pairs) == wanted
+    expected = {(min(i, int(j)), max(i, int(j))) for i in range(80) for j in nearest[i]}
+    assert set(pairs) == expected
     assert np.array_equal(costs, greedy.pair_costs(cloud, left, right))
 
 

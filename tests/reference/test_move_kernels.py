@@ -152,12 +152,12 @@ def test_split(colours: np.ndarray, labels: np.ndarray, across: bool) -> None:
         ratios.append(ratio_of(colours[(labels == k) & ~half], colours[half]))
     chosen = [k for k in range(COUNT) if ratios[k] > 0]
     assert 0 < len(chosen) < COUNT
-    found, new_areas = moves.split(pad_labels(labels), colours, areas, PRIOR, across, COUNT)
+    actual, new_areas = moves.split(pad_labels(labels), colours, areas, PRIOR, across, COUNT)
     assert len(new_areas) == COUNT + len(chosen)
     assert new_areas.sum() == pytest.approx(areas.sum())
-    found = found[1:-1, 1:-1]
+    actual = actual[1:-1, 1:-1]
     for k in range(COUNT):
-        parts = np.unique(found[labels == k])
+        parts = np.unique(actual[labels == k])
         assert len(parts) == 1 + (k in chosen)
         assert new_areas[parts] == pytest.approx(areas[k] / len(parts))
     order = sorted(chosen, key=lambda k: -ratios[k])
@@ -180,14 +180,14 @@ def test_merge(colours: np.ndarray, labels: np.ndarray) -> None:
     best = {k: max((p for p in ratios if k in p), key=ratios.__getitem__) for k in range(COUNT)}
     chosen = {p for p in best.values() if best[p[0]] == best[p[1]] and ratios[p] > 0}
     assert 2 < len(chosen) < COUNT // 2
-    found, new_areas = moves.merge(pad_labels(labels), colours, areas, PRIOR, COUNT)
-    found = found[1:-1, 1:-1]
-    assert np.array_equal(np.unique(found), np.arange(COUNT - len(chosen)))
+    actual, new_areas = moves.merge(pad_labels(labels), colours, areas, PRIOR, COUNT)
+    actual = actual[1:-1, 1:-1]
+    assert np.array_equal(np.unique(actual), np.arange(COUNT - len(chosen)))
     for u, v in ratios:
-        assert (len(np.unique(found[(labels == u) | (labels == v)])) == 1) == ((u, v) in chosen)
+        assert (len(np.unique(actual[(labels == u) | (labels == v)])) == 1) == ((u, v) in chosen)
     for k in range(COUNT):
-        parts = [j for j in range(COUNT) if found[labels == j][0] == found[labels == k][0]]
-        assert new_areas[found[labels == k][0]] == pytest.approx(areas[parts].sum())
+        parts = [j for j in range(COUNT) if actual[labels == j][0] == actual[labels == k][0]]
+        assert new_areas[actual[labels == k][0]] == pytest.approx(areas[parts].sum())
     fewer, _ = moves.merge(pad_labels(labels), colours, areas, PRIOR, 1)
     first = max(chosen, key=ratios.__getitem__)
     assert len(np.unique(fewer[1:-1, 1:-1])) == COUNT - 1

@@ -199,8 +199,8 @@ def test_box_holds() -> None:
     assert np.abs(run.x[:, LOGIT] - run.x0[:, LOGIT]).max() <= 4.0001
     assert run.x[:, LOGIT].min() >= MIN_LOGIT
     assert run.x[:, LOGIT].max() <= MAX_LOGIT
-    wanted = np.where(g.colors > 0, np.float32(-0.05), np.float32(1.05))
-    np.testing.assert_allclose(run.x[:, COLOR:], wanted, atol=1e-6)
+    expected = np.where(g.colors > 0, np.float32(-0.05), np.float32(1.05))
+    np.testing.assert_allclose(run.x[:, COLOR:], expected, atol=1e-6)
 
 
 def test_colours_that_begin_outside_the_range_may_stay_there() -> None:

@@ -76,8 +76,8 @@ def test_pool_matches(own: bool, seed: int) -> None:
     groups = [sorted(rng.choice(200, size, replace=False).tolist()) for size in (1, 2, 3, 30, 160)]
     geometry, sh = pooled(members, groups, own)
     for g, rows in enumerate(groups):
-        wanted, wanted_sh = pool_reference(members, rows, own)
-        np.testing.assert_allclose(geometry[g], wanted, rtol=2e-6, atol=1e-10)
+        expected, wanted_sh = pool_reference(members, rows, own)
+        np.testing.assert_allclose(geometry[g], expected, rtol=2e-6, atol=1e-10)
         np.testing.assert_allclose(sh[g], wanted_sh, atol=2e-6)
 
 
@@ -116,8 +116,8 @@ def test_opaque_members_have_a_finite_depth() -> None:
     members["opacities"][:] = 1
     geometry, _ = pooled(members, [[0, 1, 2]])
     assert np.isfinite(geometry).all()
-    wanted, _ = pool_reference(members, [0, 1, 2], True)
-    np.testing.assert_allclose(geometry[0], wanted, rtol=2e-6)
+    expected, _ = pool_reference(members, [0, 1, 2], True)
+    np.testing.assert_allclose(geometry[0], expected, rtol=2e-6)
 
 
 def test_far_from_the_origin_nothing_cancels() -> None:
@@ -125,8 +125,8 @@ def test_far_from_the_origin_nothing_cancels() -> None:
     members = random_members(50, 4)
     members["means"] = (members["means"] * 0.05 + 1e4).astype(np.float32)
     geometry, _ = pooled(members, [list(range(50))], False)
-    wanted, _ = pool_reference(members, list(range(50)), False)
-    np.testing.assert_allclose(geometry[0, 3:9], wanted[3:9], rtol=1e-6, atol=1e-9)
+    expected, _ = pool_reference(members, list(range(50)), False)
+    np.testing.assert_allclose(geometry[0, 3:9], expected[3:9], rtol=1e-6, atol=1e-9)
 
 
 def test_empty_groups_stay_zero() -> None:
@@ -167,8 +167,8 @@ def test_decompose_matches_eigh() -> None:
     scales, quats, again = rebuilt(covars)
     size = np.trace(covars, axis1=1, axis2=2)[:, None, None]
     np.testing.assert_allclose(again / size, covars / size, atol=1e-13)
-    wanted = np.linalg.eigvalsh(covars)
-    np.testing.assert_allclose(scales**2, wanted, atol=1e-13, rtol=1e-6)
+    expected = np.linalg.eigvalsh(covars)
+    np.testing.assert_allclose(scales**2, expected, atol=1e-13, rtol=1e-6)
     assert (np.diff(scales, axis=1) >= 0).all()
     np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-14)
     assert (quats[:, 0] >= 0).all()

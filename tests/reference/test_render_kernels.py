@@ -44,16 +44,16 @@ def random_boxes(count: int, lines: int, columns: int) -> np.ndarray:
 @pytest.mark.parametrize(("lines", "columns"), [(1, 1), (1, 9), (9, 1), (5, 7)])
 def test_tile_lists(lines: int, columns: int) -> None:
     boxes, order = random_boxes(200, lines, columns), RNG.permutation(200).astype(np.int32)
-    wanted: list[list[int]] = [[] for _ in range(lines * columns)]
+    expected: list[list[int]] = [[] for _ in range(lines * columns)]
     for k, (x0, x1, y0, y1) in zip(order.tolist(), boxes[order].tolist(), strict=True):
         for y in range(y0, y1):
             for x in range(x0, x1):
-                wanted[y * columns + x].append(k)
+                expected[y * columns + x].append(k)
     counts = binning.count_tiles(boxes, lines, columns)
-    assert counts.tolist() == [len(tile) for tile in wanted]
+    assert counts.tolist() == [len(tile) for tile in expected]
     members, starts = np.full(counts.sum(), -1, np.int32), np.cumsum(counts) - counts
     binning.deal_tiles(order, boxes[order], columns, starts.copy(), members)
-    assert members.tolist() == [k for tile in wanted for k in tile]
+    assert members.tolist() == [k for tile in expected for k in tile]
 
 
 @pytest.mark.parametrize("degree", range(5))

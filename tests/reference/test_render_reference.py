@@ -52,9 +52,9 @@ def reference(gaussians: Gaussians, cameras: Cameras, **options: object) -> Refe
     )  # fmt: skip
 
 
-def assert_alike(image: object, wanted: object, most: float = 0.02) -> None:
+def assert_alike(image: object, expected: object, most: float = 0.02) -> None:
     """Equal up to rounding but for single pixels where a threshold or a depth tie falls the other way."""
-    error = np.abs(np.asarray(image, np.float64) - np.asarray(wanted))
+    error = np.abs(np.asarray(image, np.float64) - np.asarray(expected))
     assert error.max() < most
     assert np.quantile(error, 0.99) < 2e-5
 
@@ -63,11 +63,11 @@ def assert_alike(image: object, wanted: object, most: float = 0.02) -> None:
 def test_images_match(degree: int) -> None:
     gaussians, cameras = random_gaussians(300, degree, degree), turned_camera()
     rendering = render(gaussians, cameras, (0.2, 0.5, 0.9), with_depths=True)
-    wanted = reference(gaussians, cameras, background=(0.2, 0.5, 0.9))
+    expected = reference(gaussians, cameras, background=(0.2, 0.5, 0.9))
     assert rendering.depths is not None
-    assert_alike(rendering.images[0], wanted.image)
-    assert_alike(rendering.alphas[0, ..., 0], 1 - wanted.transmittance)
-    assert_alike(rendering.depths[0, ..., 0], wanted.depth, 0.1)
+    assert_alike(rendering.images[0], expected.image)
+    assert_alike(rendering.alphas[0, ..., 0], 1 - expected.transmittance)
+    assert_alike(rendering.depths[0, ..., 0], expected.depth, 0.1)
 
 
 def test_antialiased_images_match() -> None:
@@ -106,9 +106,9 @@ def test_adjoint_matches_the_weights(channels: int) -> None:
     gaussians, cameras = random_gaussians(200, 0, 11), turned_camera()
     plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
     image = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, channels))
-    wanted = torch.einsum("nhw,hwc->nc", reference(gaussians, cameras).weights, torch.from_numpy(image))
-    np.testing.assert_allclose(splat_adjoint(plan, image), wanted, atol=0.02)
-    assert np.median(np.abs(splat_adjoint(plan, image) - wanted.numpy())) < 1e-5
+    expected = torch.einsum("nhw,hwc->nc", reference(gaussians, cameras).weights, torch.from_numpy(image))
+    np.testing.assert_allclose(splat_adjoint(plan, image), expected, atol=0.02)
+    assert np.median(np.abs(splat_adjoint(plan, image) - expected.numpy())) < 1e-5
 
 
 def test_contributions_match_the_weights() -> None:

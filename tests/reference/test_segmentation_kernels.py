@@ -135,13 +135,13 @@ def greedy_rectangles(pixels: np.ndarray, count: int) -> np.ndarray:
 @pytest.mark.parametrize("count", [1, 2, 3, 20, 200, 391])
 def test_rectangles_are_nearly_the_greedy_ones(pixels: np.ndarray, count: int) -> None:
     padded, num_regions = kd.split_rectangles(pixels, count, 32, COMPACTNESS)
-    found = padded[1:-1, 1:-1]
-    assert num_regions == count == len(np.unique(found))
+    actual = padded[1:-1, 1:-1]
+    assert num_regions == count == len(np.unique(actual))
     for k in range(count):
-        y, x = np.nonzero(found == k)
+        y, x = np.nonzero(actual == k)
         assert len(y) == (np.ptp(y) + 1) * (np.ptp(x) + 1)  # a full rectangle
     # Cuts within an eighth of an octave of each other may come in any order.
-    assert total_error(pixels, found) == pytest.approx(total_error(pixels, greedy_rectangles(pixels, count)), rel=0.01)
+    assert total_error(pixels, actual) == pytest.approx(total_error(pixels, greedy_rectangles(pixels, count)), rel=0.01)
 
 
 def test_rectangles_start_from_blocks(pixels: np.ndarray) -> None:
@@ -259,14 +259,14 @@ def test_sweep_makes_the_moves_that_lower_the_error(backward: bool) -> None:
 
 def slow_parameters(colours: np.ndarray, labels: np.ndarray, count: int) -> list[tuple]:
     """(mean colour, mean position, covariance) of every region, as the model's posterior has them."""
-    area, found = labels.size / count, []
+    area, actual = labels.size / count, []
     for k in range(count):
         y, x = np.nonzero(labels == k)
         places = np.stack([x, y], 1).astype(float)
         off = places - places.mean(0)
         covariance = (area**2 * np.eye(2) + off.T @ off) / (len(x) + 50 * area - 3)
-        found.append((colours[labels == k].mean(0), places.mean(0), covariance))
-    return found
+        actual.append((colours[labels == k].mean(0), places.mean(0), covariance))
+    return actual
 
 
 def test_bass_parameters(pixels: np.ndarray, labels: np.ndarray) -> None:
@@ -355,9 +355,9 @@ def slow_dither(density: np.ndarray) -> np.ndarray:
 
 def test_dither(pixels: np.ndarray) -> None:
     density = pixels[..., 0].astype(np.float64) ** 2
-    found = seeds.dither(density)
-    assert np.array_equal(found, slow_dither(density))
-    assert found.sum() == pytest.approx(density.sum(), rel=0.1)
+    actual = seeds.dither(density)
+    assert np.array_equal(actual, slow_dither(density))
+    assert actual.sum() == pytest.approx(density.sum(), rel=0.1)
 
 
 @pytest.mark.parametrize("count", [1, 5, 60, 117])

@@ -15,11 +15,11 @@ from gsmerge.geometry import quat_to_rotmat
 
 def slow_voxels(gaussians: Gaussians, size: float) -> dict[tuple[int, ...], dict[str, np.ndarray]]:
     """Voxel -> its weighted means."""
-    found: dict[tuple[int, ...], list[int]] = {}
+    actual: dict[tuple[int, ...], list[int]] = {}
     for row, mean in enumerate(gaussians.means.double().numpy()):
-        found.setdefault(tuple(round(x / size) for x in mean), []).append(row)
+        actual.setdefault(tuple(round(x / size) for x in mean), []).append(row)
     result = {}
-    for voxel, rows in found.items():
+    for voxel, rows in actual.items():
         opacities = gaussians.opacities[rows].double().numpy()
         shares = np.exp(opacities) / np.exp(opacities).sum()
         logit = sum(w * np.log(a / (1 - a)) for w, a in zip(shares, opacities, strict=True))

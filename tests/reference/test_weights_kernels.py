@@ -100,10 +100,10 @@ def test_transposed_matches_the_adjoint_and_the_dense_matrix(channels: int) -> N
     sums = apply_transposed(weights, image)
     assert sums.shape == (len(plan.ids), channels)
     assert_allclose(sums, splat_adjoint(plan, image)[plan.ids], atol=2e-4)
-    wanted = dense(weights, 400).T @ image.reshape(-1, channels)
-    assert_allclose(sums, wanted[plan.ids], atol=2e-4)
+    expected = dense(weights, 400).T @ image.reshape(-1, channels)
+    assert_allclose(sums, expected[plan.ids], atol=2e-4)
     left_out = np.setdiff1d(np.arange(400), plan.ids)
-    assert not wanted[left_out].any()
+    assert not expected[left_out].any()
 
 
 def test_apply_and_transposed_are_adjoint() -> None:
@@ -127,12 +127,12 @@ def test_masses_match_contributions(case: tuple[int, int, float]) -> None:
 def test_weights_match_the_slow_renderer() -> None:
     gaussians = random_gaussians(200, 7)
     _, weights = planned(gaussians)
-    wanted = render_reference(
+    expected = render_reference(
         gaussians.means.double(), gaussians.quats.double(), gaussians.scales.double(), gaussians.opacities.double(),
         torch.zeros(200, 3, dtype=torch.float64), torch.eye(4, dtype=torch.float64), torch.from_numpy(K),
         WIDTH, HEIGHT,
     ).weights  # fmt: skip
-    error = np.abs(dense(weights, 200).T - wanted.reshape(200, -1).numpy())
+    error = np.abs(dense(weights, 200).T - expected.reshape(200, -1).numpy())
     assert np.quantile(error, 0.999) < 1e-5
     assert error.max() < 0.02  # single pixels where a threshold falls the other way
 

@@ -34,11 +34,11 @@ def test_flyaways_do_not_disturb_the_rest(room: PixelScene, settings: dict) -> N
     means[rows] = eyes + 1e5 * (means[rows] - eyes)
     scene = replace(room, gaussians=replace(room.gaussians, means=means))
     assert find_frame(scene).unit == find_frame(room).unit
-    clean, found = scenes.compacted(room, **settings), scenes.compacted(scene, **settings)
-    assert abs(len(found.gaussians) - len(clean.gaussians)) <= 2 * len(rows)
-    near = found.gaussians[found.gaussians.means.norm(dim=1) < 10]
-    assert len(near) >= len(found.gaussians) - len(rows)
-    assert scenes.psnr_of(found.gaussians, room) > scenes.psnr_of(clean.gaussians, room) - 0.7
+    clean, actual = scenes.compacted(room, **settings), scenes.compacted(scene, **settings)
+    assert abs(len(actual.gaussians) - len(clean.gaussians)) <= 2 * len(rows)
+    near = actual.gaussians[actual.gaussians.means.norm(dim=1) < 10]
+    assert len(near) >= len(actual.gaussians) - len(rows)
+    assert scenes.psnr_of(actual.gaussians, room) > scenes.psnr_of(clean.gaussians, room) - 0.7
 
 
 # 37: coordinates of maps

@@ -56,8 +56,8 @@ def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
 def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", noisy())
-    found = gsmerge.compact(scene, fit="none", superpixels="10%", checkpoint=str(path), **settings)
-    for result in (found, *found.coarser):
+    actual = gsmerge.compact(scene, fit="none", superpixels="10%", checkpoint=str(path), **settings)
+    for result in (actual, *actual.coarser):
         assert result.report.choices["networks"]["checkpoint"] == str(path)
     rival = gsmerge.compact(scene, method="random", checkpoint=str(path))
     assert "networks" not in rival.report.choices

@@ -43,12 +43,12 @@ def test_exposure_that_changes_between_views(room: PixelScene) -> None:
     assert room.images is not None
     factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
     merged = scenes.compacted(painted(room, 0.8 * room.images), fit="none").gaussians
-    found = []
+    actual = []
     for images in (0.8 * room.images, 0.8 * room.images * factors):
         photos = scene_photos(replace(room, images=images), 2)
-        found.append(fit_colors(merged, draw(merged, photos), photos, FitOptions())[0])
+        actual.append(fit_colors(merged, draw(merged, photos), photos, FitOptions())[0])
     surfaces = [scenes.Surface(s.shape, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
-    steady, varied = (novel_psnr(g, surfaces) for g in found)
+    steady, varied = (novel_psnr(g, surfaces) for g in actual)
     assert steady > novel_psnr(merged, surfaces) + 1
     assert varied > steady - 0.2
 
@@ -104,16 +104,16 @@ def shiny(scene: PixelScene, strength: float) -> PixelScene:
 @pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
 def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
     scene = shiny(room, 0.3)
-    found = scenes.compacted(scene, **settings).gaussians
-    assert found.sh_degree == 3
-    stripped = replace(found, shN=torch.zeros_like(found.shN))
-    assert scenes.psnr_of(found, scene) > scenes.psnr_of(stripped, scene) + 3
+    actual = scenes.compacted(scene, **settings).gaussians
+    assert actual.sh_degree == 3
+    stripped = replace(actual, shN=torch.zeros_like(actual.shN))
+    assert scenes.psnr_of(actual, scene) > scenes.psnr_of(stripped, scene) + 3
 
 
 def test_equal_harmonics_stay_equal(room: PixelScene) -> None:
     scene = shiny(room, 0.3)
-    found = scenes.plain(scene)
-    np.testing.assert_allclose(found.shN, scene.gaussians.shN[:1].expand_as(found.shN), atol=1e-5)
+    actual = scenes.plain(scene)
+    np.testing.assert_allclose(actual.shN, scene.gaussians.shN[:1].expand_as(actual.shN), atol=1e-5)
 
 
 def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:

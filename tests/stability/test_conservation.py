@@ -43,16 +43,16 @@ def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
     "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none", "checkpoint": "none"}], ids=str
 )
 def test_more_children_show_more(scene: PixelScene, settings: dict) -> None:
-    found = [scenes.compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
-    assert (np.diff([len(g) for g in found]) > 0).all()
-    assert (np.diff([scenes.psnr_of(g, scene) for g in found]) > -0.05).all()
+    actual = [scenes.compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
+    assert (np.diff([len(g) for g in actual]) > 0).all()
+    assert (np.diff([scenes.psnr_of(g, scene) for g in actual]) > -0.05).all()
 
 
 @pytest.mark.parametrize("fit", ["color", "full"])
 def test_more_superpixels_show_more(scene: PixelScene, fit: str) -> None:
-    found = [scenes.compacted(scene, superpixels=share, fit=fit).gaussians for share in ("1%", "3%", "10%")]
-    assert (np.diff([len(g) for g in found]) > 0).all()
-    assert (np.diff([scenes.psnr_of(g, scene) for g in found]) > -0.05).all()
+    actual = [scenes.compacted(scene, superpixels=share, fit=fit).gaussians for share in ("1%", "3%", "10%")]
+    assert (np.diff([len(g) for g in actual]) > 0).all()
+    assert (np.diff([scenes.psnr_of(g, scene) for g in actual]) > -0.05).all()
 
 
 # 48: coverage and brightness
@@ -107,8 +107,8 @@ def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
     opacities = 0.05 * torch.ones_like(scene.gaussians.opacities)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
     usual = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
-    found = scenes.compacted(faint, superpixels="4.4%", **settings).gaussians
-    assert len(found) > 0.8 * len(usual)
+    actual = scenes.compacted(faint, superpixels="4.4%", **settings).gaussians
+    assert len(actual) > 0.8 * len(usual)
 
 
 @pytest.mark.parametrize("match", ["overlap", "none"])
@@ -117,11 +117,11 @@ def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None
     renderer, which thickens small Gaussians, does not count."""
     opacities = 0.05 * torch.ones_like(clean.gaussians.opacities)
     faint = replace(clean, gaussians=replace(clean.gaussians, opacities=opacities))
-    found = scenes.plain(faint, match=match)
+    actual = scenes.plain(faint, match=match)
     Ks = clean.cameras.Ks.clone()
     Ks[:, :2] *= 4
     fine = replace(clean.cameras[:1], Ks=Ks[:1], width=4 * clean.cameras.width, height=4 * clean.cameras.height)
-    before, after = (scenes.images_of(g, fine)[1].mean() for g in (faint.gaussians, found))
+    before, after = (scenes.images_of(g, fine)[1].mean() for g in (faint.gaussians, actual))
     assert after == pytest.approx(before, rel=0.1)
 
 

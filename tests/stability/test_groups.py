@@ -58,18 +58,18 @@ def test_coincident_members_stack(small: PixelScene) -> None:
     a, b = (covariances(g.quats.double(), g.scales.double())[0] for g in (merged, one))
     np.testing.assert_allclose(a, b + floor, rtol=1e-4, atol=1e-8)
     discs = [float(g.scales[0].double().sort().values[1:].prod()) for g in (merged, one)]
-    wanted = 1 - (1 - 0.02) ** (count * discs[1] / discs[0])
-    assert float(merged.opacities[0]) == pytest.approx(wanted, rel=1e-4)
+    expected = 1 - (1 - 0.02) ** (count * discs[1] / discs[0])
+    assert float(merged.opacities[0]) == pytest.approx(expected, rel=1e-4)
 
 
 # 2: one member is left as it is
 
 
 def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
-    found = scenes.plain(small, superpixels="100%")
-    order = torch.cdist(small.gaussians.means, found.means).argmin(1)
-    assert len(order.unique()) == len(found) == len(small.gaussians)
-    own, kept = small.gaussians, found[order]
+    actual = scenes.plain(small, superpixels="100%")
+    order = torch.cdist(small.gaussians.means, actual.means).argmin(1)
+    assert len(order.unique()) == len(actual) == len(small.gaussians)
+    own, kept = small.gaussians, actual[order]
     np.testing.assert_allclose(kept.means, own.means, atol=1e-6)
     np.testing.assert_allclose(kept.sh0, own.sh0, atol=1e-6)
     np.testing.assert_allclose(kept.opacities, own.opacities, atol=0.03)  # the floor of a tenth of a pixel
@@ -89,9 +89,9 @@ def test_flat_groups_have_a_smallest_scale(small: PixelScene, axes: list[int]) -
     means[:, axes] = small.gaussians.means[:, axes]
     scene = changed(small, means=means, scales=torch.full_like(small.gaussians.scales, 1e-9))
     features = one_group_per_view(scene)
-    found = feature_to_gaussians(features)
-    assert float(found.scales.min()) >= 0.0999 * float(features.footprints[0])
-    rotmat = quat_to_rotmat(found.quats.double())[0]
+    actual = feature_to_gaussians(features)
+    assert float(actual.scales.min()) >= 0.0999 * float(features.footprints[0])
+    rotmat = quat_to_rotmat(actual.quats.double())[0]
     assert float(torch.linalg.det(rotmat)) == pytest.approx(1, abs=1e-6)
 
 
@@ -105,16 +105,16 @@ def test_needle_in_a_group(small: PixelScene, size: int) -> None:
     scene.valid.view(-1)[:size] = True
     scales = scene.gaussians.scales.clone()
     scales[0, 0] *= 1e4
-    clean, found = (feature_to_gaussians(one_group_per_view(s)) for s in (scene, changed(scene, scales=scales)))
+    clean, actual = (feature_to_gaussians(one_group_per_view(s)) for s in (scene, changed(scene, scales=scales)))
     extent = max(float(clean.scales.max()), float(scene.gaussians.scales[:size].max()))
-    assert float(found.scales.max()) <= 3 * extent
+    assert float(actual.scales.max()) <= 3 * extent
 
 
 def test_needles_hardly_show(room: PixelScene) -> None:
     scales = room.gaussians.scales.clone()
     scales[::40, 0] *= 1e4
-    clean, found = scenes.plain(room), scenes.plain(changed(room, scales=scales))
-    assert scenes.psnr_of(found, room) > scenes.psnr_of(clean, room) - 1
+    clean, actual = scenes.plain(room), scenes.plain(changed(room, scales=scales))
+    assert scenes.psnr_of(actual, room) > scenes.psnr_of(clean, room) - 1
 
 
 @pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"fit": "color", "k": 4}], ids=str)
@@ -134,8 +134,8 @@ def test_oversized_members_cost_less_than_a_decibel(room: PixelScene, robust: bo
     scales[rows] *= torch.from_numpy(rng.uniform(4, 15, (len(rows), 1)).astype(np.float32))
     settings = {"robust": robust, "fit": "none"}
     clean = scenes.compacted(room, **settings).gaussians
-    found = scenes.compacted(changed(room, scales=scales), **settings).gaussians
-    assert scenes.psnr_of(found, room) > scenes.psnr_of(clean, room) - 1
+    actual = scenes.compacted(changed(room, scales=scales), **settings).gaussians
+    assert scenes.psnr_of(actual, room) > scenes.psnr_of(clean, room) - 1
 
 
 # 7: transparent groups
@@ -146,9 +146,9 @@ def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
     opacities = room.gaussians.opacities.clone().reshape(room.valid.shape)
     opacities[0] = 0
     half = replace(changed(room, opacities=opacities.reshape(-1)), images=None)  # photos would prune what view 0 hides
-    found = scenes.plain(half, k=k, match="none")
+    actual = scenes.plain(half, k=k, match="none")
     others = scenes.plain(scenes.take_views(half, [1, 2]), k=k, match="none")
-    scenes.assert_same_set(found, others, atol=1e-4)
+    scenes.assert_same_set(actual, others, atol=1e-4)
 
 
 @pytest.mark.parametrize("fit", ["color", "full"])
@@ -184,8 +184,8 @@ def test_tiny_changes_make_tiny_changes(room: PixelScene) -> None:
     """Axes may flip, covariances must not."""
     nudge = 1e-7 * torch.randn(room.gaussians.means.shape, generator=torch.Generator().manual_seed(0)).double()
     moved = changed(room, means=room.gaussians.means + nudge)
-    found = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
-    a, b = (covariances(g.quats.double(), g.scales.double()) for g in found)
+    actual = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
+    a, b = (covariances(g.quats.double(), g.scales.double()) for g in actual)
     assert float((a - b).abs().max()) < 1e-6
 
 
@@ -200,9 +200,9 @@ def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
     scales[0] = 5.0
     settings = {"robust": False, "fit": "none"}
     clean = scenes.compacted(room, **settings).gaussians
-    found = scenes.compacted(changed(room, means=means, scales=scales), **settings).gaussians
+    actual = scenes.compacted(changed(room, means=means, scales=scales), **settings).gaussians
     others = scenes.take_views(room, [1, 2])
-    assert abs(scenes.psnr_of(found, others) - scenes.psnr_of(clean, others)) < 0.1
+    assert abs(scenes.psnr_of(actual, others) - scenes.psnr_of(clean, others)) < 0.1
 
 
 @pytest.mark.parametrize("where", ["at", "behind"])
@@ -214,8 +214,8 @@ def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settin
     part = means[:, :8, :24]
     means[:, :8, :24] = eyes if where == "at" else 2 * eyes - part
     scene = changed(room, means=means.reshape(-1, 3))
-    found = scenes.compacted(scene, **settings).gaussians
-    assert scenes.psnr_of(found, scene) > scenes.psnr_of(scene.gaussians, scene) - 6
+    actual = scenes.compacted(scene, **settings).gaussians
+    assert scenes.psnr_of(actual, scene) > scenes.psnr_of(scene.gaussians, scene) - 6
 
 
 # 15, 16: depth edges
@@ -225,8 +225,8 @@ def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settin
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(8e5, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
-    found = scenes.compacted(scene, **settings).gaussians
-    depths = project(found.means, scene.cameras)[1][0]
+    actual = scenes.compacted(scene, **settings).gaussians
+    depths = project(actual.means, scene.cameras)[1][0]
     assert ((depths < 3) | (depths > 4e5)).all()
     assert scene.images is not None
     far = scenes.trace(sky, scene.cameras)[1].reshape(scene.valid.shape) > 1e5
@@ -236,7 +236,7 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
         return float(-10 * np.log10(((image - scene.images.numpy()) ** 2)[far].mean()))  # type: ignore[union-attr]
 
     if settings.get("robust", True):  # one plain layer is not closed, see test_conservation
-        assert sky_psnr(found) > sky_psnr(scene.gaussians) - 0.5
+        assert sky_psnr(actual) > sky_psnr(scene.gaussians) - 0.5
 
 
 TORN = pytest.mark.xfail(reason="one Gaussian cannot be in two places; leaving the fewer members out gained nothing")
@@ -247,8 +247,8 @@ def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
     """Two grey walls, 2 and 4 away: what is merged lies on the one or on the other."""
     grey = scenes.flat(0.5, 0.5, 0.5)
     scene = scenes.make_scene([scenes.plane(2.0, grey, right=0.03), scenes.plane(4.0, grey)], scenes.arc(2))
-    found = scenes.plain(scene, k=k)
-    torn = (found.means[:, 2] - 2).abs().minimum((found.means[:, 2] - 4).abs()) > 0.2
+    actual = scenes.plain(scene, k=k)
+    torn = (actual.means[:, 2] - 2).abs().minimum((actual.means[:, 2] - 4).abs()) > 0.2
     assert not torn.any()
 
 
@@ -284,9 +284,9 @@ def test_near_and_far_details_are_both_kept(settings: dict) -> None:
     ]
     cameras = scenes.arc(3, span=0.004)
     scene = scenes.make_scene(surfaces, cameras)
-    found = scenes.compacted(scene, **settings).gaussians
+    actual = scenes.compacted(scene, **settings).gaussians
     is_near = (scenes.trace(surfaces, cameras)[1] < 1).reshape(scene.valid.shape)
-    drawn = [scenes.images_of(gaussians, cameras)[0].clip(0, 1) for gaussians in (found, scene.gaussians)]
+    drawn = [scenes.images_of(gaussians, cameras)[0].clip(0, 1) for gaussians in (actual, scene.gaussians)]
     for part in (is_near, ~is_near):
         inner = part[:, 1:, 1:] & part[:, :-1, :-1] & part[:, 1:, :-1] & part[:, :-1, 1:]
         detail = [np.abs(np.diff(i, axis=1)[:, :, 1:]) + np.abs(np.diff(i, axis=2)[:, 1:]) for i in drawn]

@@ -49,6 +49,6 @@ def test_a_pruned_export_is_put_back(exporter: ModuleType, root: Path, tmp_path:
     assert loaded.recovery is not None
     assert loaded.recovery.best.layout.kind == "box+depth"
     assert loaded.recovery.best.frame.scale == pytest.approx(1 / 1.7, rel=1e-3)
-    found = loaded.pixel_scene()
-    assert found.num_gaussians == loaded.ply.count
-    assert found.valid.all()  # what was dropped is put back from the depth maps
+    actual = loaded.pixel_scene()
+    assert actual.num_gaussians == loaded.ply.count
+    assert actual.valid.all()  # what was dropped is put back from the depth maps

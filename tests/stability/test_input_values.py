@@ -145,9 +145,9 @@ def test_channel_major_harmonics_of_every_degree(scene_copy: Path, tmp_path: Pat
         shN = torch.arange(64 * higher * 3, dtype=torch.float32).reshape(64, higher, 3)
         path = tmp_path / f"{degree}.ply"
         write_ply(path, Gaussians(few.means, few.quats, few.scales, few.opacities, few.sh0, shN))
-        found = read_ply(path)
-        assert found.info.sh_degree == degree
-        assert torch.equal(found.gaussians.shN, shN)
+        actual = read_ply(path)
+        assert actual.info.sh_degree == degree
+        assert torch.equal(actual.gaussians.shN, shN)
 
 
 def test_coordinates_far_from_the_origin(scene_copy: Path) -> None:

@@ -34,9 +34,9 @@ def chain(count: int, apart: float) -> FeatureGaussians:
 def test_chain_of_a_thousand_does_not_collapse(apart: float) -> None:
     features = chain(1000, apart)
     for size, most in ((None, 7), (4, 4)):  # one of each of the seven views, unless told
-        found = diameters(features, cluster_size=size)
-        assert found.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
-        assert len(found) >= 1000 / most
+        actual = diameters(features, cluster_size=size)
+        assert actual.max() <= 2 * np.sqrt(-8 * np.log(0.7))  # two leaders' reaches: exp(-d^2 / 8) = 0.7
+        assert len(actual) >= 1000 / most
 
 
 def test_chained_wall_stays_covered() -> None:
@@ -55,10 +55,10 @@ def test_chained_wall_stays_covered() -> None:
 
 def test_wall_seen_by_many_views_does_not_collapse() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(6, 32, 24, span=0.2))
-    alone, found = scenes.plain(scene, match="none"), scenes.plain(scene)
-    assert 0.15 * len(alone) < len(found) < len(alone)
+    alone, actual = scenes.plain(scene, match="none"), scenes.plain(scene)
+    assert 0.15 * len(alone) < len(actual) < len(alone)
     single = scenes.plain(scenes.take_views(scene, [0]))
-    coverage = [scenes.images_of(g, scene.cameras[:1])[1].mean() for g in (single, found)]
+    coverage = [scenes.images_of(g, scene.cameras[:1])[1].mean() for g in (single, actual)]
     assert coverage[1] >= coverage[0]
 
 
@@ -76,9 +76,9 @@ def test_two_sides_of_a_sheet_are_not_merged(method: str) -> None:
     footprint = 3 / cameras.width
     sides = [scenes.plane(3 - footprint, grey), scenes.plane(3 + footprint, grey)]
     scene = scenes.make_scene(sides, cameras)
-    found = scenes.compacted(scene, match=method, fit="none", checkpoint="none")
-    assert found.report.choices["clusters"] == found.report.choices["groups"]
-    off = (found.gaussians.means[:, 2] - 3).abs() / footprint
+    actual = scenes.compacted(scene, match=method, fit="none", checkpoint="none")
+    assert actual.report.choices["clusters"] == actual.report.choices["groups"]
+    off = (actual.gaussians.means[:, 2] - 3).abs() / footprint
     assert ((off - 1).abs() < 0.2).all()
 
 

@@ -91,8 +91,8 @@ def test_batches_of_any_size(size: int, made: list[PixelScene], whole: list[Comp
         for scene, one, other in zip(made, whole, batched, strict=True):
             assert len(other) <= 1.1 * len(one)
             count = int(1.5 * len(one))
-            found = [scenes.psnr_of(c.decode(budget=count, **wish), scene) for c in (one, other)]
-            difference.append(found[1] - found[0])
+            actual = [scenes.psnr_of(c.decode(budget=count, **wish), scene) for c in (one, other)]
+            difference.append(actual[1] - actual[0])
         assert np.mean(difference) > -0.3, wish
 
 

@@ -36,8 +36,8 @@ def test_positions_stay_exact_in_wide_pictures() -> None:
     image = np.tile(tile, (1, width // 30, 1))
     start = np.arange(12 * 30).reshape(12, 30) // 30 // 3 * 5 + np.arange(30)[None] // 6  # blocks of 3 x 6
     start = np.concatenate([start + 20 * i for i in range(width // 30)], 1)
-    found = refine(pad_labels(start), image, 20 * width // 30, 2, np.float32(1e-3**0.5))[1:-1, 1:-1]
-    near, far = found[:, 300:330] - 20 * 10, found[:, -600:-570] - 20 * (width // 30 - 20)
+    actual = refine(pad_labels(start), image, 20 * width // 30, 2, np.float32(1e-3**0.5))[1:-1, 1:-1]
+    near, far = actual[:, 300:330] - 20 * 10, actual[:, -600:-570] - 20 * (width // 30 - 20)
     assert np.count_nonzero(near != start[:, :30]) > 20
     assert np.array_equal(near, far)
 

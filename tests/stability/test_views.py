@@ -146,9 +146,9 @@ DEGREES = (0.0, 0.2, 1.0, 5.0, 20.0)
 
 @pytest.mark.parametrize("fit", ["color", "full"])
 def test_wrong_poses_degrade_step_by_step(room: PixelScene, fit: str) -> None:
-    found = [scenes.compacted(misplaced(room, degrees), fit=fit).report.psnr_after for degrees in DEGREES[:4]]
-    assert all(value is not None for value in found)
-    assert (np.diff(np.array(found, float)) < 0.5).all()
+    actual = [scenes.compacted(misplaced(room, degrees), fit=fit).report.psnr_after for degrees in DEGREES[:4]]
+    assert all(value is not None for value in actual)
+    assert (np.diff(np.array(actual, float)) < 0.5).all()
 
 
 @pytest.mark.parametrize("degrees", DEGREES)
@@ -167,8 +167,8 @@ def test_fit_never_hurts_under_wrong_poses(room: PixelScene, degrees: float, met
 def test_more_views_do_not_hurt() -> None:
     """From a place between the views; matching makes one layer of the views' many, and it must still be closed."""
     between = scenes.make_scene(scenes.room(), scenes.arc(1, 96, 72, start=-0.23))
-    found = []
+    actual = []
     for views in (3, 6):
         scene = scenes.make_scene(scenes.room(), scenes.arc(views, 96, 72), noise=0.01)
-        found.append(scenes.psnr_of(scenes.compacted(scene, superpixels="4.4%").gaussians, between))
-    assert found[1] > found[0] - 0.5
+        actual.append(scenes.psnr_of(scenes.compacted(scene, superpixels="4.4%").gaussians, between))
+    assert actual[1] > actual[0] - 0.5

@@ -171,11 +171,11 @@ def test_scales_have_a_floor() -> None:
 
 def test_footprints_are_depth_over_focal_length() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=1)
-    found = scene_members(scene)
-    assert found.sh0.shape == (3 * 24 * 32, 1, 3)
-    assert found.shN.shape == (3 * 24 * 32, 3, 3)
+    actual = scene_members(scene)
+    assert actual.sh0.shape == (3 * 24 * 32, 1, 3)
+    assert actual.shN.shape == (3 * 24 * 32, 3, 3)
     _, depths, _ = scenes.trace(scenes.room(), scene.cameras)
-    np.testing.assert_allclose(found.footprints, depths.ravel() / 32, rtol=1e-5)
-    for values in (found.means, found.quats, found.scales, found.opacities, found.sh0, found.shN):
+    np.testing.assert_allclose(actual.footprints, depths.ravel() / 32, rtol=1e-5)
+    for values in (actual.means, actual.quats, actual.scales, actual.opacities, actual.sh0, actual.shN):
         assert values.dtype == np.float32
         assert values.flags.c_contiguous

@@ -113,10 +113,10 @@ def test_options_and_settings_combine(scene: PixelScene) -> None:
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_count_is_what_was_asked_for(scene: PixelScene, robust: bool, match: str, k: int) -> None:
     """The backing layer is part of it."""
-    found = scenes.compacted(scene, superpixels=40, robust=robust, match=match, k=k, fit="color")
-    assert len(found.gaussians) <= 3 * 40 * k
+    actual = scenes.compacted(scene, superpixels=40, robust=robust, match=match, k=k, fit="color")
+    assert len(actual.gaussians) <= 3 * 40 * k
     if match == "none" and not robust:
-        assert len(found.gaussians) >= 0.95 * 3 * 40 * k
+        assert len(actual.gaussians) >= 0.95 * 3 * 40 * k
 
 
 @pytest.mark.parametrize("superpixels", [1, 2, 3, 768])
@@ -138,9 +138,9 @@ def test_every_segmentation(scene: PixelScene, segmentation: str) -> None:
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_paper_rule(scene: PixelScene, k: int) -> None:
     """The baseline's Gaussians, children too, have their members' mean opacity."""
-    found = scenes.plain(scene, rule="paper", match="none", k=k).opacities
-    assert float(found.max()) <= float(scene.gaussians.opacities.max()) + 1e-4
-    assert float(found.min()) >= float(scene.gaussians.opacities.min()) - 1e-4
+    actual = scenes.plain(scene, rule="paper", match="none", k=k).opacities
+    assert float(actual.max()) <= float(scene.gaussians.opacities.max()) + 1e-4
+    assert float(actual.min()) >= float(scene.gaussians.opacities.min()) - 1e-4
     scenes.plain(scene, rule="paper", match="aabb", k=k)
 
 
@@ -151,18 +151,18 @@ def test_harmonics_keep_their_degree(degree: int) -> None:
 
 
 def test_result_is_in_world_coordinates(scene: PixelScene) -> None:
-    found = scenes.plain(scene)
+    actual = scenes.plain(scene)
     low, high = scene.gaussians.means.aminmax(dim=0)
-    assert found.means.dtype == torch.float64
-    assert (found.means >= low - 0.2).all()
-    assert (found.means <= high + 0.2).all()
+    assert actual.means.dtype == torch.float64
+    assert (actual.means >= low - 0.2).all()
+    assert (actual.means <= high + 0.2).all()
 
 
 def test_result_can_be_used_like_any_tensor(scene: PixelScene) -> None:
     """Changed in place, and differentiated through."""
-    found = compact(scene).gaussians
+    actual = compact(scene).gaussians
     for name in scenes.FIELDS:
-        tensor = getattr(found, name)
+        tensor = getattr(actual, name)
         tensor.add_(0)
         tensor.clone().requires_grad_().sum().backward()
         (tensor * torch.ones(1, requires_grad=True)).sum().backward()
@@ -172,8 +172,8 @@ def test_double_precision_input(scene: PixelScene) -> None:
     columns = {name: getattr(scene.gaussians, name).double() for name in scenes.FIELDS}
     assert scene.images is not None
     doubled = replace(scene, gaussians=replace(scene.gaussians, **columns), images=scene.images.double())
-    found = [scenes.compacted(s, fit="color").gaussians for s in (doubled, scene)]
-    scenes.assert_same_set(*found, atol=1e-4)
+    actual = [scenes.compacted(s, fit="color").gaussians for s in (doubled, scene)]
+    scenes.assert_same_set(*actual, atol=1e-4)
     assert scenes.psnr_of(scenes.compacted(doubled).gaussians, scene) == pytest.approx(
         scenes.psnr_of(scenes.compacted(scene).gaussians, scene), abs=1.5
     )
@@ -215,12 +215,12 @@ def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -
     starts = set()
     for one in (scenes.make_scene(scenes.wall(), scenes.arc(3, 32, 24), opacity=(0.99, 0.99)), scene):
         for settings in ({"fit": "none"}, {"fit_steps": 12}):
-            found = scenes.compacted(one, **settings)
-            scores = found.report.choices["start_scores"]
+            actual = scenes.compacted(one, **settings)
+            scores = actual.report.choices["start_scores"]
             networks = scores["learned"] > scores["analytic"]
-            assert ("networks" in found.report.choices) == networks
+            assert ("networks" in actual.report.choices) == networks
             alone = scenes.compacted(one, **settings, checkpoint="shipped" if networks else "none")
-            assert scenes.identical(found.gaussians, alone.gaussians)
+            assert scenes.identical(actual.gaussians, alone.gaussians)
             starts.add(networks)
     assert starts == {False, True}
 
@@ -234,13 +234,13 @@ def test_networks_are_left_out(scene: PixelScene, settings: dict) -> None:
 
 
 def test_networks_without_photos_are_judged_by_the_colours_of_the_pixels(scene: PixelScene) -> None:
-    found = scenes.compacted(replace(scene, images=None)).report.choices["start_scores"]
+    actual = scenes.compacted(replace(scene, images=None)).report.choices["start_scores"]
     with_photos = scenes.compacted(scene, fit="none", robust=False).report.choices["start_scores"]
-    assert found == pytest.approx(with_photos, abs=0.5)
+    assert actual == pytest.approx(with_photos, abs=0.5)
 
 
 @pytest.mark.parametrize("k", [1, 2, 4, 8])
 def test_a_budget_is_met_whatever_k_is_and_however_the_fit_grows(scene: PixelScene, k: int) -> None:
-    found = scenes.compacted(scene, k=k, budget=300, fit_steps=160)
-    assert found.report.choices["fit"]["accepted"]
-    assert len(found.gaussians) == 300
+    actual = scenes.compacted(scene, k=k, budget=300, fit_steps=160)
+    assert actual.report.choices["fit"]["accepted"]
+    assert len(actual.gaussians) == 300

@@ -143,29 +143,29 @@ def rises(count: int) -> float:
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
 @pytest.mark.parametrize("target", [17.0, 20.0, 23.3, 27.0])
 def test_search_finds_the_fewest(start: int, target: float) -> None:
-    found = search_count(rises, target, start, 10, 100_000)
+    actual = search_count(rises, target, start, 10, 100_000)
     fewest = 1000 * 2 ** ((target - 20) / 2)
-    assert found.met
-    assert found.psnr == rises(found.count) >= target
-    assert found.count <= max(2.5 * fewest, 10)
-    assert (found.count, found.psnr) in found.tried
-    assert len(found.tried) <= 6
+    assert actual.met
+    assert actual.psnr == rises(actual.count) >= target
+    assert actual.count <= max(2.5 * fewest, 10)
+    assert (actual.count, actual.psnr) in actual.tried
+    assert len(actual.tried) <= 6
 
 
 def test_search_near_the_answer_ends_close_to_it() -> None:
-    found = search_count(rises, 24.0, 3000, 10, 100_000)
-    assert 4000 <= found.count <= 4000 * 1.3
+    actual = search_count(rises, 24.0, 3000, 10, 100_000)
+    assert 4000 <= actual.count <= 4000 * 1.3
 
 
 def test_search_says_when_it_is_out_of_reach() -> None:
-    found = search_count(rises, 40.0, 1000, 10, 5000)
-    assert not found.met
-    assert (found.count, found.psnr) == (5000, rises(5000))
+    actual = search_count(rises, 40.0, 1000, 10, 5000)
+    assert not actual.met
+    assert (actual.count, actual.psnr) == (5000, rises(5000))
 
 
 def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
-    found = search_count(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
-    assert (found.met, found.count) == (False, 1000)
+    actual = search_count(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
+    assert (actual.met, actual.count) == (False, 1000)
 
 
 def test_search_stays_within_its_limits() -> None:

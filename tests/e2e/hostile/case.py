@@ -49,9 +49,9 @@ def cameras_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def without_transforms(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """:func:`cameras_of`; the file is removed, so that another kind takes its place."""
-    found = cameras_of(folder)
+    actual = cameras_of(folder)
     (folder / "transforms.json").unlink()
-    return found
+    return actual
 
 
 def names() -> list[str]:

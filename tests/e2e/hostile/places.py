@@ -119,11 +119,11 @@ for thing, make in {"loop": loop, "ring": ring, "pipe": os.mkfifo, "folder": os.
     CASES[f"images as a {thing}"] = Case(replaced("images", make), EITHER)
     CASES[f"an image as a {thing}"] = Case(replaced("images/view_000.png", make))
     for option, name in (("--cameras", "c.json"), ("--cameras", "c.npz"), ("--cameras", "c.txt"), ("--images", "i")):
-        told = given(option, f"{{}}/{name}", make=lambda folder, make=make, name=name: make(folder / name))
-        CASES[f"{option} {name}, a {thing}"] = Case(told)
+        said = given(option, f"{{}}/{name}", make=lambda folder, make=make, name=name: make(folder / name))
+        CASES[f"{option} {name}, a {thing}"] = Case(said)
     for suffix in ("ply", "npz"):
-        told = given("-o", f"{{}}/out.{suffix}", make=lambda f, make=make, suffix=suffix: make(f / f"out.{suffix}"))
-        CASES[f"output out.{suffix}, a {thing}"] = Case(told, (0, 2, 3))
+        said = given("-o", f"{{}}/out.{suffix}", make=lambda f, make=make, suffix=suffix: make(f / f"out.{suffix}"))
+        CASES[f"output out.{suffix}, a {thing}"] = Case(said, (0, 2, 3))
 CASES |= {
     "links to all files": Case(given(make=linked), READ),
     "images in an endless folder": Case(replaced("images", endless), EITHER),

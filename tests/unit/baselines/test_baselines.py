@@ -89,8 +89,8 @@ def test_scenes_without_an_order(scene: PixelScene, method: str) -> None:
 
 @pytest.mark.parametrize("method", ["unmerged", "opacity", "contribution", "voxel", "greedy"])
 def test_the_order_of_the_rows_does_not_matter(scene: PixelScene, method: str) -> None:
-    found = [compact(loose.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
-    scenes.assert_same_set(*found, atol=1e-4)
+    actual = [compact(loose.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
+    scenes.assert_same_set(*actual, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", OWN)
@@ -150,9 +150,9 @@ def test_only_its_stages_are_timed(scene: PixelScene) -> None:
 
 
 def test_unmerged_is_the_input(scene: PixelScene) -> None:
-    found = made(scene, "unmerged")
-    scenes.assert_same_set(found.gaussians, scene.gaussians, atol=1e-5)
-    assert found.report.psnr_after == pytest.approx(found.report.psnr_before, abs=1e-3)
+    actual = made(scene, "unmerged")
+    scenes.assert_same_set(actual.gaussians, scene.gaussians, atol=1e-5)
+    assert actual.report.psnr_after == pytest.approx(actual.report.psnr_before, abs=1e-3)
 
 
 def test_colors_alone_are_solved(scene: PixelScene) -> None:
@@ -167,9 +167,9 @@ def test_colors_alone_are_solved(scene: PixelScene) -> None:
 
 def test_the_same_fit_for_the_input(scene: PixelScene) -> None:
     """By steps, or by time; whatever ``fit`` says."""
-    found = made(scene, "unmerged-fit", fit_steps=20, fit="color")
-    assert (found.report.choices["fit"]["method"], found.report.choices["fit"]["steps"]) == ("full", 20)
-    assert "method unmerged-fit does not use fit, budget" in found.report.notes
+    actual = made(scene, "unmerged-fit", fit_steps=20, fit="color")
+    assert (actual.report.choices["fit"]["method"], actual.report.choices["fit"]["steps"]) == ("full", 20)
+    assert "method unmerged-fit does not use fit, budget" in actual.report.notes
     limited = made(scene, "unmerged-fit", fit_steps=20, time_budget=1e-3).report.choices["fit"]
     assert limited["steps"] < 20
 
@@ -225,14 +225,14 @@ def test_blocks_are_about_equal() -> None:
 def test_one_gaussian_for_each_superpixel_has_their_mean_opacity() -> None:
     """The paper's rule: the spread of the means, the mean opacity."""
     flat = scenes.make_scene(scenes.wall(), scenes.arc(2, 32, 24), opacity=(0.7, 0.7))
-    found = made(flat, "moment-matching").gaussians
-    torch.testing.assert_close(found.opacities, torch.full((COUNT,), 0.7), atol=1e-4, rtol=0)
+    actual = made(flat, "moment-matching").gaussians
+    torch.testing.assert_close(actual.opacities, torch.full((COUNT,), 0.7), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("degree", [0, 2])
 @pytest.mark.parametrize("method", OWN)
 def test_harmonics_are_kept(method: str, degree: int) -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 24, 16), degree=degree)
-    found = made(scene, method, budget=50).gaussians
-    assert found.sh_degree == degree
-    assert degree == 0 or float(found.shN.abs().max()) > 0.01
+    actual = made(scene, method, budget=50).gaussians
+    assert actual.sh_degree == degree
+    assert degree == 0 or float(actual.shN.abs().max()) > 0.01

@@ -27,7 +27,7 @@ def touch(*names: str) -> None:
         Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n")
 
 
-def found(*given: str, out: Path = OUT) -> list[str]:
+def actual(*given: str, out: Path = OUT) -> list[str]:
     return [str(scene) for scene in find_scenes(given, out)]
 
 
@@ -38,27 +38,27 @@ def outputs(*given: str, options: BatchOptions | None = None, own: set[str] | No
 def test_folders_are_searched() -> None:
     touch("all/b/scene.ply", "all/b/other.ply", "all/a/x.ply", "all/a/y.ply", "all/deep/er/gs_ply/0000.ply")
     touch("all/inria/point_cloud/iteration_7000/point_cloud.ply", "all/inria/input.ply", "all/z.ply")
-    wanted = ["all/z.ply", "all/a/x.ply", "all/a/y.ply", "all/b", "all/deep/er", "all/inria"]
-    assert found("all") == wanted
+    expected = ["all/z.ply", "all/a/x.ply", "all/a/y.ply", "all/b", "all/deep/er", "all/inria"]
+    assert actual("all") == expected
 
 
 def test_what_is_no_scene_is_passed_by() -> None:
     touch("all/a.ply", "all/a.compact.ply", "all/a.compact.level1.ply", "all/.a-00112233.ply", "all/.hidden/b.ply")
     touch("all/points3D.ply", "all/c/scene.ply", "all/c/images/mask.ply", "all/input/d.ply")
-    assert found("all") == ["all/a.ply", "all/c", "all/input/d.ply"]
+    assert actual("all") == ["all/a.ply", "all/c", "all/input/d.ply"]
 
 
 def test_a_scene_s_own_folders_are_no_scenes_of_their_own() -> None:
     touch("all/scene.ply", "all/gs_ply/0000.ply", "all/more/scene.ply")
-    assert found("all") == ["all", "all/more"]
+    assert actual("all") == ["all", "all/more"]
 
 
 def test_the_output_folder_is_not_searched() -> None:
     touch("all/a.ply", "all/out/a.ply", "all/out/deep/b.ply")
-    assert found("all", out=Path("all/out")) == ["all/a.ply"]
-    assert found("all/*", out=Path("all/out")) == ["all/a.ply"]
+    assert actual("all", out=Path("all/out")) == ["all/a.ply"]
+    assert actual("all/*", out=Path("all/out")) == ["all/a.ply"]
     with pytest.raises(UsageError, match="another folder for the results"):
-        found("all", out=Path("all"))
+        actual("all", out=Path("all"))
 
 
 def test_results_of_former_runs_are_no_scenes() -> None:
@@ -68,21 +68,21 @@ def test_results_of_former_runs_are_no_scenes() -> None:
 
 def test_patterns_and_lists() -> None:
     touch("s/one/scene.ply", "s/two/scene.ply", "s/notes.ply.txt", "s/x.ply")
-    assert found("s/*") == ["s/one", "s/two", "s/x.ply"]
-    assert found("s/**/scene.ply") == ["s/one/scene.ply", "s/two/scene.ply"]
+    assert actual("s/*") == ["s/one", "s/two", "s/x.ply"]
+    assert actual("s/**/scene.ply") == ["s/one/scene.ply", "s/two/scene.ply"]
     Path("s/list.txt").write_text("# mine\none\n\n  x.ply  \ngone.ply\n")
-    assert found("s/list.txt") == ["s/one", "s/x.ply", "s/gone.ply"]  # what is gone fails when its turn comes
+    assert actual("s/list.txt") == ["s/one", "s/x.ply", "s/gone.ply"]  # what is gone fails when its turn comes
 
 
 def test_names_that_look_like_patterns_are_names() -> None:
     touch("run[1]/scene.ply")
-    assert found("run[1]") == ["run[1]"]
+    assert actual("run[1]") == ["run[1]"]
 
 
 def test_links_in_a_circle_end() -> None:
     touch("all/a.ply")
     Path("all/again").symlink_to("..", target_is_directory=True)
-    assert found("all")[0] == "all/a.ply"
+    assert actual("all")[0] == "all/a.ply"
     assert len(outputs("all")) == 1
 
 
@@ -102,7 +102,7 @@ def test_what_holds_no_scene_is_told(given: str, said: str) -> None:
     Path("blank.txt").write_text("\n# nothing\n")
     Path("binary.bin").write_bytes(b"a\0b")
     with pytest.raises(SceneError, match=said) as raised:
-        found(given)
+        actual(given)
     assert given in str(raised.value)
 
 

@@ -123,8 +123,8 @@ try:
 except SceneError as error:
     print(error)
 """
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "lines.jsonl: cannot be written (" in told
+    message = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "lines.jsonl: cannot be written (" in message
     assert path.read_bytes() == whole
 
 
@@ -179,8 +179,8 @@ def test_a_lock_that_cannot_be_made_is_told(tmp_path: Path) -> None:
 
 def test_runs_share_a_folder_if_they_make_the_same(tmp_path: Path) -> None:
     with run_lock(tmp_path, "same"), run_lock(tmp_path, "same"):
-        told = rf"other settings is at work there \(process {os.getpid()}"
-        with pytest.raises(UsageError, match=told), run_lock(tmp_path, "other"):
+        message = rf"other settings is at work there \(process {os.getpid()}"
+        with pytest.raises(UsageError, match=message), run_lock(tmp_path, "other"):
             pass
         with run_lock(tmp_path, "same"):
             pass
@@ -235,9 +235,9 @@ def jobs(*counts: int) -> list[Job]:
 def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plan, "free_memory", lambda: 10**12)
 
-    def spread(count: int, processors: int, **told: Any) -> tuple[int, int]:
-        settings = CompactOptions().with_settings({"threads": told.pop("threads", None)})
-        schedule = make_schedule(jobs(*[1000] * count), BatchOptions(settings, **told), processors=processors)
+    def spread(count: int, processors: int, **message: Any) -> tuple[int, int]:
+        settings = CompactOptions().with_settings({"threads": message.pop("threads", None)})
+        schedule = make_schedule(jobs(*[1000] * count), BatchOptions(settings, **message), processors=processors)
         return schedule.jobs, schedule.threads
 
     assert spread(100, 8) == (8, 1)
@@ -257,8 +257,8 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     scenes = jobs(small, large, small, large, small)
     need = memory_bytes(large, photos=True)
 
-    def schedule(limit: int | None, **told: Any) -> plan.Schedule:
-        return make_schedule(scenes, BatchOptions(max_memory=limit, **told), processors=4)
+    def schedule(limit: int | None, **message: Any) -> plan.Schedule:
+        return make_schedule(scenes, BatchOptions(max_memory=limit, **message), processors=4)
 
     assert schedule(3 * need).jobs == 4
     assert schedule(2 * need).jobs == 2  # the two large ones may come together
@@ -297,12 +297,12 @@ def test_the_summary_has_the_newest_of_every_scene(tmp_path: Path) -> None:
     append_line(tmp_path / RECORDS, record(FAILED, "in/c.ply", "c.ply", error="killed"))
     (tmp_path / ".summary-00112233.csv").touch()  # of a killed run
     assert write_summary(tmp_path) == tmp_path / "summary.csv"
-    found = rows(tmp_path)
-    assert list(found[0]) == list(COLUMNS)
-    assert [(r["output"], r["status"], r["ratio"]) for r in found] == [
+    actual = rows(tmp_path)
+    assert list(actual[0]) == list(COLUMNS)
+    assert [(r["output"], r["status"], r["ratio"]) for r in actual] == [
         ("a.ply", "failed", ""), ("b.ply", "done", "0.5"), ("c.ply", "failed", ""),
     ]  # fmt: skip
-    assert found[0]["error"] == "no, never"
+    assert actual[0]["error"] == "no, never"
     append_line(tmp_path / RECORDS, record(SKIPPED, "in/c.ply", "c.ply"))  # it was still there and as it should be
     write_summary(tmp_path)
     assert [r["status"] for r in rows(tmp_path)] == ["failed", "done", "done"]

@@ -88,8 +88,8 @@ def test_a_new_version_does_it_again(scene: Path, out: Path, monkeypatch: pytest
 def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: Path) -> None:
     networks = tmp_path / "networks.safetensors"
     networks.write_bytes(b"no networks")  # which is a note, and the analytic stages go on
-    told = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(networks)}))
-    assert run(scene, out, told)["status"] == DONE
+    said = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(networks)}))
+    assert run(scene, out, said)["status"] == DONE
     other = Path(shutil.copy(networks, tmp_path / "same.safetensors"))
     same = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(other)}))
     assert run(scene, out, same)["status"] == SKIPPED
@@ -107,14 +107,14 @@ def test_levels_are_part_of_a_result(scene: Path, out: Path) -> None:
 
 @pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".splat"])
 def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
-    told = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
-    found = run(scene, out, told)
-    assert [file["path"] for file in found["files"]] == [f"room{ending}", f"room.level1{ending}"]
-    assert sorted(results(out)) == sorted(file["path"] for file in found["files"])
+    said = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
+    actual = run(scene, out, said)
+    assert [file["path"] for file in actual["files"]] == [f"room{ending}", f"room.level1{ending}"]
+    assert sorted(results(out)) == sorted(file["path"] for file in actual["files"])
     start = {".compressed.ply": b"ply\n", ".spz": b"\x1f\x8b"}.get(ending, b"")
     assert (out / f"room{ending}").read_bytes().startswith(start)
-    assert run(scene, out, told)["status"] == SKIPPED
-    assert run(scene, out)["files"][0]["bytes"] > 2 * found["files"][0]["bytes"]
+    assert run(scene, out, said)["status"] == SKIPPED
+    assert run(scene, out)["files"][0]["bytes"] > 2 * actual["files"][0]["bytes"]
 
 
 def test_a_named_checkpoint_is_no_file(scene: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,11 +126,11 @@ def test_a_named_checkpoint_is_no_file(scene: Path, out: Path, tmp_path: Path, m
 
 def test_a_bad_scene_is_a_record(scene: Path, out: Path) -> None:
     (scene / "scene.ply").write_bytes((scene / "scene.ply").read_bytes()[:5000])
-    found = run(scene, out)
-    assert found["status"] == FAILED
-    assert "truncated or damaged" in found["error"]
-    assert "\n" not in found["error"]
-    assert records(out) == [found]
+    actual = run(scene, out)
+    assert actual["status"] == FAILED
+    assert "truncated or damaged" in actual["error"]
+    assert "\n" not in actual["error"]
+    assert records(out) == [actual]
     assert results(out) == {}
     assert run(scene, out)["status"] == FAILED  # and is tried again
 
@@ -153,8 +153,8 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
     out.mkdir()
     (out / "room.ply").write_bytes(b"mine")
     for _ in range(2):  # the first refusal is no claim
-        found = run(scene, out)
-        assert "exists already, and no batch wrote it; pass --overwrite" in found["error"]
+        actual = run(scene, out)
+        assert "exists already, and no batch wrote it; pass --overwrite" in actual["error"]
         assert (out / "room.ply").read_bytes() == b"mine"
     with scene_lock(out, ["room.ply"]):
         pass  # killed before it was refused
@@ -259,9 +259,9 @@ def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.compact_file.write_gaussians", failing(errno.ENOSPC, out))
-    found = run(scene, out)
-    assert found["status"] == FAILED
-    assert "room.ply: could not be written (No space left on device)" in found["error"]
+    actual = run(scene, out)
+    assert actual["status"] == FAILED
+    assert "room.ply: could not be written (No space left on device)" in actual["error"]
     assert results(out) == {}
     monkeypatch.undo()
     assert run(scene, out)["status"] == DONE
@@ -274,9 +274,9 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
         raise SceneError(path, "cannot be written (No space left on device)")
 
     monkeypatch.setattr(tasks, "append_line", refuse)
-    found = run(scene, out)
-    assert found["status"] == STUCK
-    assert "batch.jsonl: cannot be written (No space left" in found["error"]
+    actual = run(scene, out)
+    assert actual["status"] == STUCK
+    assert "batch.jsonl: cannot be written (No space left" in actual["error"]
     task, context, _ = one_task(scene, out)
     assert record_failure(task, context, "died")["status"] == STUCK
     clean_up(task, context)
@@ -304,9 +304,9 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
     with scene_lock(out, ["room.ply"]):
         (out / ".room-00112233.ply").touch()  # its process died here
         (out / ".room-mine.ply").touch()
-    found = record_failure(replace(task, attempt=2), context, "killed")
-    assert (found["status"], found["error"], found["attempt"]) == (FAILED, "killed", 2)
-    assert records(out) == [found]
+    actual = record_failure(replace(task, attempt=2), context, "killed")
+    assert (actual["status"], actual["error"], actual["attempt"]) == (FAILED, "killed", 2)
+    assert records(out) == [actual]
     assert list(results(out)) == [".room-mine.ply"]
 
 
@@ -362,7 +362,7 @@ def handed_out(pool: Script, context: BatchContext, count: int) -> list[tuple[st
             assert len(pool.tasks) < pool.room  # nothing is asked for before there is room
             yield Task(Job(number, str(number), f"{number}.ply", 0), None)
 
-    return [(found["scene"], found["status"]) for found in dispatch(each(), pool, context)]
+    return [(actual["scene"], actual["status"]) for actual in dispatch(each(), pool, context)]
 
 
 @pytest.fixture

@@ -21,9 +21,9 @@ MOST = 8
 
 @pytest.fixture(scope="module")
 def scene() -> Made:
-    found = made()
-    backing = torch.arange(len(found.features)) % 7 == 3
-    return replace(found, features=replace(found.features, backing=backing))
+    actual = made()
+    backing = torch.arange(len(actual.features)) % 7 == 3
+    return replace(actual, features=replace(actual.features, backing=backing))
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +40,17 @@ def picked(features: FeatureGaussians, division: Division, counts: np.ndarray) -
 @pytest.mark.parametrize("k", range(1, MOST + 1))
 def test_children_of_every_k_are_those_of_the_stage(k: int, scene: Made, division: Division) -> None:
     counts = np.full(len(scene.features), k)
-    wanted, wanted_parents = divide(scene.features, scene.members, counts)
-    found, parents = picked(scene.features, division, counts)
+    expected, wanted_parents = divide(scene.features, scene.members, counts)
+    actual, parents = picked(scene.features, division, counts)
     np.testing.assert_array_equal(parents, wanted_parents)
-    assert scenes.identical(found, wanted)
+    assert scenes.identical(actual, expected)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_any_counts_give_the_stage_s_children(seed: int, scene: Made, division: Division) -> None:
     counts = np.random.default_rng(seed).integers(1, MOST + 3, len(scene.features))
-    wanted, _ = divide(scene.features, scene.members, np.minimum(counts, MOST))
-    assert scenes.identical(picked(scene.features, division, counts)[0], wanted)
+    expected, _ = divide(scene.features, scene.members, np.minimum(counts, MOST))
+    assert scenes.identical(picked(scene.features, division, counts)[0], expected)
 
 
 @pytest.mark.parametrize("extra", [0, 1, 17, 10_000])

@@ -46,10 +46,10 @@ def unfitted(scene: Scene, **settings: Any) -> Gaussians:
 
 def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:
     """What is decoded as it was encoded."""
-    found = decode_scene(encode_scene(scene, **{"superpixels": SHARE, **settings}))
-    assert scenes.identical(found, unfitted(scene, **settings))
-    assert len(found) > 10
-    return found
+    actual = decode_scene(encode_scene(scene, **{"superpixels": SHARE, **settings}))
+    assert scenes.identical(actual, unfitted(scene, **settings))
+    assert len(actual) > 10
+    return actual
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 4])
@@ -64,9 +64,9 @@ def test_one_encoding_gives_every_k_without_photos(k: int, bare: PixelScene, enc
 
 
 def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene, encoded: Encoded) -> None:
-    found = decode_scene(encoded, k=4)
+    actual = decode_scene(encoded, k=4)
     everything = replace(encoded, settings=replace(encoded.settings, min_contribution=0.0))
-    assert len(found) < len(decode_scene(everything, k=4))
+    assert len(actual) < len(decode_scene(everything, k=4))
 
 
 @pytest.mark.parametrize(
@@ -97,21 +97,21 @@ def test_the_same_without_photos(settings: dict[str, Any], bare: PixelScene) -> 
 @pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"k": 4}, {"budget": "7%"}], ids=str)
 def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: PixelScene, tmp_path: Path) -> None:
     checkpoint = written(tmp_path / "networks.safetensors", noisy())
-    found = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
-    assert not scenes.identical(found, unfitted(pixels, **settings))
+    actual = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
+    assert not scenes.identical(actual, unfitted(pixels, **settings))
     kept = encode_scene(pixels, superpixels=SHARE, checkpoint=str(checkpoint), **settings)
     checkpoint.unlink()
     gsmerge.save_encoded(tmp_path / "scene.gsm", kept)
-    assert scenes.identical(decode_scene(gsmerge.load_encoded(tmp_path / "scene.gsm")), found)
+    assert scenes.identical(decode_scene(gsmerge.load_encoded(tmp_path / "scene.gsm")), actual)
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_scenes_in_no_order(k: int, pixels: PixelScene) -> None:
     loose = voxels(pixels, 0.05)
-    found = encode_scene(loose, superpixels="20%")
-    assert found.settings.num_slots is not None
-    assert found.settings.max_k == 8
-    assert scenes.identical(decode_scene(found, k=k), unfitted(loose, k=k, superpixels="20%"))
+    actual = encode_scene(loose, superpixels="20%")
+    assert actual.settings.num_slots is not None
+    assert actual.settings.max_k == 8
+    assert scenes.identical(decode_scene(actual, k=k), unfitted(loose, k=k, superpixels="20%"))
 
 
 def test_shuffled_rows_and_a_budget(pixels: PixelScene) -> None:
@@ -123,9 +123,9 @@ def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: PixelScene)
     loose = shuffled(pixels)
     hidden = far_behind(loose.gaussians, 200)
     both = replace(loose, gaussians=Gaussians.concat([loose.gaussians, hidden]))
-    found = encode_scene(both, superpixels=SHARE, unseen="keep", **settings)
-    assert found.num_kept > 0
-    assert scenes.identical(decode_scene(found), unfitted(both, unseen="keep", **settings))
+    actual = encode_scene(both, superpixels=SHARE, unseen="keep", **settings)
+    assert actual.num_kept > 0
+    assert scenes.identical(decode_scene(actual), unfitted(both, unseen="keep", **settings))
 
 
 def test_a_budget_of_the_decoder_is_met_and_dealt_where_it_helps(encoded: Encoded) -> None:
@@ -147,10 +147,10 @@ def test_more_than_there_is_to_divide_is_told(encoded: Encoded) -> None:
 
 
 def test_auto_takes_what_compact_would_without_photos(bare: PixelScene, encoded_bare: Encoded) -> None:
-    wanted = len(unfitted(bare, budget="auto"))
-    assert encoded_bare.settings.knee_count == wanted
+    expected = len(unfitted(bare, budget="auto"))
+    assert encoded_bare.settings.knee_count == expected
     plan = plan_decode(encoded_bare, budget="auto")
-    assert plan.counts.sum() == max(wanted, len(encoded_bare))
+    assert plan.counts.sum() == max(expected, len(encoded_bare))
     fewer = replace(encoded_bare, settings=replace(encoded_bare.settings, knee_count=len(encoded_bare) - 1))
     plan = plan_decode(fewer, budget="auto")
     assert plan.counts.tolist() == [1] * len(encoded_bare)
@@ -158,8 +158,8 @@ def test_auto_takes_what_compact_would_without_photos(bare: PixelScene, encoded_
 
 
 def test_auto_of_what_was_encoded_so(pixels: PixelScene) -> None:
-    found = encode_scene(pixels, superpixels=SHARE, budget="auto")
-    assert scenes.identical(decode_scene(found), decode_scene(found, budget="auto"))
+    actual = encode_scene(pixels, superpixels=SHARE, budget="auto")
+    assert scenes.identical(decode_scene(actual), decode_scene(actual, budget="auto"))
 
 
 def test_the_result_does_not_depend_on_the_threads(pixels: PixelScene, encoded: Encoded) -> None:

@@ -69,7 +69,7 @@ DAMAGED: dict[str, Spoil] = {
     "most of none": with_settings(most=0),
     "an opacity of two": with_settings(min_opacity=2.0),
     "a share that is none": with_settings(prune=float("nan")),
-    "a negative number": with_settings(wanted=-1),
+    "a negative number": with_settings(expected=-1),
     "a knee of words": with_settings(knee="knee"),
     "slots beyond the children": with_tensor("division.slots", lambda t: t + 8),
     "more splits than slots": with_tensor("division.splits", lambda t: t + 1),
@@ -95,24 +95,24 @@ DAMAGED: dict[str, Spoil] = {
 
 
 def test_everything_comes_back(path: Path, encoded: Encoded) -> None:
-    found = load_encoded(path)
-    assert found.settings == encoded.settings
-    assert found.frame.unit == encoded.frame.unit
-    assert found.about == json.loads(json.dumps(encoded.about))
-    assert len(found) == len(encoded)
-    assert found.heads is not None
+    actual = load_encoded(path)
+    assert actual.settings == encoded.settings
+    assert actual.frame.unit == encoded.frame.unit
+    assert actual.about == json.loads(json.dumps(encoded.about))
+    assert len(actual) == len(encoded)
+    assert actual.heads is not None
     for name, tensor in vars(encoded.features).items():
-        assert torch.equal(getattr(found.features, name), tensor), name
+        assert torch.equal(getattr(actual.features, name), tensor), name
     for k in (1, 2, 4):
-        assert scenes.identical(decode_scene(found, k=k), decode_scene(encoded, k=k))
+        assert scenes.identical(decode_scene(actual, k=k), decode_scene(encoded, k=k))
 
 
 def test_what_no_view_sees_comes_back(encoded: Encoded, tmp_path: Path) -> None:
     kept = replace(encoded, kept=encoded.division.children[:5])
     save_encoded(tmp_path / "kept.gsm", kept)
-    found = load_encoded(tmp_path / "kept.gsm")
-    assert found.num_kept == 5
-    assert scenes.identical(decode_scene(found), decode_scene(kept))
+    actual = load_encoded(tmp_path / "kept.gsm")
+    assert actual.num_kept == 5
+    assert scenes.identical(decode_scene(actual), decode_scene(kept))
 
 
 def test_the_same_scene_gives_the_same_bytes(path: Path, encoded: Encoded, tmp_path: Path) -> None:
@@ -128,22 +128,22 @@ def test_the_source_is_told(encoded: Encoded, tmp_path: Path) -> None:
 
 
 def test_what_is_not_known_is_not_looked_at(path: Path, encoded: Encoded) -> None:
-    told, tensors = header(path), load_file(path)
+    said, tensors = header(path), load_file(path)
     tensors["features.moods"], tensors["state.views"] = torch.full((7,), float("nan")), torch.zeros(3)
-    told |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # older versions wrote a precision
-    told["settings"]["mood"] = "better"
-    save_file(tensors, path, {ENCODED: json.dumps(told), "mood": "best"})
+    said |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # older versions wrote a precision
+    said["settings"]["mood"] = "better"
+    save_file(tensors, path, {ENCODED: json.dumps(said), "mood": "best"})
     assert scenes.identical(decode_scene(load_encoded(path)), decode_scene(encoded))
 
 
 @pytest.mark.parametrize("damage", sorted(DAMAGED))
 def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     DAMAGED[damage](path)
-    with pytest.raises(SceneError) as told:
+    with pytest.raises(SceneError) as said:
         load_encoded(path)
-    assert str(told.value).startswith(f"{path}: ")
-    assert "\n" not in str(told.value)
-    assert len(str(told.value)) < 400 + len(str(path))
+    assert str(said.value).startswith(f"{path}: ")
+    assert "\n" not in str(said.value)
+    assert len(str(said.value)) < 400 + len(str(path))
 
 
 def test_a_newer_schema_says_what_to_do(path: Path) -> None:

@@ -22,9 +22,9 @@ def truth() -> tuple[np.ndarray, np.ndarray]:
 
 
 def assert_equal(path: Path, viewmats: np.ndarray, Ks: np.ndarray) -> None:
-    found = read_cameras(path)
-    np.testing.assert_allclose(found.viewmats.numpy(), viewmats, atol=1e-9)
-    np.testing.assert_allclose(found.Ks.numpy(), Ks, atol=1e-9)
+    actual = read_cameras(path)
+    np.testing.assert_allclose(actual.viewmats.numpy(), viewmats, atol=1e-9)
+    np.testing.assert_allclose(actual.Ks.numpy(), Ks, atol=1e-9)
 
 
 def entries(matrices: np.ndarray) -> list[dict[str, object]]:
@@ -82,13 +82,13 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path, truth: tuple[np.ndarr
     (tmp_path / "pos_avg_inv.txt").write_text("\n".join(" ".join(map(str, row)) for row in move))
     (tmp_path / "scene_scale.txt").write_text("1.35")
     (tmp_path / "input_frame_idx.txt").write_text("2 0")
-    found = read_cameras(path)
+    actual = read_cameras(path)
     point = np.array([0.2, -0.1, 3.0, 1.0])
     moved = np.append(1.35 * (move @ point)[:3], 1.0)
-    for view, viewmat in zip((2, 0), found.viewmats.numpy(), strict=True):
+    for view, viewmat in zip((2, 0), actual.viewmats.numpy(), strict=True):
         seen, truly = (viewmat @ moved)[:3], (viewmats[view] @ point)[:3]
         np.testing.assert_allclose(seen, 1.35 * truly, atol=1e-9)
-    assert found.names == ("2.png", "0.png")
+    assert actual.names == ("2.png", "0.png")
 
 
 def broken(kind: str, folder: Path, viewmats: np.ndarray, Ks: np.ndarray) -> Path:

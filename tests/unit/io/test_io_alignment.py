@@ -23,46 +23,46 @@ def valid_of(tiny: Tiny) -> torch.Tensor:
 
 
 def test_a_scene_aligned_with_jitter(tiny: Tiny) -> None:
-    found = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
-    assert found.ok
-    assert len(found.median_px) == 3
-    assert all(0.05 < m < 0.25 for m in found.median_px)  # the jitter is 0.2 px along each axis
-    assert found.share_in_front == 1
-    assert found.share_within_1px == 1
+    actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
+    assert actual.ok
+    assert len(actual.median_px) == 3
+    assert all(0.05 < m < 0.25 for m in actual.median_px)  # the jitter is 0.2 px along each axis
+    assert actual.share_in_front == 1
+    assert actual.share_within_1px == 1
 
 
 def test_a_known_shift_is_measured(tiny: Tiny) -> None:
     moved = cameras_of(tiny)
     Ks = moved.Ks.clone()
     Ks[1, 0, 2] += 3
-    found = check_alignment(tiny.gaussians, replace(moved, Ks=Ks), valid_of(tiny))
-    assert not found.ok
-    assert found.median_px[1] == pytest.approx(3, abs=0.2)
-    assert found.worst_px == found.median_px[1]
-    assert found.share_within_1px == pytest.approx(2 / 3, abs=0.01)
+    actual = check_alignment(tiny.gaussians, replace(moved, Ks=Ks), valid_of(tiny))
+    assert not actual.ok
+    assert actual.median_px[1] == pytest.approx(3, abs=0.2)
+    assert actual.worst_px == actual.median_px[1]
+    assert actual.share_within_1px == pytest.approx(2 / 3, abs=0.01)
 
 
 def test_rows_that_are_set_aside_do_not_count(tiny: Tiny) -> None:
     means, valid = tiny.gaussians.means.clone(), valid_of(tiny).reshape(-1)
     means[: len(means) // 2] += 100
     valid[: len(means) // 2] = False
-    found = check_alignment(replace(tiny.gaussians, means=means), cameras_of(tiny), valid)
-    assert found.ok
-    assert np.isnan(found.median_px[0])
+    actual = check_alignment(replace(tiny.gaussians, means=means), cameras_of(tiny), valid)
+    assert actual.ok
+    assert np.isnan(actual.median_px[0])
 
 
 def test_a_scene_behind_its_cameras_is_refused(tiny: Tiny) -> None:
     behind = cameras_of(tiny, np.diag([-1.0, -1, -1, 1]) @ tiny.w2c)  # same pixels, but negative depth
-    found = check_alignment(tiny.gaussians, behind, valid_of(tiny))
-    assert not found.ok
-    assert found.share_in_front == 0
-    assert found.median_px == (np.inf,) * 3
+    actual = check_alignment(tiny.gaussians, behind, valid_of(tiny))
+    assert not actual.ok
+    assert actual.share_in_front == 0
+    assert actual.median_px == (np.inf,) * 3
 
 
 def test_large_views_are_sampled_in_all_columns() -> None:
     tiny = make_tiny(200, 250)
-    found = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
-    assert found.ok
+    actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
+    assert actual.ok
     means = tiny.gaussians.means.reshape(3, 250, 200, 3).clone()
     means[:, :, 1::2] += 50  # every other column: a step of two pixels would miss it
     odd = check_alignment(replace(tiny.gaussians, means=means.reshape(-1, 3)), cameras_of(tiny), valid_of(tiny))

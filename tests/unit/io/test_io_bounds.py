@@ -63,9 +63,9 @@ def test_arrays_are_read_by_name(tmp_path: Path) -> None:
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.asfortranarray(np.eye(3, 2)), "c": np.array("text")}
     np.savez_compressed(tmp_path / "a.npz", **arrays, d=np.array([{}]))
     assert array_names(tmp_path / "a.npz") == {"a", "b", "c", "d"}
-    found = read_arrays(tmp_path / "a.npz", ("a", "b", "c", "e"))
-    assert found.keys() == {"a", "b", "c"}
-    assert all(np.array_equal(found[name], arrays[name]) for name in found)
+    actual = read_arrays(tmp_path / "a.npz", ("a", "b", "c", "e"))
+    assert actual.keys() == {"a", "b", "c"}
+    assert all(np.array_equal(actual[name], arrays[name]) for name in actual)
     with pytest.raises(SceneError, match="found objects, which are not read because they could run code"):
         read_arrays(tmp_path / "a.npz", ("d",))
     assert array_names(tmp_path / "none.npz") == frozenset()

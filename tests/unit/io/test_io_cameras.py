@@ -24,13 +24,13 @@ from gsmerge.errors import SceneError
 from gsmerge.io import CameraFile, read_cameras, to_cameras
 
 
-def assert_same(found: CameraFile, tiny: Tiny, *, K: np.ndarray | None = None, atol: float = 1e-9) -> None:
-    assert found.viewmats.dtype == found.Ks.dtype == torch.float64
-    assert np.allclose(found.viewmats, tiny.w2c, atol=atol)
-    assert np.allclose(found.Ks, tiny.K if K is None else K, atol=atol * 100)
-    assert found.widths.tolist() == [tiny.width] * 3
-    assert found.heights.tolist() == [tiny.height] * 3
-    assert len(found) == 3
+def assert_same(actual: CameraFile, tiny: Tiny, *, K: np.ndarray | None = None, atol: float = 1e-9) -> None:
+    assert actual.viewmats.dtype == actual.Ks.dtype == torch.float64
+    assert np.allclose(actual.viewmats, tiny.w2c, atol=atol)
+    assert np.allclose(actual.Ks, tiny.K if K is None else K, atol=atol * 100)
+    assert actual.widths.tolist() == [tiny.width] * 3
+    assert actual.heights.tolist() == [tiny.height] * 3
+    assert len(actual) == 3
 
 
 def save_json(path: Path, data: object) -> Path:
@@ -43,26 +43,26 @@ def save_json(path: Path, data: object) -> Path:
 
 def test_transforms_with_global_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
     write_transforms(tmp_path / "transforms.json", tiny)
-    found = read_cameras(tmp_path / "transforms.json")
-    assert_same(found, tiny)
-    assert found.names == tuple(f"images/{n}" for n in tiny.names)
-    assert found.source == "transforms.json"
-    assert found.images is None
+    actual = read_cameras(tmp_path / "transforms.json")
+    assert_same(actual, tiny)
+    assert actual.names == tuple(f"images/{n}" for n in tiny.names)
+    assert actual.source == "transforms.json"
+    assert actual.images is None
 
 
 def test_transforms_with_intrinsics_of_each_view(tmp_path: Path, tiny: Tiny) -> None:
     data = frames_of(tiny)
     for i, frame in enumerate(data["frames"]):
         frame |= {"fl_x": 10.0 + i, "fl_y": 20.0, "cx": 3.0, "cy": 4.0, "w": 30 + i, "h": 40}
-    found = read_cameras(save_json(tmp_path / "transforms.json", data))
-    assert found.Ks[2].tolist() == [[12, 0, 3], [0, 20, 4], [0, 0, 1]]
-    assert found.widths.tolist() == [30, 31, 32]
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert actual.Ks[2].tolist() == [[12, 0, 3], [0, 20, 4], [0, 0, 1]]
+    assert actual.widths.tolist() == [30, 31, 32]
 
 
 def test_transforms_from_the_angle_of_view(tmp_path: Path, tiny: Tiny) -> None:
     data = {"camera_angle_x": 2 * np.arctan(0.5), "w": 20, "h": 14, "frames": frames_of(tiny)["frames"]}
-    found = read_cameras(save_json(tmp_path / "transforms.json", data))
-    assert np.allclose(found.Ks[0], [[20, 0, 10], [0, 20, 7], [0, 0, 1]])
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert np.allclose(actual.Ks[0], [[20, 0, 10], [0, 20, 7], [0, 0, 1]])
     data |= {"camera_angle_y": 2 * np.arctan(0.25)}
     assert np.allclose(read_cameras(save_json(tmp_path / "t.json", data)).Ks[0, 1, 1], 28)
 
@@ -73,9 +73,9 @@ def test_transforms_without_a_size_take_the_images(tmp_path: Path, tiny: Tiny) -
     for frame in frames:
         frame["file_path"] = frame["file_path"].removesuffix(".png")
     data = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames}
-    found = read_cameras(save_json(tmp_path / "transforms.json", data))
-    assert found.widths.tolist() == [20] * 3
-    assert np.allclose(found.Ks[0], [[20, 0, 10], [0, 20, 7], [0, 0, 1]])
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert actual.widths.tolist() == [20] * 3
+    assert np.allclose(actual.Ks[0], [[20, 0, 10], [0, 20, 7], [0, 0, 1]])
     with pytest.raises(SceneError, match="expected 'w' and 'h', found neither them nor the image"):
         read_cameras(save_json(tmp_path / "images" / "transforms.json", data))
 
@@ -83,11 +83,11 @@ def test_transforms_without_a_size_take_the_images(tmp_path: Path, tiny: Tiny) -
 def test_transforms_with_full_intrinsics_need_no_size(tmp_path: Path, tiny: Tiny) -> None:
     data = frames_of(tiny)
     del data["w"], data["h"]
-    found = read_cameras(save_json(tmp_path / "transforms.json", data))
-    assert found.widths.tolist() == [0] * 3
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
+    assert actual.widths.tolist() == [0] * 3
     with pytest.raises(SceneError, match="expected the image size"):
-        to_cameras(found)
-    assert to_cameras(found, (20, 14)).width == 20
+        to_cameras(actual)
+    assert to_cameras(actual, (20, 14)).width == 20
 
 
 def test_applied_transform_is_not_applied(tmp_path: Path, tiny: Tiny) -> None:
@@ -100,9 +100,9 @@ def test_a_bare_list_is_opencv_and_lacks_intrinsics(tmp_path: Path, tiny: Tiny) 
     with pytest.raises(SceneError, match=r"expected intrinsics .*found none of fl_x, w, h for view a b/2\.png; add"):
         read_cameras(save_json(tmp_path / "transforms.json", frames))
     common = {k: v for k, v in frames_of(tiny).items() if k != "frames"}
-    found = read_cameras(save_json(tmp_path / "transforms.json", [f | common for f in frames]))
-    assert_same(found, tiny)
-    assert found.convention == ("camera-to-world", "OpenCV")
+    actual = read_cameras(save_json(tmp_path / "transforms.json", [f | common for f in frames]))
+    assert_same(actual, tiny)
+    assert actual.convention == ("camera-to-world", "OpenCV")
 
 
 @pytest.mark.parametrize(
@@ -141,10 +141,10 @@ def test_zero_distortion_is_a_pinhole(tmp_path: Path, tiny: Tiny) -> None:
 @pytest.mark.parametrize("place", [".", "sparse/0", "sparse", "colmap/sparse/0", "colmap"])
 def test_colmap_models(tmp_path: Path, tiny: Tiny, write: Callable[[Path, Tiny], None], place: str) -> None:
     write(tmp_path / place, tiny)
-    found = read_cameras(tmp_path)
-    assert_same(found, tiny)
-    assert found.names == tiny.names
-    assert found.convention == ("world-to-camera", "OpenCV")
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny)
+    assert actual.names == tiny.names
+    assert actual.convention == ("world-to-camera", "OpenCV")
 
 
 def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
@@ -201,9 +201,9 @@ def test_inria_cameras(tmp_path: Path, tiny: Tiny) -> None:
     write_inria(tmp_path / "cameras.json", tiny)
     centred = tiny.K.copy()
     centred[:2, 2] = tiny.width / 2, tiny.height / 2
-    found = read_cameras(tmp_path)
-    assert_same(found, tiny, K=centred)
-    assert found.names == ("2", "10", "11")
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny, K=centred)
+    assert actual.names == ("2", "10", "11")
 
 
 def test_inria_cameras_with_something_missing(tmp_path: Path) -> None:
@@ -217,17 +217,17 @@ def test_inria_cameras_with_something_missing(tmp_path: Path) -> None:
 
 def test_npz_with_images(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "exports/npz/results.npz", tiny)
-    found = read_cameras(tmp_path)
-    assert_same(found, tiny, atol=1e-6)
-    assert np.array_equal(found.images, tiny.images)
-    assert found.names == ("view 0", "view 1", "view 2")
+    actual = read_cameras(tmp_path)
+    assert_same(actual, tiny, atol=1e-6)
+    assert np.array_equal(actual.images, tiny.images)
+    assert actual.names == ("view 0", "view 1", "view 2")
 
 
 def test_npz_forms(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "a.npz", tiny, extrinsics=tiny.w2c, image=None)
-    found = read_cameras(tmp_path / "a.npz")
-    assert_same(found, tiny, atol=1e-6)
-    assert found.images is None
+    actual = read_cameras(tmp_path / "a.npz")
+    assert_same(actual, tiny, atol=1e-6)
+    assert actual.images is None
     centred = np.tile(np.array([[22.0, 0, 10], [0, 22, 7], [0, 0, 1]]), (3, 1, 1))
     write_npz(tmp_path / "b.npz", tiny, intrinsics=centred, image=None, depth=None)
     assert_same(read_cameras(tmp_path / "b.npz"), tiny, K=centred, atol=1e-6)
@@ -299,9 +299,9 @@ def test_the_first_place_wins(tmp_path: Path, tiny: Tiny) -> None:
 
 def test_to_cameras_scales_each_axis(tmp_path: Path, tiny: Tiny) -> None:
     write_transforms(tmp_path / "transforms.json", tiny)
-    found = read_cameras(tmp_path)
-    assert np.allclose(to_cameras(found).Ks, tiny.K)
-    scaled = to_cameras(found, (40, 21))
+    actual = read_cameras(tmp_path)
+    assert np.allclose(to_cameras(actual).Ks, tiny.K)
+    scaled = to_cameras(actual, (40, 21))
     assert (scaled.width, scaled.height) == (40, 21)
     assert np.allclose(scaled.Ks, tiny.K * np.array([[2], [1.5], [1]]))
     assert np.allclose(scaled.centres, tiny.c2w[:, :3, 3])
@@ -310,9 +310,9 @@ def test_to_cameras_scales_each_axis(tmp_path: Path, tiny: Tiny) -> None:
 def test_to_cameras_needs_one_size(tmp_path: Path, tiny: Tiny) -> None:
     data = frames_of(tiny)
     data["frames"][1]["w"] = 30
-    found = read_cameras(save_json(tmp_path / "transforms.json", data))
+    actual = read_cameras(save_json(tmp_path / "transforms.json", data))
     with pytest.raises(SceneError, match="expected cameras of one image size, found 20 x 14 and 30 x 14"):
-        to_cameras(found)
+        to_cameras(actual)
 
 
 def test_axes_by_hand(tmp_path: Path) -> None:

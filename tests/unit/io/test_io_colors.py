@@ -45,14 +45,14 @@ SWAPPED = [[0, 1, 2], [1, 0, 2]]
 @pytest.mark.parametrize("true", SWAPPED)
 def test_colours_tell_views_from_one_place_apart(twins: Smooth, true: list[int]) -> None:
     inverse = np.argsort(true)
-    found = recover(clues_of(twins, twins.images[inverse], SWAPPED))
-    assert isinstance(found, Recovery)
-    assert list(found.best.layout.views) == true
-    assert found.margin == pytest.approx(1, abs=0.1)
-    assert found.color_margin is not None
-    assert found.color_margin > COLOR_MARGIN
-    assert "which fits the pixels as well" in found.description
-    assert found.confirmed
+    actual = recover(clues_of(twins, twins.images[inverse], SWAPPED))
+    assert isinstance(actual, Recovery)
+    assert list(actual.best.layout.views) == true
+    assert actual.margin == pytest.approx(1, abs=0.1)
+    assert actual.color_margin is not None
+    assert actual.color_margin > COLOR_MARGIN
+    assert "which fits the pixels as well" in actual.description
+    assert actual.confirmed
 
 
 def test_where_neither_decides_nothing_is_taken(twins: Smooth) -> None:
@@ -81,10 +81,10 @@ def test_the_order_of_names_and_that_of_the_file(tmp_path: Path, twins: Smooth) 
 def test_colours_do_not_overrule_pixels() -> None:
     """Photos in the wrong order: the reading stands, and it is said that the photos do not confirm it."""
     tiny = replace(smooth_scene(48, 36), images=make_tiny(48, 36).images)
-    found = recover(clues_of(tiny, tiny.images))
-    assert found is not None
-    assert found.confirmed is False
-    assert found.description.endswith("the photos' colours do not confirm it")
+    actual = recover(clues_of(tiny, tiny.images))
+    assert actual is not None
+    assert actual.confirmed is False
+    assert actual.description.endswith("the photos' colours do not confirm it")
 
 
 def test_photos_that_agree_or_cannot_tell() -> None:
@@ -92,10 +92,10 @@ def test_photos_that_agree_or_cannot_tell() -> None:
     flat = np.full_like(tiny.images, 128)
     grey = replace(tiny, gaussians=replace(tiny.gaussians, sh0=torch.zeros_like(tiny.gaussians.sh0)))
     for scene, images, confirmed in ((tiny, tiny.images, True), (tiny, None, None), (grey, flat, None)):
-        found = recover(clues_of(scene, images))
-        assert found is not None
-        assert found.confirmed is confirmed
-        assert "confirm" not in found.description
+        actual = recover(clues_of(scene, images))
+        assert actual is not None
+        assert actual.confirmed is confirmed
+        assert "confirm" not in actual.description
 
 
 def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:

@@ -37,10 +37,10 @@ def smooth() -> Tiny:
 
 def home(scene: PixelScene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
     """Share of the valid (or of the kept) pixels whose Gaussian is the one made for them, recognised by its opacity."""
-    found, want = scene.gaussians.opacities, tiny.gaussians.opacities
+    actual, want = scene.gaussians.opacities, tiny.gaussians.opacities
     valid = scene.valid.reshape(-1) if kept is None else torch.from_numpy(kept)
-    assert found.shape == want.shape
-    return float(((found - want).abs() < 1e-5)[valid].double().mean())
+    assert actual.shape == want.shape
+    return float(((actual - want).abs() < 1e-5)[valid].double().mean())
 
 
 def test_depthsplat(tmp_path: Path, smooth: Tiny) -> None:

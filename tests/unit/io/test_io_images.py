@@ -47,16 +47,16 @@ def test_names_with_dots(tmp_path: Path) -> None:
 
 def test_the_longest_path_decides(tmp_path: Path) -> None:
     touch(tmp_path, "left/1.png", "right/1.png")
-    found = match_images(tmp_path, ["right/1", "left/1.png"])
-    assert [p.parent.name for p in found] == ["right", "left"]
+    actual = match_images(tmp_path, ["right/1", "left/1.png"])
+    assert [p.parent.name for p in actual] == ["right", "left"]
     with pytest.raises(SceneError, match=r"expected one image named 1\.png, found 1\.png and 1\.png"):
         match_images(tmp_path, ["1.png", "left/1.png"])
 
 
 def test_unknown_names_take_the_order_if_the_counts_agree(tmp_path: Path) -> None:
     touch(tmp_path, "2.png", "10.png", "1.png", "notes.txt", ".hidden.png")
-    found = match_images(tmp_path, ["view 0", "view 1", "view 2"])
-    assert [p.name for p in found] == ["1.png", "2.png", "10.png"]
+    actual = match_images(tmp_path, ["view 0", "view 1", "view 2"])
+    assert [p.name for p in actual] == ["1.png", "2.png", "10.png"]
     with pytest.raises(SceneError, match="expected 2 images, one per camera, found 3 and none for view 0"):
         match_images(tmp_path, ["view 0", "view 1"])
     with pytest.raises(SceneError, match="expected 3 images, one per camera, found 3 and none for view 1"):

@@ -17,49 +17,49 @@ from gsmerge.measure.inspection_lines import inspection_lines
 
 
 def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
-    found = inspect(tiny_folder)
-    assert found.count == 840
-    assert found.bytes == (tiny_folder / "scene.ply").stat().st_size
-    assert sum(found.bytes_by_attribute.values()) == 840 * 68
-    assert (found.num_views, found.width, found.height) == (3, 20, 14)
-    assert found.camera_format == "transforms.json"
-    assert found.images == str(tiny_folder / "images")
-    assert found.alignment is not None
-    assert found.alignment.ok
-    assert found.alignment_problem is None
-    assert found.notes == ()
+    actual = inspect(tiny_folder)
+    assert actual.count == 840
+    assert actual.bytes == (tiny_folder / "scene.ply").stat().st_size
+    assert sum(actual.bytes_by_attribute.values()) == 840 * 68
+    assert (actual.num_views, actual.width, actual.height) == (3, 20, 14)
+    assert actual.camera_format == "transforms.json"
+    assert actual.images == str(tiny_folder / "images")
+    assert actual.alignment is not None
+    assert actual.alignment.ok
+    assert actual.alignment_problem is None
+    assert actual.notes == ()
     low, high = (torch.quantile(tiny.gaussians.means, q, dim=0).tolist() for q in (0.01, 0.99))
-    assert found.box_low == pytest.approx(low, abs=1e-4)
-    assert found.box_high == pytest.approx(high, abs=1e-4)
+    assert actual.box_low == pytest.approx(low, abs=1e-4)
+    assert actual.box_high == pytest.approx(high, abs=1e-4)
 
 
 def test_it_is_plain_json(tiny_folder: Path) -> None:
-    found = inspect(tiny_folder)
-    document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
-    assert document == found.to_dict()
+    actual = inspect(tiny_folder)
+    document = json.loads(json.dumps(actual.to_dict(), allow_nan=False))
+    assert document == actual.to_dict()
     assert document["alignment"]["ok"] is True
 
 
 def test_a_ply_without_cameras(tmp_path: Path, tiny: Tiny) -> None:
-    found = inspect(tiny.save(tmp_path, cameras=False, images=False) / "scene.ply")
-    assert (found.num_views, found.cameras, found.camera_format, found.images) == (0, None, None, None)
-    assert found.alignment is None
-    assert found.alignment_problem is not None
-    assert "no cameras found" in found.alignment_problem
+    actual = inspect(tiny.save(tmp_path, cameras=False, images=False) / "scene.ply")
+    assert (actual.num_views, actual.cameras, actual.camera_format, actual.images) == (0, None, None, None)
+    assert actual.alignment is None
+    assert actual.alignment_problem is not None
+    assert "no cameras found" in actual.alignment_problem
 
 
 def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> None:
     generator = torch.Generator().manual_seed(0)
     some = torch.randperm(840, generator=generator)[:700]
     write_ply(tiny_folder / "scene.ply", tiny.gaussians[some], overwrite=True)
-    found = inspect(tiny_folder)
-    assert found.num_views == 3
-    assert found.alignment is None
-    assert "expected one Gaussian per pixel" in str(found.alignment_problem)
+    actual = inspect(tiny_folder)
+    assert actual.num_views == 3
+    assert actual.alignment is None
+    assert "expected one Gaussian per pixel" in str(actual.alignment_problem)
     (tiny_folder / "transforms.json").write_text("nonsense")
-    found = inspect(tiny_folder)
-    assert found.num_views == 0
-    assert "expected JSON" in str(found.alignment_problem)
+    actual = inspect(tiny_folder)
+    assert actual.num_views == 0
+    assert "expected JSON" in str(actual.alignment_problem)
 
 
 def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
@@ -75,11 +75,11 @@ def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     scale = start + 5 * 68 + 40
     data[scale : scale + 4] = b"\x00\x00\x20\x42"  # a log scale of 40
     (tiny_folder / "scene.ply").write_bytes(data)
-    found = inspect(tiny_folder)
-    assert (found.num_nonfinite, found.num_zero_quats, found.num_clipped_scales) == (1, 1, 1)
-    assert (found.num_opaque, found.num_transparent) == (3, 5)
-    assert len(found.notes) == 3
-    assert found.alignment is not None
+    actual = inspect(tiny_folder)
+    assert (actual.num_nonfinite, actual.num_zero_quats, actual.num_clipped_scales) == (1, 1, 1)
+    assert (actual.num_opaque, actual.num_transparent) == (3, 5)
+    assert len(actual.notes) == 3
+    assert actual.alignment is not None
 
 
 def test_an_unreadable_ply_is_an_error(tmp_path: Path) -> None:
@@ -93,13 +93,13 @@ def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> 
     means[:7] += 1000
     scales[:21, 1] = 50
     write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, means=means, scales=scales), overwrite=True)
-    found = inspect(tiny_folder).extents
-    assert found.share_outliers == pytest.approx(7 / 840)
-    assert found.share_huge == pytest.approx(21 / 840)
-    assert found.scale_max == pytest.approx(50)
-    assert 0.01 < found.scale_median < 0.11
-    low, high = (torch.tensor(side) for side in (found.box_low, found.box_high))
-    assert found.diagonal == pytest.approx(float((high - low).norm()))
+    actual = inspect(tiny_folder).extents
+    assert actual.share_outliers == pytest.approx(7 / 840)
+    assert actual.share_huge == pytest.approx(21 / 840)
+    assert actual.scale_max == pytest.approx(50)
+    assert 0.01 < actual.scale_median < 0.11
+    low, high = (torch.tensor(side) for side in (actual.box_low, actual.box_high))
+    assert actual.diagonal == pytest.approx(float((high - low).norm()))
 
 
 def test_an_empty_or_single_point_has_extents(tiny: Tiny) -> None:
@@ -113,46 +113,46 @@ def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
     opacities = tiny.gaussians.opacities.clone()
     opacities[280:350] = 0
     write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, opacities=opacities), overwrite=True)
-    found = inspect(tiny_folder)
-    assert [view.share_of_pixels for view in found.coverage] == [1, 0.75, 1]
-    assert [view.name for view in found.coverage] == [f"images/{name}" for name in tiny.names]
-    for view, w2c in zip(found.coverage, tiny.w2c, strict=True):
+    actual = inspect(tiny_folder)
+    assert [view.share_of_pixels for view in actual.coverage] == [1, 0.75, 1]
+    assert [view.name for view in actual.coverage] == [f"images/{name}" for name in tiny.names]
+    for view, w2c in zip(actual.coverage, tiny.w2c, strict=True):
         image = (tiny.gaussians.means.double().numpy() @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
         xy = image[:, :2] / image[:, 2:]
         inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < (20, 14)).all(1)
         assert view.share_of_gaussians == pytest.approx(inside.mean())
-    assert found.alignment_score == 1
-    assert found.alignment_margin is not None
-    assert found.alignment_margin > 2
-    assert found.num_saturated == 70
-    assert found.sight is not None
-    assert found.sight.share_seen == 1
+    assert actual.alignment_score == 1
+    assert actual.alignment_margin is not None
+    assert actual.alignment_margin > 2
+    assert actual.num_saturated == 70
+    assert actual.sight is not None
+    assert actual.sight.share_seen == 1
 
 
 def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
-    found = inspect(tiny_folder)
-    assert found.estimate is not None
+    actual = inspect(tiny_folder)
+    assert actual.estimate is not None
     result = compact(read_scene(tiny_folder), fit="none")
-    assert found.estimate["num_gaussians"] == pytest.approx(len(result.gaussians), abs=3)
+    assert actual.estimate["num_gaussians"] == pytest.approx(len(result.gaussians), abs=3)
     write_ply(tmp_path / "small.ply", result.gaussians)
-    assert found.estimate["bytes"] == pytest.approx((tmp_path / "small.ply").stat().st_size, abs=3 * 68)
-    assert found.estimate["ratio"] == found.estimate["num_gaussians"] / 840
-    assert found.estimate["seconds"] > 0
-    assert found.estimate["memory_bytes"] > 1e8
+    assert actual.estimate["bytes"] == pytest.approx((tmp_path / "small.ply").stat().st_size, abs=3 * 68)
+    assert actual.estimate["ratio"] == actual.estimate["num_gaussians"] / 840
+    assert actual.estimate["seconds"] > 0
+    assert actual.estimate["memory_bytes"] > 1e8
 
 
 def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     smooth = smooth_scene(40, 30)
     some = torch.randperm(3600, generator=torch.Generator().manual_seed(0))[:2400]
     folder = replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
-    found = inspect(folder)
-    assert found.alignment_score is None
-    assert found.sight is not None
-    assert found.sight.ok
-    assert [view.share_of_pixels for view in found.coverage] == [None] * 3
-    assert min(view.share_of_gaussians for view in found.coverage) > 0.2
-    assert found.estimate is not None
-    lines = "\n".join(inspection_lines(found.to_dict()))
+    actual = inspect(folder)
+    assert actual.alignment_score is None
+    assert actual.sight is not None
+    assert actual.sight.ok
+    assert [view.share_of_pixels for view in actual.coverage] == [None] * 3
+    assert min(view.share_of_gaussians for view in actual.coverage) > 0.2
+    assert actual.estimate is not None
+    lines = "\n".join(inspection_lines(actual.to_dict()))
     assert "of the Gaussians per view, least in images/" in lines
     assert "compact    would give about" in lines
     alone = inspect(folder / "scene.ply", cameras=folder / "transforms.json", order="none")

@@ -20,11 +20,11 @@ PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)
 
 def said(path: Path) -> dict[str, str]:
     """The lines by their first word; notes and all lines of one word joined."""
-    found: dict[str, str] = {}
+    actual: dict[str, str] = {}
     for line in inspection_lines(inspect(path).to_dict()):
         word, rest = line[:11].strip(), line[11:]
-        found[word] = f"{found[word]}; {rest}" if word in found else rest
-    return found
+        actual[word] = f"{actual[word]}; {rest}" if word in actual else rest
+    return actual
 
 
 def test_a_plain_export(tmp_path: Path) -> None:
@@ -51,8 +51,8 @@ def test_dropped_pixels(tmp_path: Path) -> None:
     assert f"none for {missing:,} of them; " in lines["alignment"]
     assert lines["note"] == f"{missing:,} pixels that the exporter dropped are put back from the depth maps"
     assert not lines["coverage"].startswith("100 %")
-    found = inspect(tmp_path)
-    assert (found.num_missing, found.per_pixel) == (missing, 1)
+    actual = inspect(tmp_path)
+    assert (actual.num_missing, actual.per_pixel) == (missing, 1)
 
 
 def test_the_camera_inside_the_file(tmp_path: Path) -> None:

@@ -150,10 +150,10 @@ def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
 def test_colmap_models_with_distortion(tmp_path: Path, tiny: Tiny, model: str, params: str, expected: tuple) -> None:
     write_colmap_text(tmp_path, tiny)
     (tmp_path / "cameras.txt").write_text(f"7 {model} 20 14 {params}\n")
-    found = read_cameras(tmp_path)
-    assert [(lens.name, lens.model, lens.coefficients) for lens in found.lenses if lens] == [(model, *expected)] * 3
-    assert found.Ks[0, :2, 2].tolist() == [9, 8]
-    assert len(select_views(found, [1]).lenses) == 1
+    actual = read_cameras(tmp_path)
+    assert [(lens.name, lens.model, lens.coefficients) for lens in actual.lenses if lens] == [(model, *expected)] * 3
+    assert actual.Ks[0, :2, 2].tolist() == [9, 8]
+    assert len(select_views(actual, [1]).lenses) == 1
 
 
 @pytest.mark.parametrize(
@@ -175,9 +175,9 @@ def test_one_lens_among_pinholes(tmp_path: Path, tiny: Tiny) -> None:
     data = frames_of(tiny)
     data["frames"][1]["k1"] = 0.1
     (tmp_path / "transforms.json").write_text(json.dumps(data))
-    found = read_cameras(tmp_path)
-    assert [lens is None for lens in found.lenses] == [True, False, True]
-    assert select_views(found, [0, 2]).lenses == ()
+    actual = read_cameras(tmp_path)
+    assert [lens is None for lens in actual.lenses] == [True, False, True]
+    assert select_views(actual, [0, 2]).lenses == ()
     with pytest.raises(SceneError, match=r"view images/a b/10\.png: expected a pinhole camera"):
-        to_cameras(found)
-    assert to_cameras(select_views(found, [0, 2])).width == 20
+        to_cameras(actual)
+    assert to_cameras(select_views(actual, [0, 2])).width == 20

@@ -85,9 +85,9 @@ def test_every_binary_and_text_form_reads_alike(tmp_path: Path) -> None:
         "text": save(tmp_path / "t.ply", rows, text=True),
         "double": save(tmp_path / "d.ply", double),
     }.items():
-        found = read_ply(path)
+        actual = read_ply(path)
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-            a, b = getattr(found.gaussians, name).double(), getattr(expected, name).double()
+            a, b = getattr(actual.gaussians, name).double(), getattr(expected, name).double()
             assert torch.allclose(a, b, rtol=1e-6, atol=1e-7), (form, name)
     assert read_ply(tmp_path / "d.ply").gaussians.means.dtype == torch.float64
     assert read_ply(tmp_path / "d.ply").gaussians.scales.dtype == torch.float32
@@ -112,20 +112,20 @@ def test_extra_columns_elements_and_comments_do_no_harm(tmp_path: Path) -> None:
     path = save(
         tmp_path / "a.ply", mixed, before=(size, PlyElement.describe(faces, "face")), comments=["made by a test"]
     )
-    found = read_ply(path)
-    assert found.info.extra_columns == ("label", "time")
-    assert found.info.extra_elements == ("image_size", "face")
-    assert found.info.bytes_by_attribute["extra"] == 4 * 9
-    assert torch.equal(found.gaussians.means, read_ply(save(tmp_path / "b.ply", rows)).gaussians.means)
+    actual = read_ply(path)
+    assert actual.info.extra_columns == ("label", "time")
+    assert actual.info.extra_elements == ("image_size", "face")
+    assert actual.info.bytes_by_attribute["extra"] == 4 * 9
+    assert torch.equal(actual.gaussians.means, read_ply(save(tmp_path / "b.ply", rows)).gaussians.means)
 
 
 def test_activated_opacities_are_recognised(tmp_path: Path) -> None:
     rows = columns(3)
     rows["opacity"] = (0.0, 0.25, 1.0)
     path = save(tmp_path / "a.ply", rows)
-    found = read_ply(path)
-    assert found.info.opacity_encoding == "raw"
-    assert found.gaussians.opacities.tolist() == [0.0, 0.25, 1.0]
+    actual = read_ply(path)
+    assert actual.info.opacity_encoding == "raw"
+    assert actual.gaussians.opacities.tolist() == [0.0, 0.25, 1.0]
     forced = read_ply(path, opacity="logit")
     assert forced.info.opacity_encoding == "logit"
     assert forced.gaussians.opacities[0] == 0.5
@@ -142,18 +142,18 @@ def test_our_own_files_are_never_guessed_at(tmp_path: Path) -> None:
         "means", "quats", "scales", "opacities", "sh0", "shN",
     )))  # fmt: skip
     write_ply(tmp_path / "b.ply", faint)  # all logits are 0.405: inside [0, 1]
-    found = read_ply(tmp_path / "b.ply")
-    assert found.info.opacity_encoding == "logit"
-    assert found.gaussians.opacities.tolist() == pytest.approx([0.6] * 3, abs=1e-6)
+    actual = read_ply(tmp_path / "b.ply")
+    assert actual.info.opacity_encoding == "logit"
+    assert actual.gaussians.opacities.tolist() == pytest.approx([0.6] * 3, abs=1e-6)
 
 
 def test_infinite_logits_are_opacities(tmp_path: Path) -> None:
     rows = columns(3)
     rows["opacity"] = (np.inf, -np.inf, 0.0)
-    found = read_ply(save(tmp_path / "a.ply", rows), opacity="logit")
-    assert found.gaussians.opacities.tolist() == [1.0, 0.0, 0.5]
-    assert found.valid.all()
-    assert found.info.num_nonfinite == 0
+    actual = read_ply(save(tmp_path / "a.ply", rows), opacity="logit")
+    assert actual.gaussians.opacities.tolist() == [1.0, 0.0, 0.5]
+    assert actual.valid.all()
+    assert actual.info.num_nonfinite == 0
     rows["opacity"] = (np.inf, -np.inf, -np.inf)
     assert read_ply(save(tmp_path / "b.ply", rows)).info.opacity_encoding == "logit"
 
@@ -162,24 +162,24 @@ def test_infinite_logits_are_opacities(tmp_path: Path) -> None:
 def test_a_row_with_nan_is_set_aside_in_place(tmp_path: Path, name: str) -> None:
     rows = columns(4, 9)
     rows[name][2] = np.nan
-    found = read_ply(save(tmp_path / "a.ply", rows))
-    assert found.valid.tolist() == [True, True, False, True]
-    assert found.info.num_nonfinite == 1
-    one = found.gaussians[2:3]
+    actual = read_ply(save(tmp_path / "a.ply", rows))
+    assert actual.valid.tolist() == [True, True, False, True]
+    assert actual.info.num_nonfinite == 1
+    one = actual.gaussians[2:3]
     assert one.opacities.item() == 0
     assert one.quats.tolist() == [[1, 0, 0, 0]]
-    assert one.means.tolist() == found.gaussians.means[1:2].tolist()
-    assert all(torch.isfinite(getattr(found.gaussians, f)).all() for f in ("means", "quats", "scales", "sh0", "shN"))
-    assert found.gaussians.means[3].tolist() == [rows[c][3] for c in "xyz"]
+    assert one.means.tolist() == actual.gaussians.means[1:2].tolist()
+    assert all(torch.isfinite(getattr(actual.gaussians, f)).all() for f in ("means", "quats", "scales", "sh0", "shN"))
+    assert actual.gaussians.means[3].tolist() == [rows[c][3] for c in "xyz"]
 
 
 def test_infinite_positions_are_set_aside_and_the_first_row_too(tmp_path: Path) -> None:
     rows = columns(3)
     rows["y"][0] = -np.inf
     rows["scale_0"][2] = np.inf
-    found = read_ply(save(tmp_path / "a.ply", rows))
-    assert found.valid.tolist() == [False, True, False]
-    assert found.gaussians.means[0].tolist() == found.gaussians.means[1].tolist()
+    actual = read_ply(save(tmp_path / "a.ply", rows))
+    assert actual.valid.tolist() == [False, True, False]
+    assert actual.gaussians.means[0].tolist() == actual.gaussians.means[1].tolist()
 
 
 def test_numbers_too_large_to_add_are_still_finite(tmp_path: Path) -> None:
@@ -192,23 +192,23 @@ def test_extreme_scales_are_clipped_and_counted(tmp_path: Path) -> None:
     rows = columns(5)
     rows["scale_0"] = (40, -40, 1, -np.inf, 1)
     rows["scale_1"][0] = 50
-    found = read_ply(save(tmp_path / "a.ply", rows))
-    assert found.info.num_clipped_scales == 3
-    assert found.info.num_nonfinite == 0
-    assert torch.isfinite(found.gaussians.scales).all()
-    assert (found.gaussians.scales**2 > 0).all()
-    assert found.gaussians.scales[1, 0].item() == pytest.approx(np.exp(-30.0), rel=1e-5)
+    actual = read_ply(save(tmp_path / "a.ply", rows))
+    assert actual.info.num_clipped_scales == 3
+    assert actual.info.num_nonfinite == 0
+    assert torch.isfinite(actual.gaussians.scales).all()
+    assert (actual.gaussians.scales**2 > 0).all()
+    assert actual.gaussians.scales[1, 0].item() == pytest.approx(np.exp(-30.0), rel=1e-5)
 
 
 def test_zero_and_extreme_quaternions(tmp_path: Path) -> None:
     rows = columns(4)
     for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
         rows[name] = (0, 1e-30, 1e30, 2)
-    found = read_ply(save(tmp_path / "a.ply", rows))
-    assert found.info.num_zero_quats == 1
-    assert found.gaussians.quats[0].tolist() == [1, 0, 0, 0]
+    actual = read_ply(save(tmp_path / "a.ply", rows))
+    assert actual.info.num_zero_quats == 1
+    assert actual.gaussians.quats[0].tolist() == [1, 0, 0, 0]
     for i in (1, 2, 3):
-        assert found.gaussians.quats[i].tolist() == pytest.approx([0.5] * 4, abs=1e-6)
+        assert actual.gaussians.quats[i].tolist() == pytest.approx([0.5] * 4, abs=1e-6)
 
 
 def test_many_blocks_and_any_number_of_threads_give_the_same(tmp_path: Path) -> None:

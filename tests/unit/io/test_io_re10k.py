@@ -111,9 +111,9 @@ def test_some_views_of_many(tmp_path: Path) -> None:
 def test_without_photos(tmp_path: Path) -> None:
     for images in ([], None):
         save(tmp_path, entry(SMOOTH, "a") | {"images": images})
-        found = read_cameras(tmp_path / "000000.torch")
-        assert found.images is None
-        assert np.allclose(found.Ks[:, :2, :2].numpy(), (SMOOTH.K / np.array([[48], [36], [1.0]]))[:2, :2])
+        actual = read_cameras(tmp_path / "000000.torch")
+        assert actual.images is None
+        assert np.allclose(actual.Ks[:, :2, :2].numpy(), (SMOOTH.K / np.array([[48], [36], [1.0]]))[:2, :2])
     SMOOTH.save(tmp_path, cameras=False)
     (tmp_path / "images").rename(tmp_path / "photos")
     assert load_scene(tmp_path, images=tmp_path / "photos").pixel_scene().valid.all()
@@ -178,9 +178,9 @@ def test_wrong_shapes(tmp_path: Path, change: dict[str, Any], message: str) -> N
 
 def test_tensors_that_want_gradients_or_have_no_numbers(tmp_path: Path) -> None:
     given = entry(SMOOTH, "a")
-    wanted = read_cameras(save(tmp_path, given)).viewmats
+    expected = read_cameras(save(tmp_path, given)).viewmats
     assert torch.equal(
-        read_cameras(save(tmp_path, given | {"cameras": rows_of(SMOOTH).requires_grad_()})).viewmats, wanted
+        read_cameras(save(tmp_path, given | {"cameras": rows_of(SMOOTH).requires_grad_()})).viewmats, expected
     )
     empty = torch.empty(len(SMOOTH.names), 18, device="meta")
     with pytest.raises(SceneError, match="expected cameras of numbers"):

@@ -45,16 +45,16 @@ def applied_twice(tiny: Tiny) -> np.ndarray:
     return rows
 
 
-def degrees_off(found: torch.Tensor, tiny: Tiny) -> torch.Tensor:
+def degrees_off(actual: torch.Tensor, tiny: Tiny) -> torch.Tensor:
     """``[n]`` angles between the thinnest axes."""
-    axes = [quat_to_rotmat(quats)[:, :, 2] for quats in (found, tiny.gaussians.quats)]
+    axes = [quat_to_rotmat(quats)[:, :, 2] for quats in (actual, tiny.gaussians.quats)]
     return torch.rad2deg((axes[0] * axes[1]).sum(1).abs().clamp(max=1).acos())
 
 
-def covariance_error(found: torch.Tensor, tiny: Tiny) -> torch.Tensor:
+def covariance_error(actual: torch.Tensor, tiny: Tiny) -> torch.Tensor:
     """``[n]`` distance of the covariances, as a share of the true ones' norm."""
     true = covariances(tiny.gaussians.quats, tiny.gaussians.scales)
-    return (covariances(found, tiny.gaussians.scales) - true).flatten(1).norm(dim=1) / true.flatten(1).norm(dim=1)
+    return (covariances(actual, tiny.gaussians.scales) - true).flatten(1).norm(dim=1) / true.flatten(1).norm(dim=1)
 
 
 @pytest.mark.parametrize("noise", [0.0, 8.0])
@@ -62,10 +62,10 @@ def test_the_root_is_found(tmp_path: Path, noise: float) -> None:
     tiny = discs(noise)
     loaded = load_scene(save_export(tmp_path, tiny, applied_twice(tiny)))
     assert any("stored with w last and each applied twice" in note for note in loaded.notes)
-    found = loaded.pixel_scene().gaussians.quats
-    assert degrees_off(found, tiny).quantile(0.95) < 3 + 2 * noise
-    assert covariance_error(found, tiny).median() < 0.01
-    assert covariance_error(found, tiny).mean() < 0.1
+    actual = loaded.pixel_scene().gaussians.quats
+    assert degrees_off(actual, tiny).quantile(0.95) < 3 + 2 * noise
+    assert covariance_error(actual, tiny).median() < 0.01
+    assert covariance_error(actual, tiny).mean() < 0.1
     stored = read_scene(tmp_path, quats="xyzw").gaussians.quats
     assert covariance_error(stored, tiny).mean() > 0.3
 

@@ -18,10 +18,10 @@ def make(folder: Path, *names: str) -> Path:
 
 def test_a_plain_export(tiny_folder: Path) -> None:
     for path in (tiny_folder, tiny_folder / "scene.ply"):
-        found = find_scene_files(path)
-        assert found.ply == tiny_folder / "scene.ply"
-        assert found.cameras == tiny_folder / "transforms.json"
-        assert found.images == tiny_folder / "images"
+        actual = find_scene_files(path)
+        assert actual.ply == tiny_folder / "scene.ply"
+        assert actual.cameras == tiny_folder / "transforms.json"
+        assert actual.images == tiny_folder / "images"
 
 
 def test_depth_anything_s_folders(tmp_path: Path, tiny: Tiny) -> None:
@@ -31,23 +31,23 @@ def test_depth_anything_s_folders(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path / "images", tiny)
     write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, image=None)
     for path in (tmp_path, tmp_path / "gs_ply" / "0000.ply", tmp_path / "gs_ply"):
-        found = find_scene_files(path)
-        assert found.ply == tmp_path / "gs_ply" / "0000.ply"
-        assert found.cameras == tmp_path / "exports/mini_npz/results.npz"
-        assert found.images == tmp_path / "images"
+        actual = find_scene_files(path)
+        assert actual.ply == tmp_path / "gs_ply" / "0000.ply"
+        assert actual.cameras == tmp_path / "exports/mini_npz/results.npz"
+        assert actual.images == tmp_path / "images"
     write_npz(tmp_path / "exports/npz/results.npz", tiny)
-    found = find_scene_files(tmp_path)
-    assert found.cameras == tmp_path / "exports/npz/results.npz"
-    assert found.images == found.cameras
+    actual = find_scene_files(tmp_path)
+    assert actual.cameras == tmp_path / "exports/npz/results.npz"
+    assert actual.images == actual.cameras
 
 
 def test_a_trained_model_s_folders(tmp_path: Path, tiny: Tiny) -> None:
     make(tmp_path, "point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply")
     make(tmp_path, "input.ply", "cameras.json")
-    found = find_scene_files(tmp_path)
-    assert found.ply == tmp_path / "point_cloud/iteration_30000/point_cloud.ply"
-    assert found.cameras == tmp_path / "cameras.json"
-    assert find_scene_files(found.ply).cameras == tmp_path / "cameras.json"
+    actual = find_scene_files(tmp_path)
+    assert actual.ply == tmp_path / "point_cloud/iteration_30000/point_cloud.ply"
+    assert actual.cameras == tmp_path / "cameras.json"
+    assert find_scene_files(actual.ply).cameras == tmp_path / "cameras.json"
 
 
 def test_which_ply_of_a_folder(tmp_path: Path) -> None:
@@ -65,9 +65,9 @@ def test_which_ply_of_a_folder(tmp_path: Path) -> None:
 def test_named_files_go_first(tiny_folder: Path, tmp_path: Path, tiny: Tiny) -> None:
     write_colmap_text(tmp_path / "other", tiny)
     write_images(tmp_path / "photos", tiny)
-    found = find_scene_files(tiny_folder, cameras=tmp_path / "other", images=str(tmp_path / "photos"))
-    assert found.cameras == tmp_path / "other"
-    assert found.images == tmp_path / "photos"
+    actual = find_scene_files(tiny_folder, cameras=tmp_path / "other", images=str(tmp_path / "photos"))
+    assert actual.cameras == tmp_path / "other"
+    assert actual.images == tmp_path / "photos"
 
 
 def test_image_folders_in_order(tmp_path: Path, tiny: Tiny) -> None:
@@ -102,6 +102,6 @@ def test_a_broken_npz_is_no_source_of_images(tmp_path: Path, tiny: Tiny) -> None
 def test_files_beside_a_relative_path(tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, tiny: Tiny) -> None:
     monkeypatch.chdir(tiny_folder)
     write_transforms(tiny_folder / "transforms.json", tiny)
-    found = find_scene_files("scene.ply")
-    assert found.ply == Path("scene.ply")
-    assert found.cameras == tiny_folder.resolve() / "transforms.json"
+    actual = find_scene_files("scene.ply")
+    assert actual.ply == Path("scene.ply")
+    assert actual.cameras == tiny_folder.resolve() / "transforms.json"

@@ -171,9 +171,9 @@ def test_mappings_move_a_point_and_its_photo_alike() -> None:
 
 
 def test_sizes_that_the_number_of_rows_allows() -> None:
-    found = [(m.width, m.height) for m in grids_of_count(2 * 64 * 48, 2, (640, 480))]
-    assert found[0] == (64, 48)
-    assert (64, 48) in found
+    actual = [(m.width, m.height) for m in grids_of_count(2 * 64 * 48, 2, (640, 480))]
+    assert actual[0] == (64, 48)
+    assert (64, 48) in actual
     assert list(grids_of_count(2 * 97 * 89, 2, (640, 480))) == []
     assert (256, 256) in [(m.width, m.height) for m in grids_of_count(3 * 256 * 256, 3, (640, 360))]
 

@@ -203,9 +203,9 @@ def test_harmonics_in_any_order_of_columns(tmp_path: Path) -> None:
         other = np.empty(len(rows), [(column, "<f4") for column in names])
         for column in names:
             other[column] = rows[column]
-        found = read_ply(save_export(tmp_path / name, SMOOTH, other, cameras=False) / "scene.ply")
+        actual = read_ply(save_export(tmp_path / name, SMOOTH, other, cameras=False) / "scene.ply")
         for field in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-            assert torch.equal(getattr(found.gaussians, field), getattr(usual.gaussians, field)), field
+            assert torch.equal(getattr(actual.gaussians, field), getattr(usual.gaussians, field)), field
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -216,9 +216,9 @@ def test_harmonics_of_long_lrm(tmp_path: Path, degree: int) -> None:
     rows = export_rows(SMOOTH, rest=45, normals="u1")
     for i in range(3 * higher):
         rows[f"f_rest_{i}"] = shN[:, i % higher, i // higher]
-    found = read_ply(save_export(tmp_path, SMOOTH, rows, cameras=False) / "scene.ply").gaussians.shN.numpy()
-    assert np.array_equal(found[:, :higher], shN)
-    assert not found[:, higher:].any()
+    actual = read_ply(save_export(tmp_path, SMOOTH, rows, cameras=False) / "scene.ply").gaussians.shN.numpy()
+    assert np.array_equal(actual[:, :higher], shN)
+    assert not actual[:, higher:].any()
 
 
 def test_colours_as_bytes(tmp_path: Path) -> None:

@@ -53,10 +53,10 @@ def by_opacity(tiny: Tiny, dropped: float) -> np.ndarray:
     return np.argsort(-opacities)[: round(len(opacities) * (1 - dropped))]
 
 
-def share_at_home(found: object, tiny: Tiny, kept: np.ndarray) -> float:
+def share_at_home(actual: object, tiny: Tiny, kept: np.ndarray) -> float:
     """Share of the file's rows that are at the pixel they were made for."""
     at = np.full(len(kept), -1)
-    layout = found.recovery.best.layout  # type: ignore[attr-defined]
+    layout = actual.recovery.best.layout  # type: ignore[attr-defined]
     for view, rows, pixels in zip(layout.views, layout.rows, layout.pixels, strict=True):
         at[rows] = view * tiny.width * tiny.height + pixels
     return float((at == kept).mean())

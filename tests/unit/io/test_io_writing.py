@@ -109,9 +109,9 @@ def read_back(path: Path) -> Gaussians:
 def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: PixelScene, tmp_path: Path) -> None:
     gaussians, path = drawn(scene, degree), tmp_path / f"a{ending}"
     write_gaussians(path, gaussians)
-    found = read_back(path)
-    assert (len(found), found.sh_degree) == (len(gaussians), degree)
-    assert psnr(scene, gaussians, found) > FLOORS[ending, degree]
+    actual = read_back(path)
+    assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
+    assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
 
 
 @needs_program
@@ -120,10 +120,10 @@ def test_splat_transform_reads_the_same(ending: str, degree: int, scene: PixelSc
     gaussians, path, back = drawn(scene, degree), tmp_path / f"a{ending}", tmp_path / "back.ply"
     write_gaussians(path, gaussians)
     subprocess.run([str(program()), "-q", str(path), str(back)], check=True, capture_output=True)
-    found = read_ply(back).gaussians
-    assert (len(found), found.sh_degree) == (len(gaussians), degree)
-    assert psnr(scene, gaussians, found) > FLOORS[ending, degree]
-    assert psnr(scene, read_back(path), found) > 50  # of .splat, it takes 127.5 for the middle
+    actual = read_ply(back).gaussians
+    assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
+    assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
+    assert psnr(scene, read_back(path), actual) > 50  # of .splat, it takes 127.5 for the middle
 
 
 @pytest.mark.parametrize("ending", QUANTISED)
@@ -156,11 +156,11 @@ def corners() -> Gaussians:
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
 def test_extremes_stay_finite(ending: str, tmp_path: Path) -> None:
     write_gaussians(tmp_path / f"a{ending}", corners())
-    found = read_back(tmp_path / f"a{ending}")
-    for name, tensor in vars(found).items():
+    actual = read_back(tmp_path / f"a{ending}")
+    for name, tensor in vars(actual).items():
         assert bool(torch.isfinite(tensor).all()), name
-    assert sorted(found.opacities.round(decimals=1).tolist()) == [0.0, 0.5, 1.0]
-    assert float(found.means[:, 0].max()) == pytest.approx(1e5, rel=1e-3)
+    assert sorted(actual.opacities.round(decimals=1).tolist()) == [0.0, 0.5, 1.0]
+    assert float(actual.means[:, 0].max()) == pytest.approx(1e5, rel=1e-3)
 
 
 @pytest.mark.parametrize("ending", QUANTISED)
@@ -173,10 +173,10 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
     ones = torch.ones(n)
     gaussians = Gaussians(means, quats, 0.1 * torch.ones(n, 3), 0.5 * ones, torch.zeros(n, 1, 3), torch.zeros(n, 0, 3))
     write_gaussians(tmp_path / f"a{ending}", gaussians)
-    found = read_back(tmp_path / f"a{ending}")
-    cosines = (found.quats * quats).sum(1).abs()
+    actual = read_back(tmp_path / f"a{ending}")
+    cosines = (actual.quats * quats).sum(1).abs()
     assert float(cosines.min()) > {".splat": 0.9998, ".spz": 0.99999, ".compressed.ply": 0.99999}[ending]
-    assert float((found.means - means).abs().max()) < 0.5
+    assert float((actual.means - means).abs().max()) < 0.5
 
 
 def test_harmonics_without_room_are_noted() -> None:

@@ -32,7 +32,7 @@ def scene() -> PixelScene:
 
 
 @pytest.fixture(scope="module")
-def found(scene: PixelScene) -> Comparison:
+def actual(scene: PixelScene) -> Comparison:
     half = scene.gaussians[::2]
     sizes = {"input": storage("input", len(scene.gaussians)), "a|b<i>": storage("half", len(half), 34)}
     return compare(scene, {"a|b<i>": half}, sizes, None, PLAIN, merge_seconds={"a|b<i>": 2.0})
@@ -50,10 +50,10 @@ def test_sizes_keep_the_view() -> None:
 
 
 def test_every_scene_is_drawn_at_every_size(scene: PixelScene) -> None:
-    found = measure_speeds({"a": scene.gaussians, "b": scene.gaussians[:10]}, scene.cameras, (48, 96), 0.01, threads=1)
-    cpu = [speed for speed in found["a"] if speed.device == "cpu"]
+    actual = measure_speeds({"a": scene.gaussians, "b": scene.gaussians[:10]}, scene.cameras, (48, 96), 0.01, threads=1)
+    cpu = [speed for speed in actual["a"] if speed.device == "cpu"]
     assert [(s.width, s.height, s.threads) for s in cpu] == [(48, 36, 1), (96, 72, 1)]
-    assert all(speed.seconds > 0 for speeds in found.values() for speed in speeds)
+    assert all(speed.seconds > 0 for speeds in actual.values() for speed in speeds)
 
 
 def test_overdraw_counts_what_is_blended(scene: PixelScene) -> None:
@@ -72,16 +72,16 @@ def test_break_even() -> None:
     assert break_even(0.0, 0.3, 0.1) == 0
 
 
-def test_factors_multiply_to_the_saving(found: Comparison) -> None:
-    after = comparison_document(found)["after"][0]
+def test_factors_multiply_to_the_saving(actual: Comparison) -> None:
+    after = comparison_document(actual)["after"][0]
     factors = after["factors"]
     assert factors["count"] == pytest.approx(2)
     assert factors["bytes_per_gaussian"] == pytest.approx(2)
     assert factors["bytes"] == pytest.approx(4, rel=0.01)
 
 
-def test_break_even_is_that_of_the_measured_times(found: Comparison) -> None:
-    document = comparison_document(found)
+def test_break_even_is_that_of_the_measured_times(actual: Comparison) -> None:
+    document = comparison_document(actual)
     for before, after in zip(document["before"]["speeds"], document["after"][0]["speeds"], strict=True):
         saved = before["seconds"] - after["seconds"]
         if after["break_even_frames"] is not None:
@@ -90,8 +90,8 @@ def test_break_even_is_that_of_the_measured_times(found: Comparison) -> None:
             assert saved <= 1e-5
 
 
-def test_documents(found: Comparison) -> None:
-    document = comparison_document(found, ["first"])
+def test_documents(actual: Comparison) -> None:
+    document = comparison_document(actual, ["first"])
     assert json.loads(to_json(document))["schema_version"] == 1
     assert document["notes"][0] == "first"
     assert len(document["before"]["speeds"]) >= 2
@@ -103,11 +103,11 @@ def test_documents(found: Comparison) -> None:
         assert len(widths) == 1, table
 
 
-def test_html_loads_nothing_and_escapes_names(found: Comparison) -> None:
-    page = comparison_html(comparison_document(found), b"\x89PNG")
+def test_html_loads_nothing_and_escapes_names(actual: Comparison) -> None:
+    page = comparison_html(comparison_document(actual), b"\x89PNG")
     assert "a|b&lt;i&gt;" in page
     assert "<i>" not in page
-    assert all(found.startswith("data:") for found in re.findall(r"(?:src|href)=\"?([^\"> ]*)", page))
+    assert all(actual.startswith("data:") for actual in re.findall(r"(?:src|href)=\"?([^\"> ]*)", page))
     assert "http" not in page
 
 

@@ -39,14 +39,14 @@ def half(scene: PixelScene) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def found(scene: PixelScene, half: Gaussians) -> Evaluation:
+def actual(scene: PixelScene, half: Gaussians) -> Evaluation:
     return evaluate(scene, {"half": half}, held_out(), PLAIN)
 
 
-def test_figures_are_scikit_image_s(found: Evaluation, half: Gaussians) -> None:
+def test_figures_are_scikit_image_s(actual: Evaluation, half: Gaussians) -> None:
     views = held_out()
     images = gsmerge.render(half, views.cameras).images.clamp(0, 1).numpy()
-    scores = [s for s in found.results[1].scores if s.split == "target"]
+    scores = [s for s in actual.results[1].scores if s.split == "target"]
     for score, image, photo in zip(scores, images, views.images.numpy(), strict=True):
         assert score.full.psnr == pytest.approx(peak_signal_noise_ratio(photo, image, data_range=1), abs=1e-5)
         options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -54,31 +54,31 @@ def test_figures_are_scikit_image_s(found: Evaluation, half: Gaussians) -> None:
         assert score.full.ssim == pytest.approx(expected, abs=1e-5)
 
 
-def test_masked_figures_count_visible_pixels_alone(found: Evaluation) -> None:
-    targets = [s for s in found.results[0].scores if s.split == "target"]
+def test_masked_figures_count_visible_pixels_alone(actual: Evaluation) -> None:
+    targets = [s for s in actual.results[0].scores if s.split == "target"]
     assert 0.3 < targets[1].visible < 0.95
     assert targets[1].masked.psnr is not None
     assert targets[1].full.psnr is not None
     assert targets[1].masked.psnr > targets[1].full.psnr + 3  # what nobody has seen is black
-    assert all(s.masked == s.full for s in found.results[0].scores if s.split == "context")
+    assert all(s.masked == s.full for s in actual.results[0].scores if s.split == "context")
 
 
-def test_what_is_counted(found: Evaluation, scene: PixelScene, half: Gaussians) -> None:
-    assert [r.name for r in found.results] == [INPUT, "half"]
-    assert found.results[1].num_gaussians == len(half)
-    assert found.results[1].ratio == pytest.approx(len(half) / len(scene.gaussians))
-    assert found.num_views == {"context": 3, "target": 2}
-    assert found.reference == "photos"
-    assert found.notes == ()
+def test_what_is_counted(actual: Evaluation, scene: PixelScene, half: Gaussians) -> None:
+    assert [r.name for r in actual.results] == [INPUT, "half"]
+    assert actual.results[1].num_gaussians == len(half)
+    assert actual.results[1].ratio == pytest.approx(len(half) / len(scene.gaussians))
+    assert actual.num_views == {"context": 3, "target": 2}
+    assert actual.reference == "photos"
+    assert actual.notes == ()
 
 
 def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene, half: Gaussians) -> None:
-    found = evaluate(replace(scene, images=None), {"half": half}, None, PLAIN)
-    assert found.reference == "renders of the input"
-    assert all(math.isinf(s.full.psnr or 0) for s in found.results[0].scores)
-    assert all((s.full.psnr or 99) < 60 for s in found.results[1].scores)
-    assert "flatter" in found.notes[0]
-    document = json.loads(to_json(evaluation_document(found, {})))
+    actual = evaluate(replace(scene, images=None), {"half": half}, None, PLAIN)
+    assert actual.reference == "renders of the input"
+    assert all(math.isinf(s.full.psnr or 0) for s in actual.results[0].scores)
+    assert all((s.full.psnr or 99) < 60 for s in actual.results[1].scores)
+    assert "flatter" in actual.notes[0]
+    document = json.loads(to_json(evaluation_document(actual, {})))
     assert document["results"][0]["mean"]["context"]["psnr"] is None  # strict JSON knows no infinity
 
 
@@ -92,9 +92,9 @@ def test_views_of_another_world_are_told(scene: PixelScene) -> None:
 
 def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
     loose = UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
-    found = evaluate(loose, {"half": half}, held_out(), PLAIN)
+    actual = evaluate(loose, {"half": half}, held_out(), PLAIN)
     usual = evaluate(scene, {"half": half}, held_out(), PLAIN)
-    for one, other in zip(found.results[1].scores, usual.results[1].scores, strict=True):
+    for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
         assert one.full == other.full
         assert one.visible == pytest.approx(other.visible, abs=0.05)
 
@@ -103,21 +103,21 @@ def test_a_scene_in_no_order(scene: PixelScene, half: Gaussians) -> None:
 def test_units_change_nothing(factor: float, scene: PixelScene, half: Gaussians) -> None:
     moved = scenes.move(scene, np.eye(3), factor, np.zeros(3))
     small = scenes.move_gaussians(half, np.eye(3), factor, np.zeros(3))
-    found = evaluate(moved, {"half": small}, None, PLAIN)
+    actual = evaluate(moved, {"half": small}, None, PLAIN)
     usual = evaluate(scene, {"half": half}, None, PLAIN)
-    for one, other in zip(found.results[1].scores, usual.results[1].scores, strict=True):
+    for one, other in zip(actual.results[1].scores, usual.results[1].scores, strict=True):
         assert one.full.psnr == pytest.approx(other.full.psnr, abs=0.05)
 
 
 def test_only_held_out_views(scene: PixelScene) -> None:
-    found = evaluate(scene, {}, held_out(), replace(PLAIN, context=False))
-    assert found.num_views == {"target": 2}
+    actual = evaluate(scene, {}, held_out(), replace(PLAIN, context=False))
+    assert actual.num_views == {"target": 2}
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_threads_do_not_matter(threads: int, scene: PixelScene, half: Gaussians, found: Evaluation) -> None:
+def test_threads_do_not_matter(threads: int, scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
     again = evaluate(scene, {"half": half}, held_out(), replace(PLAIN, threads=threads))
-    assert [r.scores for r in again.results] == [r.scores for r in found.results]
+    assert [r.scores for r in again.results] == [r.scores for r in actual.results]
 
 
 def test_bad_arguments(scene: PixelScene, half: Gaussians) -> None:
@@ -132,18 +132,18 @@ def test_bad_arguments(scene: PixelScene, half: Gaussians) -> None:
         evaluate(empty, {}, None, PLAIN)
 
 
-def test_csv_has_a_row_for_each_result_and_view(found: Evaluation) -> None:
-    document = evaluation_document(found, {"half": {"bytes": 12, "path": "half.ply"}})
+def test_csv_has_a_row_for_each_result_and_view(actual: Evaluation) -> None:
+    document = evaluation_document(actual, {"half": {"bytes": 12, "path": "half.ply"}})
     rows = list(csv.DictReader(io.StringIO(evaluation_csv(document))))
     assert tuple(rows[0]) == CSV_COLUMNS
     assert len(rows) == 2 * 5
     assert rows[-1]["result"] == "half"
-    assert float(rows[-1]["psnr"]) == found.results[1].scores[-1].full.psnr
+    assert float(rows[-1]["psnr"]) == actual.results[1].scores[-1].full.psnr
     assert rows[-1]["lpips_vgg"] == ""
 
 
-def test_table_for_people(found: Evaluation) -> None:
-    lines = evaluation_lines(evaluation_document(found, {"half": {"bytes": 1234}}))
+def test_table_for_people(actual: Evaluation) -> None:
+    lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
     assert lines[0].startswith("against photos")
     assert len(lines) == 2 + 4
     assert "1.2 kB" in lines[-1]
@@ -151,9 +151,9 @@ def test_table_for_people(found: Evaluation) -> None:
 
 
 def test_progress_is_told(scene: PixelScene, half: Gaussians) -> None:
-    told: list[tuple[str, int, int]] = []
-    evaluate(scene, {"half": half}, None, PLAIN, progress=lambda *step: told.append(step))
-    assert told == [("evaluate", 1, 2), ("evaluate", 2, 2)]
+    said: list[tuple[str, int, int]] = []
+    evaluate(scene, {"half": half}, None, PLAIN, progress=lambda *step: said.append(step))
+    assert said == [("evaluate", 1, 2), ("evaluate", 2, 2)]
 
 
 def test_pictures_too_small_for_ssim() -> None:
@@ -178,8 +178,8 @@ def test_what_results_are_compared_with(scene: PixelScene) -> None:
     assert evaluate(bare, {}, held_out(), replace(PLAIN, context=False)).reference == "photos"
 
 
-def test_means_leave_out_what_was_not_measured(found: Evaluation) -> None:
-    full, masked = found.results[1].mean("target")
-    scores = [s for s in found.results[1].scores if s.split == "target"]
+def test_means_leave_out_what_was_not_measured(actual: Evaluation) -> None:
+    full, masked = actual.results[1].mean("target")
+    scores = [s for s in actual.results[1].scores if s.split == "target"]
     assert full.psnr == pytest.approx(np.mean([s.full.psnr for s in scores]))
     assert masked.lpips_vgg is None

@@ -98,7 +98,7 @@ def plain_features(image: Array, tree: dict[str, Any], net: str) -> list[torch.T
     """Features ``[c,pixels]`` in float64, every convolution written out as a matrix product."""
     scaled = (2 * image.astype(np.float64) - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
     x = torch.from_numpy(scaled.transpose(2, 0, 1))[None]
-    found = []
+    actual = []
     for i, (pool, size, stride, padding, _, compared) in enumerate(PLANS[net]):
         layer = tree[FILES[net][1]][f"Conv_{i}"]
         if pool:
@@ -109,8 +109,8 @@ def plain_features(image: Array, tree: dict[str, Any], net: str) -> list[torch.T
         bias = torch.from_numpy(layer["bias"].astype(np.float64))
         x = relu(matrix @ unfold(x, size, stride=stride)[0] + bias[:, None]).reshape(1, -1, height, width)
         if compared:
-            found.append(x[0].flatten(1))
-    return found
+            actual.append(x[0].flatten(1))
+    return actual
 
 
 def plain_lpips(image: Array, reference: Array, tree: dict[str, Any], net: str) -> float:
@@ -180,23 +180,23 @@ def test_large_references_are_not_remembered(package: Path, monkeypatch: pytest.
 
 
 def test_tensors_and_odd_arrays_give_the_same(package: Path) -> None:
-    wanted = lpips(FIRST, SECOND, "alex")
-    assert lpips(torch.from_numpy(FIRST).requires_grad_(), torch.from_numpy(SECOND), "alex") == wanted
+    expected = lpips(FIRST, SECOND, "alex")
+    assert lpips(torch.from_numpy(FIRST).requires_grad_(), torch.from_numpy(SECOND), "alex") == expected
     flipped = np.ascontiguousarray(FIRST[:, ::-1])[:, ::-1]
     fixed = SECOND.astype(np.float64)
     fixed.flags.writeable = False
-    assert lpips(flipped, fixed, "alex") == wanted
+    assert lpips(flipped, fixed, "alex") == expected
 
 
 @pytest.mark.parametrize("net", NETS)
 def test_pixels_outside_the_mask_come_from_the_reference(package: Path, net: str) -> None:
     mask = np.zeros((64, 64), bool)
     mask[10:50, 5:30] = True
-    wanted = lpips(np.where(mask[..., None], FIRST, SECOND), SECOND, net)
-    assert 0 < wanted < lpips(FIRST, SECOND, net)
+    expected = lpips(np.where(mask[..., None], FIRST, SECOND), SECOND, net)
+    assert 0 < expected < lpips(FIRST, SECOND, net)
     spoilt = np.where(mask[..., None], FIRST, 0)
     for shape in (mask, mask[..., None], torch.from_numpy(mask)):
-        assert lpips(spoilt, SECOND, net, mask=shape) == wanted
+        assert lpips(spoilt, SECOND, net, mask=shape) == expected
     assert lpips(FIRST, SECOND, net, mask=np.ones((64, 64), bool)) == lpips(FIRST, SECOND, net)
 
 
@@ -343,9 +343,9 @@ def true_tree(net: str) -> dict[str, Any]:
 
 @installed
 @pytest.mark.parametrize(("net", "wanted"), [("alex", 0.1245479), ("vgg", 0.3209685)])
-def test_distance_is_the_reference_implementations(net: str, wanted: float) -> None:
+def test_distance_is_the_reference_implementations(net: str, expected: float) -> None:
     """Against the package lpips 0.1.4 with the same backbone and its own linear layers, run once."""
-    assert lpips(FIRST, SECOND, net) == pytest.approx(wanted, abs=1e-6)
+    assert lpips(FIRST, SECOND, net) == pytest.approx(expected, abs=1e-6)
 
 
 @installed

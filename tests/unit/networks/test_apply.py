@@ -192,9 +192,9 @@ def test_nearest_by_hand(scene: Made) -> None:
     features = replace(features, means=torch.stack([line, line * 0, line * 0], 1))
     assert find_neighbors(features, 2).tolist() == [[1, 2], [0, 2], [1, 0], [4, 5], [3, 5], [4, 3]]
     behind = torch.tensor([False, False, True, True, False, False])
-    found = find_neighbors(replace(features, backing=behind), 2)
-    assert found[2].tolist() == [3, -1]
-    assert found[0].tolist() == [1, 4]
+    actual = find_neighbors(replace(features, backing=behind), 2)
+    assert actual[2].tolist() == [3, -1]
+    assert actual[0].tolist() == [1, 4]
     piled = find_neighbors(replace(features, means=torch.zeros(6, 3)), 3)
     assert (piled != np.arange(6)[:, None]).all()
     assert find_neighbors(take(features, torch.tensor([0])), 2).tolist() == [[-1, -1]]
@@ -294,12 +294,12 @@ def test_absolute_heads_know_no_children(scene: Made) -> None:
     plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.networks(Networks(absolute).requires_grad_(False))
     encoded = encode_features(scene.features, untrained)
     analytic = decode(encoded, scene.members, plain)
-    found = decode(encoded, scene.members, plain, networks=untrained)
-    parents = torch.cdist(found.means, encoded.means).argmin(1)
-    torch.testing.assert_close(found.means, feature_to_gaussians(encoded).means[parents])
-    assert torch.equal(found.scales, found.scales[:, :1].expand(-1, 3))
-    assert torch.equal(found.opacities, torch.full((len(found),), 0.5))
-    torch.testing.assert_close(found.sh0, encoded.sh0[parents])
+    actual = decode(encoded, scene.members, plain, networks=untrained)
+    parents = torch.cdist(actual.means, encoded.means).argmin(1)
+    torch.testing.assert_close(actual.means, feature_to_gaussians(encoded).means[parents])
+    assert torch.equal(actual.scales, actual.scales[:, :1].expand(-1, 3))
+    assert torch.equal(actual.opacities, torch.full((len(actual),), 0.5))
+    torch.testing.assert_close(actual.sh0, encoded.sh0[parents])
     context = scene.networks(noisy(absolute))
     ones = decode(encoded, scene.members, DecodeOptions(min_opacity=0.0), networks=context)
     geometry, axes = match_geometry(encoded, context), quat_to_rotmat(ones.quats) * ones.scales[:, None]
@@ -312,7 +312,7 @@ def test_absolute_heads_know_no_children(scene: Made) -> None:
         if start is not None:
             moved = decode_gaussians(start, rows, encoded, context)
             assert not torch.equal(moved.means[::2], moved.means[1::2])  # slots tell siblings apart
-            assert float(moved.scales.max() / found.scales.max()) < np.exp(6.1)
+            assert float(moved.scales.max() / actual.scales.max()) < np.exp(6.1)
 
 
 def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
@@ -321,12 +321,12 @@ def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
     backing[0] = True
     features = encode_features(replace(scene.features, backing=backing), context)
     options = DecodeOptions(k=6, min_opacity=0.0)
-    plain, found = decode(features, scene.members, options), decode(features, scene.members, options, networks=context)
+    plain, actual = decode(features, scene.members, options), decode(features, scene.members, options, networks=context)
     sizes = np.bincount(parents_of(features, scene, 6), minlength=len(features))
     whole = torch.from_numpy(np.repeat((sizes > 4) | backing.numpy(), sizes))
     assert bool(whole.any())
-    assert_close(found[whole], plain[whole])
-    assert not torch.equal(found.means[~whole], plain.means[~whole])
+    assert_close(actual[whole], plain[whole])
+    assert not torch.equal(actual.means[~whole], plain.means[~whole])
 
 
 def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:

@@ -110,8 +110,8 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path: Path, damage: str)
         load_checkpoint(path)
     assert "\n" not in str(refused.value)
     assert str(refused.value).startswith(str(path))
-    found, notes = find_checkpoint(str(path), required=False)
-    assert found is None
+    actual, notes = find_checkpoint(str(path), required=False)
+    assert actual is None
     assert len(notes) == 1
     assert str(path) in notes[0]
     with pytest.raises(SceneError):

@@ -35,14 +35,14 @@ def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_recipe_is_its_settings(scene: PixelScene, absolute: Path) -> None:
-    found = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute))
+    actual = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute))
     settings = {"segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "robust": False, "fit": "none"}
-    wanted = scenes.compacted(scene, **settings, checkpoint=str(absolute))
-    assert torch.equal(found.gaussians.means, wanted.gaussians.means)
-    assert found.report.options["recipe"] == "paper"
-    assert found.report.choices["networks"]["options"]["outputs"] == "absolute"
-    assert {"encode", "match", "refine", "decode"} <= set(found.report.seconds)
-    assert found.report.options["fit"] == "none"
+    expected = scenes.compacted(scene, **settings, checkpoint=str(absolute))
+    assert torch.equal(actual.gaussians.means, expected.gaussians.means)
+    assert actual.report.options["recipe"] == "paper"
+    assert actual.report.choices["networks"]["options"]["outputs"] == "absolute"
+    assert {"encode", "match", "refine", "decode"} <= set(actual.report.seconds)
+    assert actual.report.options["fit"] == "none"
 
 
 def test_what_is_set_besides_goes_before() -> None:

@@ -103,9 +103,9 @@ def test_feature_gaussians_move_like_gaussians() -> None:
 
 @pytest.mark.parametrize("raw", [1e30, -1e30, float("inf"), float("-inf"), float("nan")])
 def test_whatever_comes_out_is_bounded(raw: float) -> None:
-    found = bound_residuals(torch.full((2, RESIDUAL), raw), Bounds(mean=0.5), 0.5)
-    assert bool((found.abs() <= 0.5 * residual_limits(Bounds(mean=0.5))).all())
-    assert bool(torch.isfinite(found).all())
+    actual = bound_residuals(torch.full((2, RESIDUAL), raw), Bounds(mean=0.5), 0.5)
+    assert bool((actual.abs() <= 0.5 * residual_limits(Bounds(mean=0.5))).all())
+    assert bool(torch.isfinite(actual).all())
     assert float(residual_limits(Bounds(turn=0.2))[ROTATION].max()) == pytest.approx(0.2)
 
 

@@ -8,9 +8,9 @@ from gsmerge.networks.tables import group_rows, hash_uniform, point_seeds, sampl
 
 def test_tables_hold_every_group_once() -> None:
     sizes = np.random.default_rng(0).integers(1, 100, 5000)
-    found = list(split_tables(sizes, 16))
-    assert sorted(np.concatenate([rows for rows, _ in found]).tolist()) == list(range(5000))
-    for rows, width in found:
+    actual = list(split_tables(sizes, 16))
+    assert sorted(np.concatenate([rows for rows, _ in actual]).tolist()) == list(range(5000))
+    for rows, width in actual:
         assert width in (1, 2, 4, 8, 16)
         assert len(rows) * width <= 16384
         assert (np.minimum(sizes[rows], 16) <= width).all()

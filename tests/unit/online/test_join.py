@@ -25,19 +25,19 @@ def sides() -> tuple[GroupSet, GroupSet]:
 
 
 @pytest.fixture(scope="module")
-def found(sides: tuple[GroupSet, GroupSet]) -> torch.Tensor:
+def actual(sides: tuple[GroupSet, GroupSet]) -> torch.Tensor:
     old, new = sides
     return find_partners(old.features, new.features, MatchOptions())
 
 
-def test_partners_show_the_same_surface(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
+def test_partners_show_the_same_surface(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
     old, new = sides
-    joins = torch.nonzero(found >= 0)[:, 0]
+    joins = torch.nonzero(actual >= 0)[:, 0]
     assert 10 < len(joins) < len(new)
-    assert len(found[joins].unique()) == len(joins)  # no group gets two
-    assert int(found.max()) < len(old)
-    gaps = (old.features.means[found[joins]] - new.features.means[joins]).norm(dim=1)
-    sizes = old.features.covars.diagonal(dim1=1, dim2=2).sum(1).sqrt()[found[joins]]
+    assert len(actual[joins].unique()) == len(joins)  # no group gets two
+    assert int(actual.max()) < len(old)
+    gaps = (old.features.means[actual[joins]] - new.features.means[joins]).norm(dim=1)
+    sizes = old.features.covars.diagonal(dim1=1, dim2=2).sum(1).sqrt()[actual[joins]]
     assert float((gaps / sizes).median()) < 1
 
 
@@ -45,8 +45,8 @@ def test_groups_of_one_side_are_never_partners() -> None:
     """All in one place: each new one gets one, and what is left over none."""
     same = scenes.make_features(np.tile([[0.0, 0, 3]], (3, 1)), sizes=0.1)
     many = scenes.make_features(np.tile([[0.0, 0, 3]], (5, 1)), sizes=0.1)
-    found = find_partners(same, many, MatchOptions())
-    concat_groups = found[found >= 0].tolist()
+    actual = find_partners(same, many, MatchOptions())
+    concat_groups = actual[actual >= 0].tolist()
     assert len(concat_groups) == len(set(concat_groups)) <= 3
     assert len(concat_groups) >= 1
 
@@ -59,22 +59,22 @@ def test_no_partners_without_anything_there(sides: tuple[GroupSet, GroupSet]) ->
     assert (find_partners(old.features, new.features, MatchOptions(match="none")) == -1).all()
 
 
-def joined_pairs(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> tuple[GroupSet, torch.Tensor]:
+def joined_pairs(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> tuple[GroupSet, torch.Tensor]:
     """The new groups that join, and where."""
-    joins = torch.nonzero(found >= 0)[:, 0]
-    return select_groups(sides[1], joins), found[joins]
+    joins = torch.nonzero(actual >= 0)[:, 0]
+    return select_groups(sides[1], joins), actual[joins]
 
 
-def test_what_adds_up_adds_up(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
-    new, rows = joined_pairs(sides, found)
+def test_what_adds_up_adds_up(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
+    new, rows = joined_pairs(sides, actual)
     after = merge_into(sides[0], new, rows, 4)
     for name in ("weights", "masses", "extinctions"):
         before, fresh = getattr(sides[0].features, name), getattr(new.features, name)
         np.testing.assert_allclose(getattr(after.features, name)[rows], before[rows] + fresh, rtol=1e-5)
 
 
-def test_moments_are_pooled_by_weight(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
-    new, rows = joined_pairs(sides, found)
+def test_moments_are_pooled_by_weight(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
+    new, rows = joined_pairs(sides, actual)
     old, after = select_groups(sides[0], rows).features, merge_into(sides[0], new, rows, 4).features
     share = (old.weights / (old.weights + new.features.weights)).double()[:, None]
     means = share * old.means + (1 - share) * new.features.means
@@ -87,8 +87,8 @@ def test_moments_are_pooled_by_weight(sides: tuple[GroupSet, GroupSet], found: t
     np.testing.assert_allclose(after.covars[rows], covars, atol=1e-6)
 
 
-def test_other_groups_keep_their_bytes(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
-    new, rows = joined_pairs(sides, found)
+def test_other_groups_keep_their_bytes(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
+    new, rows = joined_pairs(sides, actual)
     after = merge_into(sides[0], new, rows, 4)
     assert len(after) == len(sides[0])
     touched = set(rows.tolist())
@@ -98,8 +98,8 @@ def test_other_groups_keep_their_bytes(sides: tuple[GroupSet, GroupSet], found: 
     assert torch.equal(after.features.members, torch.arange(len(after.children)))
 
 
-def test_children_of_both_are_kept_up_to_the_most(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
-    new, rows = joined_pairs(sides, found)
+def test_children_of_both_are_kept_up_to_the_most(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
+    new, rows = joined_pairs(sides, actual)
     roomy, tight = merge_into(sides[0], new, rows, 8), merge_into(sides[0], new, rows, 4)
     sizes = roomy.features.starts.diff()[rows]
     both = sides[0].features.starts.diff()[rows] + new.features.starts.diff()
@@ -114,8 +114,8 @@ def test_children_of_both_are_kept_up_to_the_most(sides: tuple[GroupSet, GroupSe
     assert float(pooled.sum()) == pytest.approx(float(depth.sum()), rel=0.1)
 
 
-def test_colours_that_photos_held_stay(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
-    new, rows = joined_pairs(sides, found)
+def test_colours_that_photos_held_stay(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
+    new, rows = joined_pairs(sides, actual)
     color_precision = torch.zeros(len(sides[0]))
     color_precision[rows[::2]] = 5.0
     before = replace(sides[0], fitted_sh0=sides[0].fitted_sh0 + 0.3, color_precision=color_precision)
@@ -130,8 +130,8 @@ def test_nothing_to_absorb_changes_nothing(sides: tuple[GroupSet, GroupSet]) -> 
     assert merge_into(sides[0], select_groups(sides[1], none), none, 4) is sides[0]
 
 
-def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], found: torch.Tensor) -> None:
-    new, rows = joined_pairs(sides, found)
+def test_all_groups_can_be_divided_afterwards(sides: tuple[GroupSet, GroupSet], actual: torch.Tensor) -> None:
+    new, rows = joined_pairs(sides, actual)
     after = merge_into(sides[0], new, rows, 4)
     division = divide_all(after.features, child_members(after), 4, "depth")
     assert division.children.sh0.isfinite().all()

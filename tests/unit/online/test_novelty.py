@@ -34,12 +34,12 @@ def corner_distances(cameras: Cameras, view: int, point: np.ndarray) -> list[flo
         np.linalg.inv(K) @ np.array([x, y, 1.0]) for x, y in ((-m, -m), (w + m, -m), (w + m, h + m), (-m, h + m))
     ]
     middle = np.linalg.inv(K) @ np.array([w / 2, h / 2, 1.0])
-    found = []
+    actual = []
     for one, other in zip(corners, [*corners[1:], corners[0]], strict=True):
         normal = np.cross(one, other)
         normal /= np.linalg.norm(normal)
-        found.append(float(place @ normal) * (1 if middle @ normal > 0 else -1))
-    return [*found, float(place[2])]
+        actual.append(float(place @ normal) * (1 if middle @ normal > 0 else -1))
+    return [*actual, float(place[2])]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -47,21 +47,21 @@ def test_in_view_of_a_ball_about_each(seed: int) -> None:
     """Balls against the pyramid of what a picture with some pixels about it shows, a plane after the other."""
     gaussians, cameras = random_gaussians(300, seed), scenes.arc(3, 32, 20)
     features = features_of(gaussians)
-    found = groups_in_view(features, cameras)
-    assert found.shape == (3, 300)
-    assert 0.1 < found.mean() < 0.9
+    actual = groups_in_view(features, cameras)
+    assert actual.shape == (3, 300)
+    assert 0.1 < actual.mean() < 0.9
     radii = REACH * np.sqrt(np.trace(features.covars.double().numpy(), axis1=1, axis2=2))
     for view in range(3):
         for g in range(300):
             distances = np.array(corner_distances(cameras, view, features.means[g].double().numpy()))
-            assert found[view, g] == (distances > -radii[g]).all()
+            assert actual[view, g] == (distances > -radii[g]).all()
 
 
 def test_in_view_of_one_group() -> None:
     cameras = scenes.arc(1, 32, 32, start=-0.5)  # a field of view of 53 degrees, from the zero along z
     places = [[0, 0, 3], [0, 0, -3], [0, 0, -0.01], [9, 0, 3], [0, -9, 3], [1.6, 0, 3], [0, 0, 300]]
-    found = groups_in_view(scenes.make_features(np.array(places, float), sizes=0.05), cameras)
-    assert found.tolist() == [[True, False, True, False, False, True, True]]
+    actual = groups_in_view(scenes.make_features(np.array(places, float), sizes=0.05), cameras)
+    assert actual.tolist() == [[True, False, True, False, False, True, True]]
 
 
 def test_nothing_is_in_view_of_nothing() -> None:
@@ -78,7 +78,7 @@ def test_nothing_is_in_view_of_nothing() -> None:
 def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: tuple[int, int], level: int) -> None:
     """Every Gaussian that adds anything to any pixel, with the low-pass of the rasterizer, at either size."""
     gaussians, cameras = random_gaussians(200, seed, size=size), scenes.arc(2, *shape)
-    found = groups_in_view(features_of(gaussians), cameras)
+    actual = groups_in_view(features_of(gaussians), cameras)
     black = np.zeros((2, shape[1], shape[0], 3), np.float32)
     photos = photos_of(black, cameras, level)
     splats = prepare(gaussians)
@@ -87,7 +87,7 @@ def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: t
         peaks = contributions(plan)[1]
         drawn = np.flatnonzero(peaks > 0)
         assert len(drawn) > 0
-        missed = drawn[~found[view][drawn]]
+        missed = drawn[~actual[view][drawn]]
         assert len(missed) == 0, (gaussians.means[missed], gaussians.scales[missed], peaks[missed])
 
 
@@ -97,13 +97,13 @@ def test_pixel_errors_by_hand() -> None:
     gaussians = scene.gaussians[:400]  # a part of the first view
     assert scene.images is not None
     pictures = photos_of(scene.images.numpy(), scene.cameras)
-    found = pixel_errors(gaussians, pictures, 24, 36)
+    actual = pixel_errors(gaussians, pictures, 24, 36)
     images, alphas = scenes.images_of(gaussians, scene.cameras)
-    wanted = ((images.clip(0, 1) - scene.images.double().numpy()) ** 2).mean(-1) + (1 - alphas) ** 2
-    np.testing.assert_allclose(found, wanted, atol=1e-4)
-    assert found.dtype == np.float32
-    assert (found[0, -4:] >= 1 - 1e-4).all()  # nothing is there
-    assert found[0, 4:8, 4:20].mean() < 0.2
+    expected = ((images.clip(0, 1) - scene.images.double().numpy()) ** 2).mean(-1) + (1 - alphas) ** 2
+    np.testing.assert_allclose(actual, expected, atol=1e-4)
+    assert actual.dtype == np.float32
+    assert (actual[0, -4:] >= 1 - 1e-4).all()  # nothing is there
+    assert actual[0, 4:8, 4:20].mean() < 0.2
 
 
 def test_pixel_errors_of_another_size_repeat() -> None:
@@ -117,8 +117,8 @@ def test_pixel_errors_of_another_size_repeat() -> None:
 def test_nothing_shows_nothing() -> None:
     scene = room(1)
     assert scene.images is not None
-    found = pixel_errors(scene.gaussians[:0], photos_of(scene.images.numpy(), scene.cameras), 24, 36)
-    assert (found >= 1).all()
+    actual = pixel_errors(scene.gaussians[:0], photos_of(scene.images.numpy(), scene.cameras), 24, 36)
+    assert (actual >= 1).all()
 
 
 def grouped(sizes: list[int], rows: np.ndarray) -> FeatureGaussians:
@@ -134,11 +134,11 @@ def test_group_errors_against_a_loop() -> None:
     rows = rng.permutation(2 * 36 * 24)[:60]
     sizes = [1, 5, 20, 30, 4]
     features, errors = grouped(sizes, rows), rng.random((2, 24, 36)).astype(np.float32)
-    found = group_errors(features, scene_members(scene), errors)
+    actual = group_errors(features, scene_members(scene), errors)
     first = 0
     for g, size in enumerate(sizes):
         pixels = [(row // 864, row % 864 // 36, row % 36) for row in rows[first : first + size]]
-        assert found[g] == pytest.approx(np.mean([errors[p] for p in pixels]), rel=1e-5)
+        assert actual[g] == pytest.approx(np.mean([errors[p] for p in pixels]), rel=1e-5)
         first += size
 
 
@@ -150,8 +150,8 @@ def test_members_of_no_pixel_count_as_fully_wrong() -> None:
     members = unaligned_members(loosened(loose), pixels)
     errors = np.zeros((2, 24, 36), np.float32)
     errors[0, 0, 5] = 0.5
-    found = group_errors(grouped([2, 2, 2], np.arange(6)), members, errors)
-    np.testing.assert_allclose(found, [0.75, 1.0, 0.0])
+    actual = group_errors(grouped([2, 2, 2], np.arange(6)), members, errors)
+    np.testing.assert_allclose(actual, [0.75, 1.0, 0.0])
 
 
 def test_groups_of_a_scene_show_their_own_pixels() -> None:

@@ -32,10 +32,10 @@ def scene() -> PixelScene:
 @pytest.fixture(scope="module")
 def groups(scene: PixelScene) -> GroupSet:
     """Groups of all views, their colours off by a little."""
-    found = state_of(fed([scene], fit="none")).groups
+    actual = state_of(fed([scene], fit="none")).groups
     rng = torch.Generator().manual_seed(0)
-    sh0 = found.features.sh0 + 0.1 / SH_C0 * torch.randn(found.features.sh0.shape, generator=rng)
-    return replace(found, features=replace(found.features, sh0=sh0), fitted_sh0=sh0)
+    sh0 = actual.features.sh0 + 0.1 / SH_C0 * torch.randn(actual.features.sh0.shape, generator=rng)
+    return replace(actual, features=replace(actual.features, sh0=sh0), fitted_sh0=sh0)
 
 
 @pytest.fixture(scope="module")
@@ -80,10 +80,10 @@ def test_what_is_held_fast_stays(drawn: tuple[Gaussians, Photos, Drawn]) -> None
     precision = np.full(len(gaussians), 1e9)
     assert rms(fit_colors(gaussians, views, photos, FEW, 0, precision)[0].sh0, gaussians.sh0) < 1e-6
     precision[::2] = 0
-    found, report = fit_colors(gaussians, views, photos, FEW, 0, precision)
+    actual, report = fit_colors(gaussians, views, photos, FEW, 0, precision)
     assert report.accepted
-    assert rms(found.sh0[1::2], gaussians.sh0[1::2]) < 1e-6
-    assert rms(found.sh0[::2], gaussians.sh0[::2]) > 0.02
+    assert rms(actual.sh0[1::2], gaussians.sh0[1::2]) < 1e-6
+    assert rms(actual.sh0[::2], gaussians.sh0[::2]) > 0.02
 
 
 def test_the_more_is_held_the_less_moves(drawn: tuple[Gaussians, Photos, Drawn]) -> None:
@@ -101,7 +101,7 @@ def test_the_solution_is_where_the_gradient_vanishes(drawn: tuple[Gaussians, Pho
     gaussians, photos, views = drawn
     precision = np.random.default_rng(1).uniform(1, 50, len(gaussians))
     options = replace(FEW, prior_weight=1e-9, iterations=400, huber=1e6, min_gain=1.0, max_gain=1.0)
-    found, report = fit_colors(gaussians, views, photos, options, 0, precision)
+    actual, report = fit_colors(gaussians, views, photos, options, 0, precision)
     assert report.accepted
     n = len(gaussians)
     rows = [np.stack([dense(view, j, n) for j in range(n)], 1) for view in views.views]
@@ -109,7 +109,7 @@ def test_the_solution_is_where_the_gradient_vanishes(drawn: tuple[Gaussians, Pho
     weights, right = np.concatenate(rows), np.concatenate(residuals)
     offsets = np.linalg.solve(weights.T @ weights + np.diag(precision), weights.T @ right)
     inside = np.abs(0.5 + SH_C0 * gaussians.sh0[:, 0].numpy() + offsets - 0.5) < 0.5  # colours are kept in range
-    np.testing.assert_allclose(SH_C0 * (found.sh0 - gaussians.sh0)[:, 0].numpy()[inside], offsets[inside], atol=2e-3)
+    np.testing.assert_allclose(SH_C0 * (actual.sh0 - gaussians.sh0)[:, 0].numpy()[inside], offsets[inside], atol=2e-3)
 
 
 def dense(view: object, column: int, count: int) -> np.ndarray:
@@ -126,27 +126,27 @@ def test_only_colours_in_view_and_what_holds_them_change(groups: GroupSet, batch
     one, means = some(batch_photos, 0), groups.features.means.clone()
     means[[3, 50]] += 30
     groups = replace(groups, features=replace(groups.features, means=means))
-    found, report = fit_batch_colors(groups, one, FEW)
+    actual, report = fit_batch_colors(groups, one, FEW)
     assert report.accepted
     seen = groups_in_view(groups.features, one.cameras)[0]
     assert 0 < seen.sum() < len(groups)
     for row in np.flatnonzero(~seen):
-        assert same_group(found, int(row), groups, int(row))
-    assert torch.equal(found.features.sh0, groups.features.sh0)
-    assert scenes.identical(found.children, groups.children)
-    assert (found.color_precision[torch.from_numpy(seen)] >= groups.color_precision[torch.from_numpy(seen)]).all()
-    assert float(found.color_precision.sum()) > 0
+        assert same_group(actual, int(row), groups, int(row))
+    assert torch.equal(actual.features.sh0, groups.features.sh0)
+    assert scenes.identical(actual.children, groups.children)
+    assert (actual.color_precision[torch.from_numpy(seen)] >= groups.color_precision[torch.from_numpy(seen)]).all()
+    assert float(actual.color_precision.sum()) > 0
 
 
 def test_what_is_held_is_the_diagonal_of_the_equations(groups: GroupSet, batch_photos: BatchPhotos) -> None:
     """Squares of the blending weights in half-size photos."""
-    found, _ = fit_batch_colors(groups, batch_photos, FEW)
+    actual, _ = fit_batch_colors(groups, batch_photos, FEW)
     views = draw(replace(feature_to_gaussians(groups.features), sh0=groups.fitted_sh0), batch_photos.photos(2)).views
     for g in range(0, len(groups), 7):
-        wanted = sum(float((dense(view, g, len(groups)) ** 2).sum()) for view in views)
-        assert float(found.color_precision[g]) == pytest.approx(wanted, rel=1e-3, abs=1e-5)
-    twice, _ = fit_batch_colors(found, batch_photos, FEW)
-    np.testing.assert_allclose(twice.color_precision, 2 * found.color_precision, rtol=1e-5)
+        expected = sum(float((dense(view, g, len(groups)) ** 2).sum()) for view in views)
+        assert float(actual.color_precision[g]) == pytest.approx(expected, rel=1e-3, abs=1e-5)
+    twice, _ = fit_batch_colors(actual, batch_photos, FEW)
+    np.testing.assert_allclose(twice.color_precision, 2 * actual.color_precision, rtol=1e-5)
 
 
 @pytest.mark.parametrize("tint", [(0.1, 0.0, -0.1), (-0.06, 0.1, 0.04)])
@@ -173,19 +173,19 @@ def test_one_batch_after_the_other_is_near_all_at_once(
 def test_the_threads_do_not_matter(groups: GroupSet, batch_photos: BatchPhotos) -> None:
     from gsmerge.runtime.threads import use_threads
 
-    found = []
+    actual = []
     for threads in (1, 3):
         with use_threads(threads):
-            found.append(fit_batch_colors(groups, batch_photos, FEW)[0])
-    assert torch.equal(found[0].fitted_sh0, found[1].fitted_sh0)
-    assert torch.equal(found[0].color_precision, found[1].color_precision)
+            actual.append(fit_batch_colors(groups, batch_photos, FEW)[0])
+    assert torch.equal(actual[0].fitted_sh0, actual[1].fitted_sh0)
+    assert torch.equal(actual[0].color_precision, actual[1].color_precision)
 
 
 def test_views_that_see_nothing_say_nothing(groups: GroupSet, batch_photos: BatchPhotos) -> None:
     away = batch_photos.cameras[:1]
     turn = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
     away = replace(away, viewmats=turn @ away.viewmats)
-    found, report = fit_batch_colors(groups, BatchPhotos(batch_photos.images[:1], away), FEW)
+    actual, report = fit_batch_colors(groups, BatchPhotos(batch_photos.images[:1], away), FEW)
     assert not report.accepted
-    assert torch.equal(found.fitted_sh0, groups.fitted_sh0)
-    assert torch.equal(found.color_precision, groups.color_precision)
+    assert torch.equal(actual.fitted_sh0, groups.fitted_sh0)
+    assert torch.equal(actual.color_precision, groups.color_precision)

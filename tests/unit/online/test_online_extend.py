@@ -53,17 +53,17 @@ def options(**settings: Any) -> CompactOptions:
 def test_a_first_batch_is_an_encoded_scene(robust: bool, k: int, scene: PixelScene) -> None:
     """As many Gaussians, about the same ones: what is solid is told by the moments, in float32."""
     settings = FAST | {"robust": robust}
-    found = fed([scene], fit="none", robust=robust).decode(k=k, fit="none")
-    wanted = decode_scene(encode_scene(scene, **settings), k=k)
-    scenes.assert_same_set(found, wanted, atol=5e-3, unit=0.05)
+    actual = fed([scene], fit="none", robust=robust).decode(k=k, fit="none")
+    expected = decode_scene(encode_scene(scene, **settings), k=k)
+    scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
 def test_a_first_batch_with_networks(scene: PixelScene, tmp_path: Any) -> None:
     checkpoint = str(written(tmp_path / "a.safetensors", noisy()))
     for k in (1, 4):
-        found = fed([scene], fit="none", checkpoint=checkpoint).decode(k=k, fit="none")
-        wanted = decode_scene(encode_scene(scene, **FAST | {"checkpoint": checkpoint}), k=k)
-        scenes.assert_same_set(found, wanted, atol=5e-3, unit=0.05)
+        actual = fed([scene], fit="none", checkpoint=checkpoint).decode(k=k, fit="none")
+        expected = decode_scene(encode_scene(scene, **FAST | {"checkpoint": checkpoint}), k=k)
+        scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
 def test_a_first_batch_keeps_its_frame_and_views(scene: PixelScene) -> None:
@@ -105,11 +105,11 @@ def test_reports_add_up(pairs: list[PixelScene]) -> None:
 
 
 def test_stages_are_told(pairs: list[PixelScene]) -> None:
-    told: list[str] = []
+    said: list[str] = []
     compactor = Compactor(**FAST)
     for batch in pairs[:2]:
-        compactor.extend(batch, progress=lambda stage, done, total: told.append(stage))
-    assert {"prepare", "segment", "encode", "match", "cover", "join", "fit"} <= {name.split(":")[0] for name in told}
+        compactor.extend(batch, progress=lambda stage, done, total: said.append(stage))
+    assert {"prepare", "segment", "encode", "match", "cover", "join", "fit"} <= {name.split(":")[0] for name in said}
 
 
 def test_the_old_state_is_left_as_it_is(pairs: list[PixelScene], first: OnlineState) -> None:
@@ -129,14 +129,14 @@ def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"robust": True, "k": 2}, {"checkpoint": "auto"}], ids=str)
 def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[PixelScene]) -> None:
-    states, found = [], []
+    states, actual = [], []
     for threads in (1, 2, 8):
         compactor = fed(pairs, **settings, threads=threads)
         states.append(state_of(compactor))
-        found.append(compactor.decode(fit="full", fit_steps=4, effort="fast"))
-    for one, gaussians in zip(states[1:], found[1:], strict=True):
+        actual.append(compactor.decode(fit="full", fit_steps=4, effort="fast"))
+    for one, gaussians in zip(states[1:], actual[1:], strict=True):
         same_state(replace(one, about={}), replace(states[0], about={}))
-        assert scenes.identical(gaussians, found[0])
+        assert scenes.identical(gaussians, actual[0])
 
 
 def test_the_same_seed_gives_the_same(pairs: list[PixelScene]) -> None:
@@ -231,10 +231,10 @@ def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
     assert kept is not None
     num = len(kept)
     for wish in ({"fit": "none"}, {"fit": "color"}, {"fit": "full", "fit_steps": 30}):
-        found = compactor.decode(**wish)
-        assert int((found.means[:, 2] < -10).sum()) == num, wish
-        wanted = len(compactor) + num + 60
-        assert len(compactor.decode(**wish, budget=wanted)) == pytest.approx(wanted, abs=2), wish
+        actual = compactor.decode(**wish)
+        assert int((actual.means[:, 2] < -10).sum()) == num, wish
+        expected = len(compactor) + num + 60
+        assert len(compactor.decode(**wish, budget=expected)) == pytest.approx(expected, abs=2), wish
 
 
 def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
@@ -294,9 +294,9 @@ def test_higher_harmonics_of_the_same_degree() -> None:
 @pytest.mark.parametrize("fit", ["none", "color", "full"])
 def test_a_budget_is_met(fit: str, pairs: list[PixelScene]) -> None:
     compactor = fed(pairs)
-    wanted = len(compactor) + 60
+    expected = len(compactor) + 60
     steps = {"fit_steps": 6} if fit == "full" else {}
-    assert wanted - 3 <= len(compactor.decode(budget=wanted, fit=fit, **steps)) <= wanted
+    assert expected - 3 <= len(compactor.decode(budget=expected, fit=fit, **steps)) <= expected
     with pytest.raises(UsageError, match="one for each group"):
         compactor.decode(budget=10, fit=fit)
 
@@ -338,11 +338,11 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[PixelScene], monkey
 
     monkeypatch.setattr(decode_module, "fit", refused)
     compactor = fed(pairs)
-    found = decode_stored(state_of(compactor), k=1, options=FitOptions(fit="color"))
-    assert found.fit is not None
-    assert not found.fit.accepted
-    assert [note for note in found.notes if "the fit was not accepted" in note]
-    assert scenes.identical(found.gaussians, compactor.decode(k=1, fit="none"))
+    actual = decode_stored(state_of(compactor), k=1, options=FitOptions(fit="color"))
+    assert actual.fit is not None
+    assert not actual.fit.accepted
+    assert [note for note in actual.notes if "the fit was not accepted" in note]
+    assert scenes.identical(actual.gaussians, compactor.decode(k=1, fit="none"))
 
 
 @pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"budget": "20KB"}], ids=str)

@@ -51,8 +51,8 @@ def test_colours_are_fitted_unless_told_otherwise() -> None:
 
 
 def test_the_state_s_settings_come_before_the_defaults() -> None:
-    told = {"superpixels": "7%", "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
-    state: Any = SimpleNamespace(about={"options": told, "batches": []})
+    said = {"superpixels": "7%", "fit": "none", "tolerance": 0.2, "threads": 3, "of another version": 5}
+    state: Any = SimpleNamespace(about={"options": said, "batches": []})
     options, online = merge_settings({"tolerance": 0.3, "seed": 4}, state)
     assert options.to_dict().items() >= {"superpixels": "7%", "fit": "none", "seed": 4}.items()
     assert online.tolerance == 0.3

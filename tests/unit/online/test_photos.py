@@ -26,11 +26,11 @@ def batch_photos(first: int, count: int) -> BatchPhotos:
 
 def kept(sizes: list[int], most: int, start: int = 0) -> Replay:
     """What is kept of batches of given sizes."""
-    found, first = NOTHING, start
+    actual, first = NOTHING, start
     for size in sizes:
-        found = update_replay(found, batch_photos(first, size), np.arange(first, first + size), first + size, most)
+        actual = update_replay(actual, batch_photos(first, size), np.arange(first, first + size), first + size, most)
         first += size
-    return found
+    return actual
 
 
 @pytest.mark.parametrize("most", [1, 2, 3, 4, 7, 16])
@@ -48,19 +48,19 @@ def test_kept_photos_do_not_depend_on_the_batches(most: int, num_views: int) -> 
     cuts = [[1] * num_views, [num_views - num_views // 2, num_views // 2]]
     cuts += [np.diff([0, *sorted(rng.integers(0, num_views, 3)), num_views]).tolist() for _ in range(3)]
     for sizes in cuts:
-        found = kept([size for size in sizes if size], most)
-        assert found.views.tolist() == views, sizes
-        np.testing.assert_array_equal(found.images, whole.images)
+        actual = kept([size for size in sizes if size], most)
+        assert actual.views.tolist() == views, sizes
+        np.testing.assert_array_equal(actual.images, whole.images)
 
 
 @pytest.mark.parametrize("start", [1, 3, 7])
 @pytest.mark.parametrize("most", [1, 2, 5])
 def test_views_without_photos_before(start: int, most: int) -> None:
     """Where the first photo is no even one, one is kept all the same."""
-    found = kept([1, 1, 1], most, start)
-    assert 1 <= len(found) <= most
-    assert found.views.tolist() == kept([3], most, start).views.tolist()
-    assert found.images[:, 0, 0, 0].tolist() == found.views.tolist()
+    actual = kept([1, 1, 1], most, start)
+    assert 1 <= len(actual) <= most
+    assert actual.views.tolist() == kept([3], most, start).views.tolist()
+    assert actual.images[:, 0, 0, 0].tolist() == actual.views.tolist()
 
 
 def test_views_that_come_again_are_kept_once() -> None:
@@ -71,9 +71,9 @@ def test_views_that_come_again_are_kept_once() -> None:
 
 
 def test_photos_of_views_that_came_without() -> None:
-    found = update_replay(kept([1, 1], 8, 4), batch_photos(0, 3), np.array([0, 2, 1]), 6, 8)
-    assert found.views.tolist() == [0, 1, 2, 4, 5]
-    assert found.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
+    actual = update_replay(kept([1, 1], 8, 4), batch_photos(0, 3), np.array([0, 2, 1]), 6, 8)
+    assert actual.views.tolist() == [0, 1, 2, 4, 5]
+    assert actual.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
 
 
 def test_known_cameras_are_found() -> None:
@@ -85,9 +85,9 @@ def test_known_cameras_are_found() -> None:
 
 
 def test_no_photos_are_kept_where_none_are_wanted() -> None:
-    found = kept([3, 2], 0)
-    assert found.images.shape == (0, 2, 3, 3)
-    assert len(found.views) == 0
+    actual = kept([3, 2], 0)
+    assert actual.images.shape == (0, 2, 3, 3)
+    assert len(actual.views) == 0
 
 
 def test_fewer_may_be_wanted_later() -> None:
@@ -99,37 +99,37 @@ def test_fewer_may_be_wanted_later() -> None:
 def test_colours_are_rounded() -> None:
     one = batch_photos(0, 1)
     values = np.linspace(0, 1, 18, dtype=np.float32).reshape(1, 2, 3, 3)
-    found = update_replay(NOTHING, BatchPhotos(values, one.cameras), np.array([0]), 1, 4)
-    assert found.images.dtype == np.uint8
-    np.testing.assert_allclose(found.images / 255, values, atol=0.5 / 255 + 1e-6)
+    actual = update_replay(NOTHING, BatchPhotos(values, one.cameras), np.array([0]), 1, 4)
+    assert actual.images.dtype == np.uint8
+    np.testing.assert_allclose(actual.images / 255, values, atol=0.5 / 255 + 1e-6)
 
 
 def test_pictures_of_the_states_size_are_left_as_they_are() -> None:
     scene = room(2)
     assert scene.images is not None
-    found = resize_photos(scene.images, scene.cameras, 36, 24)
-    assert found.images is not None
-    np.testing.assert_array_equal(found.images, scene.images.numpy())
-    assert found.cameras is scene.cameras
+    actual = resize_photos(scene.images, scene.cameras, 36, 24)
+    assert actual.images is not None
+    np.testing.assert_array_equal(actual.images, scene.images.numpy())
+    assert actual.cameras is scene.cameras
 
 
 @pytest.mark.parametrize("size", [(18, 12), (12, 8), (18, 24)])
 def test_pictures_of_another_size_are_averages(size: tuple[int, int]) -> None:
     scene = room(2)
     assert scene.images is not None
-    found = resize_photos(scene.images, scene.cameras, *size)
+    actual = resize_photos(scene.images, scene.cameras, *size)
     w, h = size
     means = scene.images.numpy().reshape(2, h, 24 // h, w, 36 // w, 3).mean((2, 4))
-    np.testing.assert_allclose(found.images, means, atol=1e-5)
-    assert len(found) == 2
+    np.testing.assert_allclose(actual.images, means, atol=1e-5)
+    assert len(actual) == 2
 
 
 def test_larger_pictures_keep_the_view() -> None:
     scene = room(1)
     assert scene.images is not None
-    found = resize_photos(scene.images, scene.cameras, 72, 48)
-    assert found.images.shape == (1, 48, 72, 3)
-    assert float(np.abs(found.images.mean((1, 2)) - scene.images.numpy().mean((1, 2))).max()) < 0.01
+    actual = resize_photos(scene.images, scene.cameras, 72, 48)
+    assert actual.images.shape == (1, 48, 72, 3)
+    assert float(np.abs(actual.images.mean((1, 2)) - scene.images.numpy().mean((1, 2))).max()) < 0.01
 
 
 def test_the_same_points_are_at_the_same_share_of_the_picture() -> None:
@@ -142,14 +142,14 @@ def test_the_same_points_are_at_the_same_share_of_the_picture() -> None:
 
 def test_joined_cameras_come_one_after_the_other() -> None:
     first, second = room(2).cameras, room(3).cameras
-    found = concat_cameras(first, second)
-    assert (len(found), found.width, found.height) == (5, 36, 24)
-    assert torch.equal(found.viewmats[2:], second.viewmats.double())
-    assert torch.equal(found.Ks[:2], first.Ks.double())
+    actual = concat_cameras(first, second)
+    assert (len(actual), actual.width, actual.height) == (5, 36, 24)
+    assert torch.equal(actual.viewmats[2:], second.viewmats.double())
+    assert torch.equal(actual.Ks[:2], first.Ks.double())
 
 
 def test_photos_at_half_size() -> None:
     scene = room(2)
     assert scene.images is not None
-    found = resize_photos(scene.images, scene.cameras, 36, 24).photos(2)
-    assert (found.width, found.height, len(found)) == (18, 12, 2)
+    actual = resize_photos(scene.images, scene.cameras, 36, 24).photos(2)
+    assert (actual.width, actual.height, len(actual)) == (18, 12, 2)

@@ -52,10 +52,10 @@ def uneven(some: Made) -> FeatureGaussians:
 
 @pytest.fixture(scope="module")
 def groups(some: Made, uneven: FeatureGaussians) -> GroupSet:
-    found = bake(uneven, some.members, None, 4)
+    actual = bake(uneven, some.members, None, 4)
     rng = torch.Generator().manual_seed(1)
-    fitted_sh0 = found.fitted_sh0 + 0.1 * torch.randn(found.fitted_sh0.shape, generator=rng)
-    return replace(found, fitted_sh0=fitted_sh0, color_precision=torch.rand(len(found), generator=rng))
+    fitted_sh0 = actual.fitted_sh0 + 0.1 * torch.randn(actual.fitted_sh0.shape, generator=rng)
+    return replace(actual, fitted_sh0=fitted_sh0, color_precision=torch.rand(len(actual), generator=rng))
 
 
 def assert_close(one: Gaussians, other: Gaussians, rtol: float = 1e-4) -> None:
@@ -83,28 +83,28 @@ def ones_and_most(groups: GroupSet, most: int) -> tuple[Gaussians, Gaussians]:
 
 @pytest.mark.parametrize("most", [1, 2, 4, 8])
 def test_baked_is_what_the_stages_decode(most: int, some: Made, uneven: FeatureGaussians) -> None:
-    found = bake(uneven, some.members, None, most)
-    ones, children = ones_and_most(found, most)
+    actual = bake(uneven, some.members, None, most)
+    ones, children = ones_and_most(actual, most)
     assert_close(ones, feature_to_gaussians(uneven))
-    wanted = decode(uneven, some.members, replace(ALL, k=most)) if most > 1 else feature_to_gaussians(uneven)
-    assert scenes.identical(found.children, wanted)
-    assert_same_children(children, wanted)
-    assert int(found.features.starts.diff().max()) <= most
+    expected = decode(uneven, some.members, replace(ALL, k=most)) if most > 1 else feature_to_gaussians(uneven)
+    assert scenes.identical(actual.children, expected)
+    assert_same_children(children, expected)
+    assert int(actual.features.starts.diff().max()) <= most
 
 
 def test_heads_are_in_what_is_baked(some: Made) -> None:
     networks = some.networks(noisy())
     features = encode_features(some.features, networks)
     assert features.latents.shape[1] == SMALL.latent
-    found = bake(features, some.members, networks, 4)
-    assert found.features.latents.shape == (len(features), 0)
-    ones, children = ones_and_most(found, 4)
+    actual = bake(features, some.members, networks, 4)
+    assert actual.features.latents.shape == (len(features), 0)
+    ones, children = ones_and_most(actual, 4)
     # lengths are floored beside the largest, so that the thinnest may be told anew
     assert_close(ones, decode(features, some.members, ALL, networks=networks), rtol=1e-3)
-    wanted = decode(features, some.members, replace(ALL, k=4), networks=networks)
-    assert_same_children(children, wanted)
+    expected = decode(features, some.members, replace(ALL, k=4), networks=networks)
+    assert_same_children(children, expected)
     plain = bake(features, some.members, None, 4)
-    assert not torch.equal(plain.children.sh0, found.children.sh0)
+    assert not torch.equal(plain.children.sh0, actual.children.sh0)
 
 
 def test_baked_groups_are_plain(groups: GroupSet, uneven: FeatureGaussians) -> None:
@@ -117,9 +117,9 @@ def test_baked_groups_are_plain(groups: GroupSet, uneven: FeatureGaussians) -> N
 
 
 def test_nothing_is_held_to_begin_with(some: Made, uneven: FeatureGaussians) -> None:
-    found = bake(uneven, some.members, None, 2)
-    assert not found.color_precision.any()
-    assert torch.equal(found.fitted_sh0, found.features.sh0)
+    actual = bake(uneven, some.members, None, 2)
+    assert not actual.color_precision.any()
+    assert torch.equal(actual.fitted_sh0, actual.features.sh0)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -132,8 +132,8 @@ def test_moments_are_what_is_decoded_from_them(degree: int) -> None:
 def test_moments_of_the_faintest_and_the_most_solid() -> None:
     gaussians = replace(random_gaussians(4, 5), opacities=torch.tensor([0.0, 1e-6, 0.999, 1.0]))
     features = replace(scenes.make_features(gaussians.means), **moments_of(gaussians))
-    found = feature_to_gaussians(features).opacities
-    np.testing.assert_allclose(found, [0, 1e-6, 0.999, 0.999], atol=1e-6)
+    actual = feature_to_gaussians(features).opacities
+    np.testing.assert_allclose(actual, [0, 1e-6, 0.999, 0.999], atol=1e-6)
 
 
 def test_moments_of_none() -> None:
@@ -145,11 +145,11 @@ def test_moments_of_none() -> None:
 
 def test_pick_takes_groups_with_their_children(groups: GroupSet) -> None:
     rows = torch.tensor([5, 0, 17, 5])
-    found = select_groups(groups, rows)
-    assert len(found) == 4
+    actual = select_groups(groups, rows)
+    assert len(actual) == 4
     for place, row in enumerate(rows.tolist()):
-        assert same_group(found, place, groups, row)
-    assert torch.equal(found.features.members, torch.arange(len(found.children)))
+        assert same_group(actual, place, groups, row)
+    assert torch.equal(actual.features.members, torch.arange(len(actual.children)))
 
 
 def test_pick_of_all_and_of_none(groups: GroupSet) -> None:
@@ -167,26 +167,26 @@ def test_joined_keeps_all_in_order(groups: GroupSet) -> None:
 def test_swapped_groups_take_the_places_of_others(groups: GroupSet) -> None:
     rows = torch.tensor([8, 2])
     others = select_groups(groups, torch.tensor([20, 21]))
-    found = replace_groups(groups, rows, others)
-    assert len(found) == len(groups)
+    actual = replace_groups(groups, rows, others)
+    assert len(actual) == len(groups)
     for row in range(len(groups)):
-        wanted = {8: 20, 2: 21}.get(row, row)
-        assert same_group(found, row, groups, wanted)
+        expected = {8: 20, 2: 21}.get(row, row)
+        assert same_group(actual, row, groups, expected)
 
 
 def test_thinned_pools_the_children_of_crowded_groups(groups: GroupSet) -> None:
-    found = limit_children(groups, 2)
-    sizes, before = found.features.starts.diff(), groups.features.starts.diff()
+    actual = limit_children(groups, 2)
+    sizes, before = actual.features.starts.diff(), groups.features.starts.diff()
     assert int(sizes.max()) == 2
     assert int(before.max()) > 2
     for row in range(len(groups)):
         if before[row] <= 2:
-            assert same_group(found, row, groups, row)
+            assert same_group(actual, row, groups, row)
             continue
         crowded = select_groups(groups, torch.tensor([row]))
-        wanted = decode(crowded.features, child_members(crowded), replace(ALL, k=2))
-        columns, children = group(found, row)
-        assert scenes.identical(children, wanted)
+        expected = decode(crowded.features, child_members(crowded), replace(ALL, k=2))
+        columns, children = group(actual, row)
+        assert scenes.identical(children, expected)
         own, _ = group(groups, row)
         assert all(torch.equal(columns[name], own[name]) for name in columns)
 
@@ -197,18 +197,18 @@ def test_nothing_is_thinned_where_none_is_crowded(groups: GroupSet) -> None:
 
 def test_children_of_one_member_each_are_left_as_they_are(groups: GroupSet) -> None:
     """Members of their own: asked for as many as there are, each is what it was."""
-    found = decode(groups.features, child_members(groups), replace(ALL, k=4))
-    assert_same_children(found, groups.children)
+    actual = decode(groups.features, child_members(groups), replace(ALL, k=4))
+    assert_same_children(actual, groups.children)
 
 
 def test_solved_colours_move_groups_and_children_alike(groups: GroupSet) -> None:
     """Real photos differ from what exports say, whatever the number of Gaussians."""
-    found = with_fitted_colors(groups)
-    assert torch.equal(found.features.sh0, groups.fitted_sh0)
+    actual = with_fitted_colors(groups)
+    assert torch.equal(actual.features.sh0, groups.fitted_sh0)
     offsets, sizes = groups.fitted_sh0 - groups.features.sh0, groups.features.starts.diff()
-    wanted = groups.children.sh0 + offsets.repeat_interleave(sizes, 0)
-    np.testing.assert_allclose(found.children.sh0, wanted, atol=1e-6)
-    same = replace(found, features=groups.features, children=replace(found.children, sh0=groups.children.sh0))
+    expected = groups.children.sh0 + offsets.repeat_interleave(sizes, 0)
+    np.testing.assert_allclose(actual.children.sh0, expected, atol=1e-6)
+    same = replace(actual, features=groups.features, children=replace(actual.children, sh0=groups.children.sh0))
     same_groups(same, groups)
 
 
@@ -261,10 +261,10 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Pixel
     state = from_encoded(encoded)
     assert state.settings.target_count is None
     assert state.settings.max_k == encoded.settings.max_k
-    found = to_encoded(state)
-    assert len(decode_scene(found, k=1)) <= len(encoded)
+    actual = to_encoded(state)
+    assert len(decode_scene(actual, k=1)) <= len(encoded)
     for k in (1, encoded.settings.max_k):
-        assert_same_children(decode_scene(found, k=k), decode_scene(encoded, k=k))
+        assert_same_children(decode_scene(actual, k=k), decode_scene(encoded, k=k))
 
 
 def test_division_between_one_and_most_is_about_as_good(pixels: PixelScene) -> None:

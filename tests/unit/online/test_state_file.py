@@ -144,11 +144,11 @@ def test_without_photos(tmp_path: Path) -> None:
 
 
 def test_what_is_not_known_is_not_looked_at(path: Path, state: OnlineState) -> None:
-    told, tensors = header(path), load_file(path)
+    said, tensors = header(path), load_file(path)
     tensors["features.moods"], tensors["division.slots"] = torch.full((7,), float("nan")), torch.zeros(3)
-    told |= {"minor": 7, "moods": ["good"]}
-    told["settings"]["mood"] = "better"
-    save_file(tensors, path, {STATE: json.dumps(told), "mood": "best"})
+    said |= {"minor": 7, "moods": ["good"]}
+    said["settings"]["mood"] = "better"
+    save_file(tensors, path, {STATE: json.dumps(said), "mood": "best"})
     same_state(load_state(path), state)
 
 
@@ -168,11 +168,11 @@ def test_a_state_is_no_encoded_scene(path: Path) -> None:
 @pytest.mark.parametrize("damage", sorted(DAMAGED))
 def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     DAMAGED[damage](path)
-    with pytest.raises(SceneError) as told:
+    with pytest.raises(SceneError) as said:
         load_state(path)
-    assert str(told.value).startswith(f"{path}: ")
-    assert "\n" not in str(told.value)
-    assert len(str(told.value)) < 400 + len(str(path))
+    assert str(said.value).startswith(f"{path}: ")
+    assert "\n" not in str(said.value)
+    assert len(str(said.value)) < 400 + len(str(path))
 
 
 def test_a_newer_schema_says_what_to_do(path: Path) -> None:

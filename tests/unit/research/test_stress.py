@@ -103,31 +103,31 @@ def test_views_are_taken_away_shuffled_and_repeated(scene: PixelScene) -> None:
 def test_every_case_on_a_scene_with_held_out_views(load: SceneLoad, made_scene: Path) -> None:
     read = read_held_out(load, made_scene / "targets")
     steps: list[tuple[str, int, int]] = []
-    found = stress(
+    actual = stress(
         load,
         CompactOptions().with_settings({"fit_steps": 30, "superpixels": "10%"}),
         targets=Views(read.cameras, read.images, read.names),
         progress=lambda *step: steps.append(step),
     )
-    assert [outcome.case for outcome in found] == list(CASES)
-    failed = {o.case: o.measured for o in found if o.passed is False}
+    assert [outcome.case for outcome in actual] == list(CASES)
+    failed = {o.case: o.measured for o in actual if o.passed is False}
     assert failed == {}
-    assert [o.case for o in found if o.passed is None] == ["c2w-opengl"]
+    assert [o.case for o in actual if o.passed is None] == ["c2w-opengl"]
     assert steps[-1] == ("done", len(CASES), len(CASES))
 
 
 def test_a_scene_in_no_order_skips_what_needs_pixels(load: SceneLoad) -> None:
     assert isinstance(load.scene, PixelScene)
     loose = UnalignedScene(load.scene.gaussians, load.scene.cameras, load.scene.images, load.scene.names)
-    found = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
-    assert [outcome.passed for outcome in found] == [None, None, True, None]
+    actual = stress(replace(load, scene=loose, cameras=None), FAST, cases=["order", "views-3", "large", "c2w-opencv"])
+    assert [outcome.passed for outcome in actual] == [None, None, True, None]
 
 
 def test_without_photos(load: SceneLoad) -> None:
     bare = replace(load, scene=replace(load.scene, images=None))
-    found = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
-    assert [outcome.passed for outcome in found] == [True, None, True]
-    assert "renders of the input" in found[0].measured
+    actual = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
+    assert [outcome.passed for outcome in actual] == [True, None, True]
+    assert "renders of the input" in actual[0].measured
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:

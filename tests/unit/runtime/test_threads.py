@@ -76,19 +76,19 @@ def test_without_a_block_a_pool_is_made_for_the_call() -> None:
 
 
 def test_two_callers_do_not_stop_each_other() -> None:
-    found: dict[int, list[int]] = {}
+    actual: dict[int, list[int]] = {}
 
     def caller(i: int) -> None:
         with use_threads(2):
             for _ in range(20):
-                found[i] = parallel_map(lambda j: i + j, range(10))
+                actual[i] = parallel_map(lambda j: i + j, range(10))
 
     threads = [threading.Thread(target=caller, args=(i,)) for i in (0, 100)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(60)
-    assert found == {0: list(range(10)), 100: list(range(100, 110))}
+    assert actual == {0: list(range(10)), 100: list(range(100, 110))}
 
 
 def test_overlapping_blocks_give_the_libraries_their_threads_back() -> None:

@@ -74,9 +74,9 @@ def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k:
     even = replace(members, opacities=np.full_like(members.opacities, 0.5))
     groups = segment(scene.images, SegmentOptions(), COUNT)
     paper = encode(scene, even, groups, EncodeOptions("paper"))
-    found = decode(paper, even, DecodeOptions(k=k), rule="paper")
-    assert len(found) == 2 * COUNT * k
-    np.testing.assert_allclose(found.opacities, 0.5, rtol=1e-3)
+    actual = decode(paper, even, DecodeOptions(k=k), rule="paper")
+    assert len(actual) == 2 * COUNT * k
+    np.testing.assert_allclose(actual.opacities, 0.5, rtol=1e-3)
     if k > 1:
         assert (decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).abs().max() > 0.1
 
@@ -135,8 +135,8 @@ def test_gains_and_spreads_reach_the_children(features: FeatureGaussians, member
     stronger = replace(features, gains=2 * features.gains, spreads=1.5 * features.spreads)
     changed = decode(stronger, members, DecodeOptions(k=2, min_opacity=0))
     np.testing.assert_allclose(changed.scales, 1.5 * plain.scales, rtol=1e-5)
-    wanted = 1 - (1 - plain.opacities.double()) ** 2
-    np.testing.assert_allclose(changed.opacities, wanted.clamp(max=0.999), rtol=1e-4)
+    expected = 1 - (1 - plain.opacities.double()) ** 2
+    np.testing.assert_allclose(changed.opacities, expected.clamp(max=0.999), rtol=1e-4)
 
 
 def test_merged_features_are_split_again(features: FeatureGaussians, members: Members) -> None:
@@ -152,9 +152,9 @@ def test_backing_stays_at_one(features: FeatureGaussians, members: Members, k: i
         features, backing=torch.ones(len(features), dtype=torch.bool), extinctions=2 * features.extinctions
     )
     both = FeatureGaussians.concat([features, behind])
-    found = decode(both, members, DecodeOptions(k=k, min_opacity=0))
-    assert len(found) == 2 * COUNT * (k + 1)
-    assert_alike(found[2 * COUNT * k :], feature_to_gaussians(behind))
+    actual = decode(both, members, DecodeOptions(k=k, min_opacity=0))
+    assert len(actual) == 2 * COUNT * (k + 1)
+    assert_alike(actual[2 * COUNT * k :], feature_to_gaussians(behind))
 
 
 @pytest.mark.parametrize("k", [1, 2])
@@ -178,9 +178,9 @@ def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
     assert half.images is not None
     features = encode(half, own, segment(half.images, SegmentOptions(), COUNT), EncodeOptions())
     assert len(features) == 2 * COUNT
-    found = decode(features, own, DecodeOptions(k=k))
-    assert len(found) == COUNT * k
-    assert (found.opacities >= 1 / 255).all()
+    actual = decode(features, own, DecodeOptions(k=k))
+    assert len(actual) == COUNT * k
+    assert (actual.opacities >= 1 / 255).all()
 
 
 @pytest.mark.parametrize("k", [0, -1, 9])

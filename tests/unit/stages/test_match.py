@@ -14,11 +14,11 @@ METHODS = ["overlap", "aabb"]
 
 
 def sets(features: FeatureGaussians, **settings: object) -> set[frozenset[int]]:
-    found = match(features, MatchOptions(**settings))  # type: ignore[arg-type]
-    assert found.clusters.dtype == torch.int64
-    assert sorted(set(found.clusters.tolist())) == list(range(found.count))
-    clusters = found.clusters.numpy()
-    return {frozenset(np.nonzero(clusters == c)[0].tolist()) for c in range(found.count)}
+    actual = match(features, MatchOptions(**settings))  # type: ignore[arg-type]
+    assert actual.clusters.dtype == torch.int64
+    assert sorted(set(actual.clusters.tolist())) == list(range(actual.count))
+    clusters = actual.clusters.numpy()
+    return {frozenset(np.nonzero(clusters == c)[0].tolist()) for c in range(actual.count)}
 
 
 def alone(count: int) -> set[frozenset[int]]:

@@ -108,9 +108,9 @@ def test_every_member_once_whatever_the_clusters() -> None:
     sizes = rng.integers(1, 5, 40).tolist()
     features = with_members(make_features(rng.normal(size=(40, 3))), sizes)
     labels = np.unique(rng.integers(0, 25, 40), return_inverse=True)[1]
-    found = Matches(torch.from_numpy(labels.reshape(-1)), int(labels.max()) + 1)
-    merged = merge(features, found)
-    assert len(merged) == found.count
+    actual = Matches(torch.from_numpy(labels.reshape(-1)), int(labels.max()) + 1)
+    merged = merge(features, actual)
+    assert len(merged) == actual.count
     assert sorted(merged.members.tolist()) == features.members.tolist()
     assert float(merged.extinctions.sum()) == pytest.approx(float(features.extinctions.sum()), rel=1e-5)
     assert float(merged.masses.sum()) == pytest.approx(float(features.masses.sum()), rel=1e-5)

@@ -147,8 +147,8 @@ def test_pixel_depths() -> None:
     depths = pixel_depths(scene)
     eyes = scene.cameras.centres.repeat_interleave(48, 0)
     forward = scene.cameras.viewmats[:, 2, :3].repeat_interleave(48, 0)
-    wanted = ((scene.gaussians.means - eyes) * forward).sum(1)
-    np.testing.assert_allclose(depths.reshape(-1), wanted, rtol=1e-5)
+    expected = ((scene.gaussians.means - eyes) * forward).sum(1)
+    np.testing.assert_allclose(depths.reshape(-1), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -200,17 +200,17 @@ def test_knee_is_where_the_slope_is_the_one_asked_for() -> None:
     """D = 0.1 / N without a floor: 10 / ln 10 = 4.3 dB per relative increase everywhere; with one it falls."""
     counts = np.arange(1, 2000)
     for floor in (1e-3, 1e-4):
-        found = knee(counts, 0.1 / counts, AllocateOptions(knee_slope=2.0, knee_floor=floor))
-        middle = found / 1.25**0.5  # the slope is measured over a factor of 1.25
+        actual = knee(counts, 0.1 / counts, AllocateOptions(knee_slope=2.0, knee_floor=floor))
+        middle = actual / 1.25**0.5  # the slope is measured over a factor of 1.25
         share = (0.1 / middle) / (floor + 0.1 / middle)
         assert 10 / np.log(10) * share == pytest.approx(2.0, rel=0.02)
 
 
 def test_knee_does_not_rise_with_the_slope() -> None:
     tree = tree_of(noise(), slanted())
-    found = [knee(tree.counts, tree.distortions, AllocateOptions(knee_slope=s)) for s in (0.1, 0.5, 1, 2, 4, 50)]
-    assert found == sorted(found, reverse=True)
-    assert found[-1] == 1
+    actual = [knee(tree.counts, tree.distortions, AllocateOptions(knee_slope=s)) for s in (0.1, 0.5, 1, 2, 4, 50)]
+    assert actual == sorted(actual, reverse=True)
+    assert actual[-1] == 1
 
 
 def test_knee_of_nothing() -> None:

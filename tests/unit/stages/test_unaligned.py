@@ -82,8 +82,8 @@ def test_rows_by_pixel_are_those_of_the_grid(room: PixelScene, groups: Groups) -
     """Members that know their pixels are grouped as those of a scene in order."""
     scene, pixels = loose.loosened(room), np.arange(len(room.gaussians))
     members = unaligned_members(scene, pixels)
-    for found, wanted in zip(member_rows(scene, members, groups), group_rows(room, groups), strict=True):
-        assert (found == wanted).all()
+    for actual, expected in zip(member_rows(scene, members, groups), group_rows(room, groups), strict=True):
+        assert (actual == expected).all()
     np.testing.assert_allclose(members.footprints, scene_members(room).footprints, rtol=1e-5)
     one, other = (
         encode(scene, members, groups, EncodeOptions()),
@@ -106,16 +106,16 @@ def test_members_without_a_pixel_are_in_no_group(room: PixelScene, groups: Group
 
 
 def test_frame_is_that_of_the_grid(room: PixelScene) -> None:
-    found, wanted = canonicalise(loose.loosened(room))[1], find_frame(room)
-    assert found.unit == wanted.unit
-    assert (found.origin - wanted.origin).abs().max() < 0.5
+    actual, expected = canonicalise(loose.loosened(room))[1], find_frame(room)
+    assert actual.unit == expected.unit
+    assert (actual.origin - expected.origin).abs().max() < 0.5
 
 
 def test_depths_are_those_of_the_surfaces(room: PixelScene) -> None:
     depths, valid = seen_depths(loose.loosened(room))
-    _, wanted, _ = scenes.trace(scenes.room(), room.cameras)
+    _, expected, _ = scenes.trace(scenes.room(), room.cameras)
     assert valid.float().mean() > 0.99
-    error = (depths.numpy().reshape(3, -1) / wanted - 1)[valid.reshape(3, -1).numpy()]
+    error = (depths.numpy().reshape(3, -1) / expected - 1)[valid.reshape(3, -1).numpy()]
     assert np.median(np.abs(error)) < 0.01
 
 

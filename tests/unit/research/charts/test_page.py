@@ -70,9 +70,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_the_page_is_well_formed(page: str) -> None:
-    found = outline(page)
-    assert found.open == []
-    assert len(found.ids) == len(set(found.ids))
+    actual = outline(page)
+    assert actual.open == []
+    assert len(actual.ids) == len(set(actual.ids))
     assert page.startswith("<!DOCTYPE html>\n<html lang=")
 
 
@@ -85,11 +85,11 @@ def test_the_page_fetches_nothing(page: str) -> None:
 
 
 def test_every_reference_inside_the_page_is_there(page: str) -> None:
-    found = outline(page)
-    inside = {value[1:] for value in found.fetched if value.startswith("#")}
+    actual = outline(page)
+    inside = {value[1:] for value in actual.fetched if value.startswith("#")}
     inside |= set(re.findall(r"url\(#([^)]+)\)", page))
     assert len(inside) > 20
-    assert inside - set(found.ids) == set()
+    assert inside - set(actual.ids) == set()
 
 
 def test_the_page_says_what_was_found(page: str) -> None:

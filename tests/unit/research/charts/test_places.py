@@ -125,13 +125,13 @@ def test_proxies_fill_superpixels_with_their_means(made_scene: Path, tmp_path: P
     assert images is not None
     coarse, fine = (proxy_psnr(images[0], count, "rdseg") for count in (20, 600))
     assert 10 < coarse < fine - 3
-    wanted = proxy_points("ab" * 32, 2)
-    assert len(wanted) == len(SEGMENTATIONS) * len(SHARES)
-    some = {key: point for key, point in wanted.items() if point in (("rdseg", 0.01), ("slic", 0.01))}
+    expected = proxy_points("ab" * 32, 2)
+    assert len(expected) == len(SEGMENTATIONS) * len(SHARES)
+    some = {key: point for key, point in expected.items() if point in (("rdseg", 0.01), ("slic", 0.01))}
     done: list[int] = []
     measure_proxies(tmp_path, "room", images, some, max_views=2, progress=lambda: done.append(1))
-    found, notes = read_proxies(tmp_path)
-    assert (set(found), notes, len(done)) == (set(some), (), 2)
-    rdseg, slic = (next(p for p in found.values() if p.segmentation == name) for name in ("rdseg", "slic"))
+    actual, notes = read_proxies(tmp_path)
+    assert (set(actual), notes, len(done)) == (set(some), (), 2)
+    rdseg, slic = (next(p for p in actual.values() if p.segmentation == name) for name in ("rdseg", "slic"))
     assert rdseg.psnr > slic.psnr
     assert (rdseg.superpixels, rdseg.views) == (61, 2)

@@ -24,16 +24,16 @@ def test_t_factors_are_those_of_the_tables(count: int, factor: float) -> None:
 
 
 def test_mean_interval() -> None:
-    found = mean_interval([20.0, 22.0, 27.0])
+    actual = mean_interval([20.0, 22.0, 27.0])
     half = 4.302653 * np.std([20, 22, 27], ddof=1) / math.sqrt(3)
-    assert (found.mean, found.count) == (23, 3)
-    assert found.low == pytest.approx(23 - half, abs=1e-5)
-    assert found.high == pytest.approx(23 + half, abs=1e-5)
+    assert (actual.mean, actual.count) == (23, 3)
+    assert actual.low == pytest.approx(23 - half, abs=1e-5)
+    assert actual.high == pytest.approx(23 + half, abs=1e-5)
 
 
 def test_one_scene_has_a_mean_and_no_width() -> None:
-    found = mean_interval([21.5])
-    assert (found.mean, found.low, found.high, found.count) == (21.5, 21.5, 21.5, 1)
+    actual = mean_interval([21.5])
+    assert (actual.mean, actual.low, actual.high, actual.count) == (21.5, 21.5, 21.5, 1)
     with pytest.raises(ValueError, match="at least one value"):
         mean_interval([])
 
@@ -41,18 +41,18 @@ def test_one_scene_has_a_mean_and_no_width() -> None:
 def test_pairing_takes_out_what_scenes_differ_by() -> None:
     ours = {"a": 15.0, "b": 25.0, "c": 31.0, "only ours": 99.0}
     theirs = {"a": 14.0, "b": 24.1, "c": 29.9}
-    found = paired_difference(ours, theirs)
-    assert found.mean == pytest.approx(1.0)
-    assert found.count == 3
-    assert found.low > 0.7
+    actual = paired_difference(ours, theirs)
+    assert actual.mean == pytest.approx(1.0)
+    assert actual.count == 3
+    assert actual.low > 0.7
     assert mean_interval(list(ours.values())[:3]).high - mean_interval([15, 25, 31]).low > 10
 
 
 def test_paired_intervals_match_a_slow_twin() -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(20, 5, (6, 1)) + rng.normal(0, 0.3, (6, 4))
-    found = paired_intervals(values)
-    for j, interval in enumerate(found):
+    actual = paired_intervals(values)
+    for j, interval in enumerate(actual):
         own = [values[i, j] - np.mean(values[i]) + np.mean(values) for i in range(6)]
         half = t_factor(6) * np.std(own, ddof=1) / math.sqrt(6) * math.sqrt(4 / 3)
         assert interval.mean == pytest.approx(np.mean(values[:, j]))
@@ -108,32 +108,32 @@ OURS = {scene: [(1.0, 20.0 + i), (10.0, 24.0 + i)] for i, scene in enumerate("ab
 )
 def test_verdicts(shift: tuple[float, ...], words: str) -> None:
     points = {scene: (10.0, 24.0 + i + shift[i]) for i, scene in enumerate("abc")}
-    found = judge("voxel", points, OURS)
-    assert (found.baseline, found.words) == ("voxel", words)
-    assert found.ahead is not None
-    assert found.ahead.mean == pytest.approx(-np.mean(shift))
-    assert found.ours == pytest.approx(25)
-    assert found.quality == pytest.approx(25 + np.mean(shift))
+    actual = judge("voxel", points, OURS)
+    assert (actual.baseline, actual.words) == ("voxel", words)
+    assert actual.ahead is not None
+    assert actual.ahead.mean == pytest.approx(-np.mean(shift))
+    assert actual.ours == pytest.approx(25)
+    assert actual.quality == pytest.approx(25 + np.mean(shift))
 
 
 def test_verdicts_where_less_is_better() -> None:
     ours = {"a": [(1.0, 0.3), (10.0, 0.2)]}
-    found = judge("voxel", {"a": (10.0, 0.25)}, ours, higher=False)
-    assert found.words == "ours above"
-    assert found.ours == pytest.approx(0.2)
-    assert found.quality == pytest.approx(0.25)
-    assert found.ahead is not None
-    assert found.ahead.mean == pytest.approx(0.05)
+    actual = judge("voxel", {"a": (10.0, 0.25)}, ours, higher=False)
+    assert actual.words == "ours above"
+    assert actual.ours == pytest.approx(0.2)
+    assert actual.quality == pytest.approx(0.25)
+    assert actual.ahead is not None
+    assert actual.ahead.mean == pytest.approx(0.05)
 
 
 def test_nothing_is_said_where_ours_has_nothing_as_cheap() -> None:
-    found = judge("random", {"a": (0.1, 30.0)}, OURS)
-    assert (found.ours, found.ahead, found.quality) == (None, None, 30)
-    assert found.words == "ours has none so cheap"
+    actual = judge("random", {"a": (0.1, 30.0)}, OURS)
+    assert (actual.ours, actual.ahead, actual.quality) == (None, None, 30)
+    assert actual.words == "ours has none so cheap"
 
 
 def test_one_scene_of_several_says_nothing() -> None:
     curve = {"a": [(1.0, 20.0)], "b": [(9.0, 20.0)]}
-    found = judge("voxel", {"a": (2.0, 15.0), "b": (2.0, 15.0)}, curve)
-    assert (found.words, found.ahead and found.ahead.count) == ("undecided", 1)
+    actual = judge("voxel", {"a": (2.0, 15.0), "b": (2.0, 15.0)}, curve)
+    assert (actual.words, actual.ahead and actual.ahead.count) == ("undecided", 1)
     assert judge("voxel", {"a": (2.0, 15.0)}, curve).words == "ours above"

@@ -27,17 +27,17 @@ def test_records_come_back_as_they_were(tmp_path: Path) -> None:
     second = record("2", error='no "room"')
     append_run(tmp_path / "new" / "folder", first)
     append_run(tmp_path / "new" / "folder", second)
-    found, notes = read_runs(tmp_path / "new" / "folder")
-    assert list(found.values()) == [first, second]
+    actual, notes = read_runs(tmp_path / "new" / "folder")
+    assert list(actual.values()) == [first, second]
     assert notes == ()
 
 
 def test_the_newest_run_of_a_key_counts(tmp_path: Path) -> None:
     for made in (record("1", count=1), record("2"), record("1", count=2)):
         append_run(tmp_path, made)
-    found, _ = read_runs(tmp_path)
-    assert list(found) == ["2", "1"]
-    assert found["1"].count == 2
+    actual, _ = read_runs(tmp_path)
+    assert list(actual) == ["2", "1"]
+    assert actual["1"].count == 2
 
 
 def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
@@ -48,8 +48,8 @@ def test_every_way_to_cut_the_last_line(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for length in range(start, len(whole)):
         path.write_bytes(whole[:length])
-        found, notes = read_runs(tmp_path)
-        assert list(found) == ["1"]
+        actual, notes = read_runs(tmp_path)
+        assert list(actual) == ["1"]
         assert len(notes) == (length > start)
         append_run(tmp_path, record("2", count=20))
         assert path.read_bytes() == whole
@@ -61,8 +61,8 @@ def test_a_damaged_line_in_the_middle_costs_that_line_alone(tmp_path: Path) -> N
     lines = (tmp_path / RUNS).read_bytes().splitlines(keepends=True)
     lines[1] = b"\x00" * 20 + b"\n"
     (tmp_path / RUNS).write_bytes(b"".join(lines))
-    found, notes = read_runs(tmp_path)
-    assert list(found) == ["1", "3"]
+    actual, notes = read_runs(tmp_path)
+    assert list(actual) == ["1", "3"]
     assert "line 2 is damaged" in notes[0]
 
 
@@ -70,8 +70,8 @@ def test_lines_of_another_version_are_passed_over(tmp_path: Path) -> None:
     append_run(tmp_path, record("1"))
     append_line(tmp_path / RUNS, record("2").to_dict() | {"schema_version": 99})
     append_line(tmp_path / RUNS, {"schema_version": 1, "key": "3"})
-    found, notes = read_runs(tmp_path)
-    assert list(found) == ["1"]
+    actual, notes = read_runs(tmp_path)
+    assert list(actual) == ["1"]
     assert "2 line(s) of another version" in notes[0]
 
 
@@ -85,8 +85,8 @@ def test_lines_of_other_kinds_of_values_are_passed_over(odd: dict[str, object], 
     append_run(tmp_path, record("1", psnr_target=20.5, stages={"fit": 2}))
     with (tmp_path / RUNS).open("a") as file:
         file.write(json.dumps(record("2").to_dict() | odd) + "\n")
-    found, notes = read_runs(tmp_path)
-    assert list(found) == ["1"]
+    actual, notes = read_runs(tmp_path)
+    assert list(actual) == ["1"]
     assert "1 line(s) of another version" in notes[0]
 
 

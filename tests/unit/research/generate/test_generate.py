@@ -98,8 +98,8 @@ def test_what_is_there_is_kept_and_the_rest_added(folder: Path, tmp_path: Path) 
     generate(tmp_path, 1, TINY)
     before = (tmp_path / "scene_0000" / "scene.ply").stat().st_mtime_ns
     calls: list[tuple[int, int]] = []
-    found = generate(tmp_path, 2, TINY, progress=lambda done, total: calls.append((done, total)))
-    assert [scene.kept for scene in found] == [True, False]
+    actual = generate(tmp_path, 2, TINY, progress=lambda done, total: calls.append((done, total)))
+    assert [scene.kept for scene in actual] == [True, False]
     assert (tmp_path / "scene_0000" / "scene.ply").stat().st_mtime_ns == before
     assert calls[-1] == (2, 2)
     assert contents(tmp_path / "scene_0001") == contents(folder / "scene_0001")

@@ -106,17 +106,17 @@ def test_errors_are_larger_without_texture() -> None:
     image[: H // 2] = 0.5
     given = replace(seen(), image=image)
     assert texture_mask(image)[: H // 2 - 4].max() == 0
-    found = seen_again(made(replace(CLEAN, grain=0.01, blank=2.0), given))[1]
-    off = np.log(found / given.depth)
+    actual = seen_again(made(replace(CLEAN, grain=0.01, blank=2.0), given))[1]
+    off = np.log(actual / given.depth)
     assert off[: H // 2 - 4].std() == pytest.approx(3 * off[H // 2 + 4 :].std(), rel=0.2)
 
 
 def test_the_sky_is_as_far_as_the_network_can_say() -> None:
     depth = seen().depth.copy()
     depth[:10] = 1e6
-    found = seen_again(made(CLEAN, replace(seen(), depth=depth)))[1]
-    assert found[:5].max() <= 9.01 * np.median(depth)
-    assert np.isfinite(found).all()
+    actual = seen_again(made(CLEAN, replace(seen(), depth=depth)))[1]
+    assert actual[:5].max() <= 9.01 * np.median(depth)
+    assert np.isfinite(actual).all()
 
 
 def test_shares_are_met() -> None:
@@ -136,9 +136,9 @@ def test_harmonics_show_the_photo_to_their_own_camera(degree: int) -> None:
     assert gaussians.shN.shape[1] == (degree + 1) ** 2 - 1
     assert gaussians.shN.std() == pytest.approx(0.05, rel=0.5)
     parts = (gaussians.means.numpy(), gaussians.sh0.numpy(), gaussians.shN.numpy())
-    found = np.empty((W * H, 3), np.float32)
-    view_colors(*parts, np.arange(W * H, dtype=np.int32), POSE[:3, 3].astype(np.float32), 0, W * H, found)
-    np.testing.assert_allclose(found, seen().image.reshape(-1, 3), atol=1e-4)
+    actual = np.empty((W * H, 3), np.float32)
+    view_colors(*parts, np.arange(W * H, dtype=np.int32), POSE[:3, 3].astype(np.float32), 0, W * H, actual)
+    np.testing.assert_allclose(actual, seen().image.reshape(-1, 3), atol=1e-4)
 
 
 def test_what_is_drawn_lies_in_the_ranges() -> None:

@@ -234,9 +234,9 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
         def loss(window: Window = window) -> torch.Tensor:
             return window_loss(networks, window, scales, options, 0, np.random.default_rng(0))
 
-        found = torch.autograd.grad(loss(), parameters)
+        actual = torch.autograd.grad(loss(), parameters)
         directions = [torch.randn(p.shape, generator=generator) for p in parameters]
-        derivative = sum(float((g * d).sum()) for g, d in zip(found, directions, strict=True))
+        derivative = sum(float((g * d).sum()) for g, d in zip(actual, directions, strict=True))
         before, values = [p.detach().clone() for p in parameters], []
         for step in (1e-2, -1e-2):
             with torch.no_grad():
@@ -256,8 +256,8 @@ def test_every_network_learns_from_renders(example: Example) -> None:
     for window in windows(example, 6):
         loss = window_loss(networks, window, scales, options, 0, np.random.default_rng(0))
         names, parameters = zip(*networks.named_parameters(), strict=True)
-        found = torch.autograd.grad(loss, parameters, allow_unused=True)
-        for name, gradient in zip(names, found, strict=True):
+        actual = torch.autograd.grad(loss, parameters, allow_unused=True)
+        for name, gradient in zip(names, actual, strict=True):
             network = next(network for network in seen if name.startswith(network))
             seen[network] += 0.0 if gradient is None else float(gradient.abs().sum())
     assert {name for name, value in seen.items() if value > 0} == {"encoder", "merger", "refiner", "heads.1", "heads.2"}

@@ -84,8 +84,8 @@ def test_differences_undo_corrections(example: Example) -> None:
     frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
     frames = frames * torch.linalg.det(frames)[:, None, None]
     expected = bound_residuals(raw, TINY.bounds, 0.5)
-    found = corrections_between(start, move_gaussians(start, expected, frames), frames)
-    torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-3)
+    actual = corrections_between(start, move_gaussians(start, expected, frames), frames)
+    torch.testing.assert_close(actual, expected, atol=2e-4, rtol=1e-3)
 
 
 def test_untrained_networks_predict_nothing(example: Example) -> None:

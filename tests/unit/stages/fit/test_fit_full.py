@@ -62,11 +62,11 @@ def test_perturbed_scene_comes_back(scene: PixelScene, truth: Gaussians, photos:
 def test_view_between_gets_better(scene: PixelScene, truth: Gaussians, photos: Pair) -> None:
     """Not one of the photos."""
     between = scenes.arc(1, 48, 36, start=-0.25)
-    wanted = scenes.images_of(truth, between)[0].clip(0, 1)
+    expected = scenes.images_of(truth, between)[0].clip(0, 1)
 
     def score(gaussians: Gaussians) -> float:
         image = scenes.images_of(gaussians, between)[0].clip(0, 1)
-        return float(-10 * np.log10(((image - wanted) ** 2).mean()))
+        return float(-10 * np.log10(((image - expected) ** 2).mean()))
 
     start = scenes.spoil(truth)
     assert score(fit_full(start, photos, LONG)[0]) > score(start) + 3
@@ -107,9 +107,9 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
 
     def shares_of(some: Pair) -> np.ndarray:
         plan = plan_run(some, QUICK, 0)
-        psnr, found = initial_scores(state, plan)
+        psnr, actual = initial_scores(state, plan)
         assert psnr == holdout_score(state, plan)
-        return found
+        return actual
 
     def with_views(views: list[int]) -> Pair:
         return tuple(Photos(p.images[views], p.viewmats[views], p.Ks[views], p.eps2d) for p in photos)  # type: ignore[return-value]
@@ -221,8 +221,8 @@ def test_perfect_start_is_not_spoilt(scene: PixelScene, truth: Gaussians, photos
     result, report = fit_full(truth, photos, LONG)
     assert report.accepted == (report.holdout_after > report.holdout_before)
     assert report.accepted or result is truth
-    found, wanted = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
-    assert np.abs(found - wanted).mean() < 0.01
+    actual, expected = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
+    assert np.abs(actual - expected).mean() < 0.01
 
 
 def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
@@ -311,9 +311,9 @@ def test_steps_follow_the_time_budget(photos: Pair) -> None:
     probe, most = full_module.PROBE, full_module.MAX_STEPS
     assert steps(1e-9, 1.0) == probe + 1
     assert steps(1e9, 1.0) == most
-    found = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
-    assert found == sorted(found)
-    assert found[0] > probe + 1
+    actual = [steps(budget, 0.06) for budget in (0.5, 1, 2, 4)]
+    assert actual == sorted(actual)
+    assert actual[0] > probe + 1
     # a step of 10 ms at half size: 70 % of the steps at that, the rest at three times it
     assert steps(1.0, 0.06) == pytest.approx(probe + (1.0 - 0.06) / (0.01 * (0.7 + 3 * 0.3)), abs=1)
 
@@ -324,14 +324,14 @@ def test_steps_follow_the_time_budget(photos: Pair) -> None:
 def test_rates_decay() -> None:
     rates = LearningRates()
     start, half, end = (step_sizes(rates, p, 100) for p in (0.0, 0.5, 1.0))
-    wanted = (
+    expected = (
         [rates.means_lr] * 3
         + [rates.scales_lr] * 3
         + [rates.quats_lr] * 4
         + [rates.opacities_lr]
         + [rates.colors_lr] * 3
     )
-    np.testing.assert_allclose(start, wanted, rtol=1e-6)
+    np.testing.assert_allclose(start, expected, rtol=1e-6)
     np.testing.assert_allclose(end, rates.decay * start, rtol=1e-6)
     assert rates.decay < 1
     np.testing.assert_allclose(half**2, start * end, rtol=1e-6)
@@ -359,11 +359,11 @@ def test_score_is_that_of_the_half_size_blocks(truth: Gaussians, photos: Pair) -
 
 @pytest.mark.parametrize("settings", [{}, {"dropout": 0.2}, {"fit_steps": 160}], ids=str)
 def test_threads_change_no_bit(truth: Gaussians, photos: Pair, settings: dict[str, Any]) -> None:
-    start, found = scenes.spoil(truth), []
+    start, actual = scenes.spoil(truth), []
     for threads in (1, 2, 8):
         with use_threads(threads):
-            found.append(fit_full(start, photos, replace(QUICK, **settings), count=len(start) + 20, seed=3))
-    assert all(scenes.identical(a[0], b[0]) and a[1] == b[1] for a, b in itertools.pairwise(found))
+            actual.append(fit_full(start, photos, replace(QUICK, **settings), count=len(start) + 20, seed=3))
+    assert all(scenes.identical(a[0], b[0]) and a[1] == b[1] for a, b in itertools.pairwise(actual))
 
 
 def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:

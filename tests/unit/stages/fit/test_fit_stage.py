@@ -45,9 +45,9 @@ def noise(photos: Pair) -> Pair:
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     result, report = fit(start, photos, QUICK, seed=4)
-    wanted, own = fit_full(start, photos, QUICK, seed=4)
+    expected, own = fit_full(start, photos, QUICK, seed=4)
     assert report == own
-    assert scenes.identical(result, wanted)
+    assert scenes.identical(result, expected)
 
 
 def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:

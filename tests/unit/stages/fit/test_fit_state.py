@@ -21,8 +21,8 @@ from gsmerge.stages.fit.state import State, gaussians_of, start_state
 
 def make(degree: int) -> tuple[PixelScene, Gaussians]:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
-    found = scenes.plain(scene, superpixels="8%")
-    return scene, replace(found, means=found.means.float())
+    actual = scenes.plain(scene, superpixels="8%")
+    return scene, replace(actual, means=actual.means.float())
 
 
 @pytest.fixture(scope="module")
@@ -66,16 +66,16 @@ def test_state_and_back(degree: int) -> None:
     state = start_state(gaussians)
     assert state.x.shape == (len(gaussians), COLUMNS)
     assert state.x.dtype == np.float32
-    found = gaussians_of(state.x, state.splats.shN)
-    assert found.sh_degree == degree
-    torch.testing.assert_close(found.means, gaussians.means, rtol=0, atol=0)
-    torch.testing.assert_close(found.quats, gaussians.quats, rtol=0, atol=0)
-    torch.testing.assert_close(found.shN, gaussians.shN, rtol=0, atol=0)
-    torch.testing.assert_close(found.scales, gaussians.scales, rtol=1e-5, atol=0)
-    torch.testing.assert_close(found.opacities, gaussians.opacities, rtol=0, atol=1e-6)
-    torch.testing.assert_close(found.sh0, gaussians.sh0, rtol=0, atol=1e-6)
+    actual = gaussians_of(state.x, state.splats.shN)
+    assert actual.sh_degree == degree
+    torch.testing.assert_close(actual.means, gaussians.means, rtol=0, atol=0)
+    torch.testing.assert_close(actual.quats, gaussians.quats, rtol=0, atol=0)
+    torch.testing.assert_close(actual.shN, gaussians.shN, rtol=0, atol=0)
+    torch.testing.assert_close(actual.scales, gaussians.scales, rtol=1e-5, atol=0)
+    torch.testing.assert_close(actual.opacities, gaussians.opacities, rtol=0, atol=1e-6)
+    torch.testing.assert_close(actual.sh0, gaussians.sh0, rtol=0, atol=1e-6)
     for name in scenes.FIELDS:
-        assert getattr(found, name).dtype == torch.float32
+        assert getattr(actual, name).dtype == torch.float32
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -88,8 +88,8 @@ def test_state_is_drawn_like_its_gaussians(degree: int) -> None:
 
 
 def test_unit_is_the_mean_of_the_two_largest_scales(gaussians: Gaussians) -> None:
-    wanted = gaussians.scales.sort(1).values[:, 1:].prod(1).sqrt()
-    np.testing.assert_allclose(start_state(gaussians).units, wanted, rtol=1e-5)
+    expected = gaussians.scales.sort(1).values[:, 1:].prod(1).sqrt()
+    np.testing.assert_allclose(start_state(gaussians).units, expected, rtol=1e-5)
 
 
 def test_state_does_not_share_memory_with_the_gaussians(gaussians: Gaussians) -> None:
@@ -155,8 +155,8 @@ def test_halves_have_their_parents_moments(gaussians: Gaussians, photos: Photos)
     np.testing.assert_array_equal(covars_of(second), own)
     apart = (second - first)[:, :3].astype(np.float64) / 2
     pair = own + apart[:, :, None] * apart[:, None]
-    wanted = covars_of(state.x)
-    assert (np.abs(pair - wanted).max((1, 2)) <= 1e-4 * np.abs(wanted).max((1, 2))).all()
+    expected = covars_of(state.x)
+    assert (np.abs(pair - expected).max((1, 2)) <= 1e-4 * np.abs(expected).max((1, 2))).all()
     longest = state.x[:, SIZE:QUAT].max(1)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 0.7 * np.exp(longest), rtol=1e-4)
     np.testing.assert_array_equal(first[:, COLOR:], state.x[:, COLOR:])
