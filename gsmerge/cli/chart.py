@@ -25,8 +25,8 @@ LISTS = ("methods", "k", "budgets", "superpixels", "segmentations", "fit", "effo
 HINTS = ("opacity", "exporter", "quats", "order", "scene_scale", "max_side")
 
 
-def _list(name: str, help: str, shown: str) -> Parameter:
-    return opt.option(name, str, help, shown=shown, metavar="LIST")
+def _list(name: str, help: str, wording: str) -> Parameter:
+    return opt.option(name, str, help, wording=wording, metavar="LIST")
 
 
 @opt.command(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     *opt.panel(
         opt.MEASURING,
         opt.option("views", int, "Use so many of the input views, at equal intervals, as the context, and the held-out "
-                   "ones midway between them as targets.", shown="all", min=1),
+                   "ones midway between them as targets.", wording="all", min=1),
         opt.option("context", bool, "Also measure the input views.", "--context/--no-context", default=True),
     ),
     "lpips lpips_views",

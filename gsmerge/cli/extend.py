@@ -23,14 +23,14 @@ from gsmerge.errors import UsageError
     *opt.panel(
         opt.COUNT,
         opt.option("tolerance", float, "A new Gaussian is left out where the state's colour error is below this; 0: "
-                   "none is left out.", shown="0.06", min=0.0, max=1.0),
+                   "none is left out.", wording="0.06", min=0.0, max=1.0),
     ),
     f"effort {opt.MERGE} {opt.NETWORKS}",
     *opt.panel(
         opt.FITTING,
         opt.option("fit", ("color", "none"), "What is fitted to a batch's photos; gsmerge decode makes the full fit.",
-                   shown="color"),
-        opt.option("replay", int, "Most photos that the state keeps for the full fit of gsmerge decode.", shown="96",
+                   wording="color"),
+        opt.option("replay", int, "Most photos that the state keeps for the full fit of gsmerge decode.", wording="96",
                    min=0),
     ),
     opt.RUN,

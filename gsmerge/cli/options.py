@@ -121,7 +121,7 @@ def argument(name: str, kind: Any, metavar: str, help: str, default: Any = REQUI
 
 
 def option(
-    name: str, kind: Any, help: str, *flags: str, default: Any = None, shown: str | None = None, rare: bool = False,
+    name: str, kind: Any, help: str, *flags: str, default: Any = None, wording: str | None = None, rare: bool = False,
     **more: Any,
 ) -> Parameter:  # fmt: skip
     """An option.
@@ -132,7 +132,7 @@ def option(
         help: For the reader.
         flags: On the command line, where they are not made of the name.
         default: Value where it is not given.
-        shown: How help words the default, where that is left to the library.
+        wording: How help words the default, where that is left to the library.
         rare: Shown by ``--help-all`` alone.
         more: Passed on to Typer.
     """
@@ -142,7 +142,7 @@ def option(
         kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
         default = kind(default) if isinstance(default, str) else default
     kind = kind | None if default is None else kind
-    info = typer.Option(*flags, help=_escape(help), show_default=shown or default is not False, hidden=rare, **more)
+    info = typer.Option(*flags, help=_escape(help), show_default=wording or default is not False, hidden=rare, **more)
     return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
 
 
@@ -247,80 +247,81 @@ _TABLE = (
                "last, or relative to each view's camera.", default="auto", rare=True),
         option("order", ("auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"),
                "Order of the rows; none: the Gaussians belong to no pixels.", default="auto", rare=True),
-        option("scene_scale", float, "Size of the Gaussians' world in units of the cameras'.", shown="estimated",
+        option("scene_scale", float, "Size of the Gaussians' world in units of the cameras'.", wording="estimated",
                rare=True),
         option("max_side", int, "Longest side of a view, pixels, where the Gaussians belong to no pixels; larger "
-               "photos are resized.", shown="1200", rare=True, min=16),
+               "photos are resized.", wording="1200", rare=True, min=16),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "
                "left out."),
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
     ),
     panel(
         COUNT,
-        option("k", str, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by its saliency.", shown="1",
+        option("k", str, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by its saliency.", wording="1",
                parser=parse_k, metavar="1-8|mixed"),
-        option("k_low", float, "Percentile of saliency up to which a mixed k is 1.", shown="50.0", rare=True),
-        option("k_high", float, "Percentile of saliency above which a mixed k is 4.", shown="85.0", rare=True),
+        option("k_low", float, "Percentile of saliency up to which a mixed k is 1.", wording="50.0", rare=True),
+        option("k_high", float, "Percentile of saliency above which a mixed k is 4.", wording="85.0", rare=True),
         option("k_rule", ("saliency", "distortion"), "What a mixed k goes by: the corner response of the photos, or "
-               "as many Gaussians where they lower distortion most.", shown="saliency", rare=True),
+               "as many Gaussians where they lower distortion most.", wording="saliency", rare=True),
         option("superpixels", str, "Superpixels per view: a number such as 3000, or a share of its pixels.",
-               shown="4.4%", parser=parse_superpixels, metavar="NUMBER|SHARE"),
+               wording="4.4%", parser=parse_superpixels, metavar="NUMBER|SHARE"),
         option("budget", str, "Gaussians in the result: a number, a share such as 2% of the input, or a size such as "
                "5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the scene "
                "needs.", metavar="40000|2%|5MB|DEVICE|auto"),
         option("quality", str, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that lose at "
                "most so much against the best, such as -0.2dB.", metavar="30dB|-0.2dB"),
         option("levels", int, "Levels of detail, each in a file of its own, with a quarter of the Gaussians of the "
-               "one before.", shown="1", rare=True, min=1, max=8),
+               "one before.", wording="1", rare=True, min=1, max=8),
         option("max_k", int, "Most Gaussians per superpixel that can be decoded later: more take more space.",
-               shown="4, or 8 with a --budget", min=1, max=8),
+               wording="4, or 8 with a --budget", min=1, max=8),
     ),
     panel(
         MERGING,
         option("segmentation", ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid"), "Superpixel method.",
-               shown="rdseg", rare=True),
+               wording="rdseg", rare=True),
         option("robust", bool, "Choose among merges by comparing them with the photos.", "--robust/--no-robust",
-               shown="unless --fit full or a draft", rare=True),
+               wording="unless --fit full or a draft", rare=True),
         option("match", ("overlap", "aabb", "none"), "How Gaussians of different views are matched and merged.",
-               shown="overlap, none for a draft", rare=True),
+               wording="overlap, none for a draft", rare=True),
         option("geometry", ("analytic", "decoded"), "What is matched where networks are loaded: moments, or the "
-               "output of the K = 1 head.", shown="analytic", rare=True),
-        option("neighbors", int, "Nearest neighbours in other views that are compared.", shown="16", rare=True, min=1),
-        option("overlap", float, "Least overlap of Gaussians that --match overlap merges.", shown="0.7", rare=True),
-        option("iou", float, "Least intersection over union of boxes that --match aabb merges.", shown="0.2",
+               "output of the K = 1 head.", wording="analytic", rare=True),
+        option("neighbors", int, "Nearest neighbours in other views that are compared.", wording="16", rare=True,
+               min=1),
+        option("overlap", float, "Least overlap of Gaussians that --match overlap merges.", wording="0.7", rare=True),
+        option("iou", float, "Least intersection over union of boxes that --match aabb merges.", wording="0.2",
                rare=True),
-        option("similarity", float, "Least cosine of the networks' latents that --match aabb merges.", shown="0.8",
+        option("similarity", float, "Least cosine of the networks' latents that --match aabb merges.", wording="0.8",
                rare=True),
-        option("max_color", float, "Largest difference of colours that are merged.", shown="0.12", rare=True),
-        option("min_opacity", float, "Gaussians below this opacity are left out.", shown="1/255", rare=True),
+        option("max_color", float, "Largest difference of colours that are merged.", wording="0.12", rare=True),
+        option("min_opacity", float, "Gaussians below this opacity are left out.", wording="1/255", rare=True),
         option("unseen", ("drop", "keep"), "Gaussians that no view sees, where they are not one per pixel: drop (the "
                "default), or keep, merged.", rare=True),
         option("method", (
             "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "moment-matching", "voxel", "opacity",
             "contribution", "random", "blocks", "greedy", "splat-transform",
-        ), "gsmerge, or a baseline to compare it with.", shown="gsmerge", rare=True),
+        ), "gsmerge, or a baseline to compare it with.", wording="gsmerge", rare=True),
         option("recipe", ("paper",), "Settings that belong together. paper: the superpixel merging paper's own method, "
                "with networks from --checkpoint FILE.", rare=True),
         option("checkpoint", str, "Trained networks that correct the analytic stages: a file, shipped, none, or auto: "
-               "the shipped ones where they improve the result.", shown="auto", rare=True, metavar="FILE|NAME"),
+               "the shipped ones where they improve the result.", wording="auto", rare=True, metavar="FILE|NAME"),
         option("require_checkpoint", bool, "A checkpoint that cannot be used is an error instead of a note.",
                "--require-checkpoint", rare=True),
     ),
     panel(
         FITTING,
-        option("fit", ("full", "color", "none"), "What is fitted to the photos.", shown="full"),
+        option("fit", ("full", "color", "none"), "What is fitted to the photos.", wording="full"),
         option("effort", ("draft", "fast", "default", "best"), "How much work goes into superpixels and fit.",
-               shown="default"),
+               wording="default"),
         option("device", ("cpu", "cuda", "auto"), "Where the full fit runs; cuda needs gsmerge[cuda]. auto: a GPU "
-               "where there is one.", shown="cpu"),
-        option("fit_steps", int, "Steps of the full fit.", shown="by effort", rare=True, min=1),
+               "where there is one.", wording="cpu"),
+        option("fit_steps", int, "Steps of the full fit.", wording="by effort", rare=True, min=1),
         option("time_budget", float, "Seconds that the full fit may take.", rare=True, min=0.0),
     ),
     panel(
         MEASURING,
         option("lpips", ("both", "vgg", "alex", "none"), "Networks of the perceptual distance; none is much faster.",
-               shown="both, where installed"),
-        option("lpips_views", int, "Measure LPIPS on at most so many views of each split.", shown="all", min=1),
+               wording="both, where installed"),
+        option("lpips_views", int, "Measure LPIPS on at most so many views of each split.", wording="all", min=1),
     ),
     panel(
         OUTPUT,
@@ -332,8 +333,8 @@ _TABLE = (
     ),
     panel(
         GENERAL,
-        option("seed", int, "Seed of all random numbers.", shown="0", rare=True, min=0),
-        option("threads", int, "Threads; the result does not depend on their number.", shown="all processors",
+        option("seed", int, "Seed of all random numbers.", wording="0", rare=True, min=0),
+        option("threads", int, "Threads; the result does not depend on their number.", wording="all processors",
                rare=True, min=1),
         switch("quiet", "Print errors only.", "-q", rare=True),
         switch("debug", "Print tracebacks of errors.", rare=True),
@@ -344,6 +345,6 @@ _TABLE = (
 OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}
 
 
-def output(help: str, shown: str | None = None, default: Any = None) -> Parameter:
+def output(help: str, wording: str | None = None, default: Any = None) -> Parameter:
     """``-o/--output``: the file or folder that a command writes its result to; ``default`` may be REQUIRED."""
-    return changed("output", default, help=help, show_default=shown or default is not REQUIRED)
+    return changed("output", default, help=help, show_default=wording or default is not REQUIRED)

@@ -121,4 +121,4 @@ def check_cameras(files: SceneFiles) -> None:
     from gsmerge.io.cameras.sharp import read_sharp
 
     if files.cameras is None and files.images is None and read_sharp(files.ply) is None:
-        raise SceneError(files.ply, "no cameras found beside it", "name them with --cameras")
+        raise SceneError(files.ply, "no cameras beside it", "name them with --cameras")

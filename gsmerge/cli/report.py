@@ -37,7 +37,7 @@ def parse_sizes(text: str) -> tuple[int, ...]:
     *opt.panel(
         opt.MEASURING,
         opt.option("sizes", str, "Longer sides of the pictures whose render time is measured.", parser=parse_sizes,
-                   metavar="PIXELS,...", shown="the views' own, and twice that"),
+                   metavar="PIXELS,...", wording="the views' own, and twice that"),
         opt.option("merge_seconds", list[float], "Seconds that making each AFTER took; may be repeated, in their "
                    "order.", min=0.0),
         opt.option("compact_report", list[Path], "The --report of the compact run of each AFTER, instead."),

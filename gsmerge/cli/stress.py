@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @opt.command(
     opt.SCENE,
     f"{opt.READING} {opt.TARGETS} k superpixels budget fit effort fit_steps",
-    *opt.panel(opt.MEASURING, opt.option("cases", str, "Run only these cases.", shown="all", metavar="NAME,...")),
+    *opt.panel(opt.MEASURING, opt.option("cases", str, "Run only these cases.", wording="all", metavar="NAME,...")),
     f"report overwrite {opt.RUN}",
 )
 def stress(args: opt.Args) -> None:
