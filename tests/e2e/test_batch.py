@@ -122,22 +122,22 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
     for name, path in cameras.items():
         shutil.copytree(rooms / name, tmp_path / "in" / name)
         (tmp_path / "in" / name / "transforms.json").rename(path)
-    message = ("--cameras", f"{tmp_path}/{{stem}}.json", "--name", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
-    outcome = batch(run, tmp_path / "in", tmp_path / "out", *message)
+    arguments = ("--cameras", f"{tmp_path}/{{stem}}.json", "--name", "{parent}/{index}-{stem}.k{k}.ply", "--jobs", 1)
+    outcome = batch(run, tmp_path / "in", tmp_path / "out", *arguments)
     assert outcome.code == 0, outcome.err
     assert sorted(results(tmp_path / "out")) == ["in/0-room0.k1.ply", "in/1-room1.k1.ply"]
 
 
 def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_path: Path, run: Run) -> None:
-    message = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
-    outcome = run("batch", rooms / "room0", "--output", tmp_path, *message)
+    arguments = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
+    outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments)
     assert outcome.code == 4
     assert "1 of 1 results miss the target" in outcome.err
     assert (tmp_path / "room0.ply").exists()
 
 
 @pytest.mark.parametrize(
-    ("told", "code", "said"),
+    ("arguments", "code", "said"),
     [
         (("--fit", "color", "--quality", "30"), 2, 'quality: expected a PSNR as "30dB"'),
         (("--method", "voxel", "--budget", "auto"), 2, "method voxel"),
@@ -155,9 +155,9 @@ def test_a_target_that_is_missed_is_told_and_the_result_kept(rooms: Path, tmp_pa
     ],
 )
 def test_wrong_usage_is_told_at_once(
-    message: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
+    arguments: tuple[object, ...], code: int, said: str, rooms: Path, tmp_path: Path, run: Run
 ) -> None:
-    outcome = run("batch", rooms, "--output", tmp_path / "out", *message)
+    outcome = run("batch", rooms, "--output", tmp_path / "out", *arguments)
     assert outcome.code == code
     assert said in outcome.err
     assert outcome.err.count("\n") == 1

@@ -128,7 +128,7 @@ def test_without_photos_it_still_compacts(scene_copy: Path, run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("option", "told"),
+    ("option", "message"),
     [
         (("--budget", "5B"), "budget: expected at least 502 bytes for one Gaussian, got 5"),
         (("--budget", "0.001%"), "budget: expected at least one Gaussian, got '0.001%'"),

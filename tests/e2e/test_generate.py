@@ -70,7 +70,7 @@ def test_quiet_says_nothing(tmp_path: Path, run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "said"),
     [
         (("--views", "many"), 2, "--views: expected a number such as 6"),
         (("--views", "1"), 2, "views: expected 2 to 200"),

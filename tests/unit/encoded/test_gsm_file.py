@@ -69,7 +69,7 @@ DAMAGED: dict[str, Spoil] = {
     "most of none": with_settings(most=0),
     "an opacity of two": with_settings(min_opacity=2.0),
     "a share that is none": with_settings(prune=float("nan")),
-    "a negative number": with_settings(expected=-1),
+    "a negative number": with_settings(wanted=-1),
     "a knee of words": with_settings(knee="knee"),
     "slots beyond the children": with_tensor("division.slots", lambda t: t + 8),
     "more splits than slots": with_tensor("division.splits", lambda t: t + 1),

@@ -342,7 +342,7 @@ def true_tree(net: str) -> dict[str, Any]:
 
 
 @installed
-@pytest.mark.parametrize(("net", "wanted"), [("alex", 0.1245479), ("vgg", 0.3209685)])
+@pytest.mark.parametrize(("net", "expected"), [("alex", 0.1245479), ("vgg", 0.3209685)])
 def test_distance_is_the_reference_implementations(net: str, expected: float) -> None:
     """Against the package lpips 0.1.4 with the same backbone and its own linear layers, run once."""
     assert lpips(FIRST, SECOND, net) == pytest.approx(expected, abs=1e-6)
