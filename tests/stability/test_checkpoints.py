@@ -21,7 +21,14 @@ PLAIN = {"fit": "none", "match": "none", "robust": False, "superpixels": 100}
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"k": 2}, {"k": 4, "robust": True}, {"match": "aabb", "similarity": -1.0, "max_color": 2.0}, {"fit": "full", "fit_steps": 4}, {"budget": 150}],
+    [
+        {},
+        {"k": 2},
+        {"k": 4, "robust": True},
+        {"match": "aabb", "similarity": -1.0, "max_color": 2.0},
+        {"fit": "full", "fit_steps": 4},
+        {"budget": 150},
+    ],
     ids=str,
 )
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
