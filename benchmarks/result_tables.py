@@ -407,8 +407,7 @@ What the paper shows and this page does not, and where else it is:
 
 - Other backbones, each with its own errors (`tab:nvs`): one depth network stands in for all, see above. Its benchmarks
   (DL3DV, Mip-NeRF 360, Tanks and Temples) are not here; the scenes are five captures.
-- The learned method of the paper itself, in any table: no networks with absolute outputs ship
-  ([networks](internals/networks.md#the-papers-own-method)).
+- The learned method of the paper itself: [networks](internals/networks.md#the-papers-own-method).
 - Online reconstruction (`tab:online`, `fig:online`): [views in batches](internals/views-in-batches.md).
 - Superpixel sizes without training again (right of `fig:sp_proxy_pareto`): rows of the ablation, after the fit.
 - K by superpixel (supplement, method extensions): [how many Gaussians](guide/how-many.md).

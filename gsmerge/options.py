@@ -22,13 +22,13 @@ METHODS = (
     "random", "blocks", "greedy", "splat-transform",
 )  # fmt: skip
 
-CHECKPOINTS = ("auto", "shipped", "none")  # names that are no files
+CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
 # Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: BASS from
 # saliency seeds, networks whose outputs are absolute, matching by latents and boxes of the decoded geometry, no fit.
 RECIPES: Mapping[str, Mapping[str, Any]] = {
     "paper": {
         "segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "robust": False, "fit": "none",
-        "k_low": 100 / 3, "k_high": 200 / 3, "require_checkpoint": True,
+        "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
     },
 }  # fmt: skip
 AUTO_STEPS = 2  # times the usual ones
@@ -53,10 +53,10 @@ class CompactOptions:
         method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
         checkpoint: Trained networks that correct what the analytic stages make: a file, or ``"shipped"``, those that
-            come with the package; ``"none"``: the analytic stages alone; ``"auto"``: the shipped ones, unless the
-            analytic start shows the views better, see :meth:`networks`.
+            come with the package; ``"paper"``: those with absolute outputs; ``"none"``: the analytic stages alone;
+            ``"auto"``: the shipped ones, unless the analytic start shows the views better, see :meth:`networks`.
         recipe: Name of settings that belong together, which :meth:`with_settings` sets: ``"paper"``, the paper's own
-            method, with networks of absolute outputs from the checkpoint; None: none.
+            method, with networks of absolute outputs; None: none.
         require_checkpoint: A checkpoint that cannot be used is an error, instead of a note and the analytic stages.
         seed: Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.
         threads: Threads to use; None: all processors. The result does not depend on it.
@@ -88,11 +88,8 @@ class CompactOptions:
             raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
         if self.recipe not in (None, *RECIPES):
             raise ValueError(f"recipe: expected {', '.join(RECIPES)}, got {self.recipe!r}")
-        if self.recipe == "paper" and self.checkpoint in CHECKPOINTS:
-            raise ValueError(
-                f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"; gsmerge train'
-                " --preset paper makes one"
-            )
+        if self.recipe == "paper" and self.checkpoint in ("auto", "none"):
+            raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
         if self.method == "gsmerge":

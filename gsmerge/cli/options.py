@@ -301,9 +301,9 @@ _TABLE = (
             "contribution", "random", "blocks", "greedy", "splat-transform",
         ), "gsmerge, or a baseline to compare it with.", wording="gsmerge", rare=True),
         option("recipe", ("paper",), "Settings that belong together. paper: the superpixel merging paper's own method, "
-               "with networks from --checkpoint FILE.", rare=True),
-        option("checkpoint", str, "Trained networks that correct the analytic stages: a file, shipped, none, or auto: "
-               "the shipped ones where they improve the result.", wording="auto", rare=True, metavar="FILE|NAME"),
+               "with networks that have absolute outputs.", rare=True),
+        option("checkpoint", str, "Trained networks that correct the analytic stages: a file, shipped, paper, none, or "
+               "auto: the shipped ones where they improve the result.", wording="auto", rare=True, metavar="FILE|NAME"),
         option("require_checkpoint", bool, "A checkpoint that cannot be used is an error instead of a note.",
                "--require-checkpoint", rare=True),
     ),

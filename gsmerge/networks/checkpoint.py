@@ -24,6 +24,7 @@ SCHEMA = 1  # version of the tensors' names and of the tokens that they were tra
 FORMAT = "gsmerge-networks"
 REMEDY = "give another file, or --checkpoint none"
 SHIPPED = Path(__file__).with_name("shipped.safetensors")
+IN_PACKAGE = {"shipped": SHIPPED, "paper": Path(__file__).with_name("paper.safetensors")}  # by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class Checkpoint:
     def facts(self) -> dict[str, Any]:
         """Entry of a report."""
         sizes = {"num_parameters": self.networks.num_parameters, "options": asdict(self.networks.options)}
-        name = "shipped" if self.path == SHIPPED else str(self.path)
+        name = next((name for name, path in IN_PACKAGE.items() if path == self.path), str(self.path))
         head = {"checkpoint": name, "schema": SCHEMA, "gsmerge": self.version}
         return head | sizes | {"training": dict(self.training)}
 
@@ -132,7 +133,7 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     """The checkpoint of this name, and notes for the user; None for the analytic stages alone.
 
     Args:
-        name: A file, ``"shipped"``: the one in the package, or ``"none"``.
+        name: A file, ``"shipped"`` or ``"paper"``: those in the package, or ``"none"``.
         required: A checkpoint that cannot be used is an error; otherwise a note, and the stages run without.
 
     Raises:
@@ -141,7 +142,7 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     if name == "none":
         return None, []
     try:
-        return load_checkpoint(SHIPPED if name == "shipped" else name), []
+        return load_checkpoint(IN_PACKAGE.get(name, name)), []
     except SceneError as error:
         if required:
             raise

@@ -63,8 +63,8 @@ def test_decoded_geometry_decides_what_is_merged(scene: PixelScene, absolute: Pa
     assert counts["analytic"] != counts["decoded"]
 
 
-@pytest.mark.parametrize("checkpoint", ["auto", "shipped", "none"])
-def test_it_needs_a_file(checkpoint: str) -> None:
+@pytest.mark.parametrize("checkpoint", ["auto", "none"])
+def test_it_needs_networks(checkpoint: str) -> None:
     with pytest.raises(ValueError, match="recipe paper: expected a checkpoint with absolute outputs"):
         CompactOptions().with_settings({"recipe": "paper", "checkpoint": checkpoint})
 
@@ -72,8 +72,15 @@ def test_it_needs_a_file(checkpoint: str) -> None:
 def test_other_networks_are_refused(scene: PixelScene, tmp_path: Path) -> None:
     path = tmp_path / "residual.safetensors"
     save_checkpoint(path, Networks(replace(SMALL, outputs="residual")), {})
-    with pytest.raises(UsageError, match=r"expected networks with absolute outputs, .* has residual ones"):
-        scenes.compacted(scene, recipe="paper", checkpoint=str(path))
+    for checkpoint in (str(path), "shipped"):
+        with pytest.raises(UsageError, match=r"expected networks with absolute outputs, .* has residual ones"):
+            scenes.compacted(scene, recipe="paper", checkpoint=checkpoint)
+
+
+def test_networks_with_absolute_outputs_ship(scene: PixelScene) -> None:
+    networks = scenes.compacted(scene, recipe="paper").report.choices["networks"]
+    assert networks["checkpoint"] == "paper"
+    assert networks["options"]["outputs"] == "absolute"
 
 
 def test_more_children_than_a_head_has_are_refused(scene: PixelScene, absolute: Path) -> None:
