@@ -123,6 +123,7 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
     if members is None:
         with log.stage("members"):
             members = assign_members(scene, segmentation.groups, options.contribution)
+    saliency = scene_saliency(prepared.pictures) if options.decode.k == MIXED else None
     starts = []
     for networks in prepared.candidates(members):
         robust = None
@@ -145,7 +146,6 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
             with log.stage("close"):
                 closed = close_holes(merged, robust, options.robust)
                 merged, choices = closed.features, choices | closed.choices
-        saliency = scene_saliency(prepared.pictures) if options.decode.k == MIXED else None
         starts.append(MergedViews(merged, members, segmentation, networks, choices, saliency=saliency))
     start = starts[0]
     if len(starts) > 1:

@@ -71,12 +71,13 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
     """The plan for people."""
     from gsmerge.report import human_bytes
     from gsmerge.runtime.estimate import memory_problems
+    from gsmerge.stages.segment import SegmentOptions
 
     scene, estimate, per_view = plan["input"], plan["estimate"], plan["superpixels_per_view"]
     superpixels = "where the scene needs them"
     if per_view is not None:
         chosen = plan["options"]
-        adapts = chosen["segmentation"] == "bass-adaptive" and not str(chosen["superpixels"]).isdecimal()
+        adapts = SegmentOptions(chosen["superpixels"], chosen["segmentation"]).adapts
         superpixels = f"{per_view:,} per view{' at the start' * adapts}, {chosen['k']} Gaussian(s) each"
     steps = [
         f"superpixels  {superpixels}",

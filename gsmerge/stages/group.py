@@ -129,14 +129,14 @@ def segment_scene(prepared: PreparedScene, count: int | None) -> Segmentation:
     if count is None:
         each = max(1, int(limits.per_view * limits.share))
         num_coarse = min(round(backing_share(prepared) * each), each - 1)
-        num_fine, count = each - num_coarse, limits.default
-        if options.segment.adapts:  # to the number in the end, of which the fit begins with a share
-            groups = segment(pictures, options.segment, limits.per_view, adapt=num_fine / limits.per_view)
-            count = round(limits.default * len(groups) / (num_fine * views))
-        else:
-            groups = segment(pictures, options.segment, num_fine)
-        if count <= limits.max_count or not options.segment.adapts:
-            return Segmentation(groups, _coarse(pictures, options, num_coarse), count, exact=False)
+        num_fine, coarse = each - num_coarse, _coarse(pictures, options, num_coarse)
+        if not options.segment.adapts:
+            return Segmentation(segment(pictures, options.segment, num_fine), coarse, limits.default, exact=False)
+        # to the number in the end, of which the fit begins with a share
+        groups = segment(pictures, options.segment, limits.per_view, adapt=num_fine / limits.per_view)
+        count = round(limits.default * len(groups) / (num_fine * views))
+        if count <= limits.max_count:
+            return Segmentation(groups, coarse, count, exact=False)
         count = limits.max_count
     tree = prepared.tree
     first = max(views, int(count * limits.share))

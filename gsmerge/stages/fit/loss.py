@@ -36,7 +36,7 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
 def image_gradient(
     image: np.ndarray, photo: np.ndarray, weight: np.ndarray, ssim_lambda: float
 ) -> tuple[np.ndarray, float]:
-    """Gradient of the loss (1 - dssim) |image - photo| + dssim (1 - SSIM), per pixel of the image.
+    """Gradient of the loss (1 - l) |image - photo| + l (1 - SSIM), l = ``ssim_lambda``, per pixel of the image.
 
     Args:
         image: ``[h,w,3]`` float32.
