@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,15 +20,10 @@ from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
 from gsmerge.research.training.predict import Prediction, match_crop, predict
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
-from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.merge import merge
 from gsmerge.types import Gaussians
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    with use_threads(1):
-        yield
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +35,6 @@ from gsmerge.research.training.losses import (
 from gsmerge.research.training.predict import analytic_gaussians, predict
 from gsmerge.research.training.scenes import coverage, covered_pixels, reduced_masks, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window, whole_photo
-from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import merge
 from gsmerge.types import Cameras, Gaussians, PixelScene
@@ -45,11 +43,7 @@ PHOTO = replace(OPTIONS, photo_start=0.0, window=16)
 WIDTH, HEIGHT = 48, 36
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """As in a run: torch's own threads cost more than these sizes take."""
-    with use_threads(1):
-        yield
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def scene() -> PixelScene:

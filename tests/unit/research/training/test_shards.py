@@ -29,13 +29,8 @@ from gsmerge.research.training import (
 from gsmerge.research.training.examples import make_examples as make_each
 from gsmerge.research.training.shards import read_targets
 from gsmerge.research.training.stream import ExampleStreams, open_streams
-from gsmerge.runtime.threads import use_threads
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    with use_threads(1):
-        yield
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,16 @@
+"""What the tests of training share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from gsmerge.runtime.threads import use_threads
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """As in a run: torch's own threads cost more than these sizes take."""
+    with use_threads(1):
+        yield
