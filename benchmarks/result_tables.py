@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from result_cells import (
+    QUALITY,
+    Row,
+    describe_run,
+    format_interval,
+    format_mean,
+    format_quality,
+    format_share,
+    group_runs,
+    make_table,
+)
 
 from gsmerge.measure.comparison import break_even
 from gsmerge.report import human_bytes
 from gsmerge.research.charts.figures import make_verdict_tables
 from gsmerge.research.charts.record import INPUT, RunRecord
-from gsmerge.research.charts.statistics import mean_interval
 
-Row = Sequence[str]
 OURS = "gsmerge"
 COMMAND = "python benchmarks/results.py"
 
@@ -46,64 +55,16 @@ line, `robust False` is `--no-robust`.
 Machine: {machine}."""
 
 
-def _table(head: Row, rows: Sequence[Row]) -> str:
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def _section(title: str, parts: str, words: str, table: str, *figures: str) -> str:
     """A section with the command that makes it, its table and its charts."""
     pictures = [f"![{name}](results/{name}.png)" for name in figures]
     return "\n\n".join(filter(None, [f"## {title}", f"Made by `{COMMAND} --only {parts}`. {words}", table, *pictures]))
 
 
-def _mean(records: Sequence[RunRecord], name: str, digits: int = 2) -> str:
-    values = [v for r in records if (v := getattr(r, name)) is not None]
-    return f"{np.mean(values):.{digits}f}" if values else "-"
-
-
-def _interval(records: Sequence[RunRecord], name: str) -> str:
-    values = [v for r in records if (v := getattr(r, name)) is not None]
-    if len(values) < 2:
-        return "-"
-    interval = mean_interval(values)
-    return f"{interval.mean:.2f} ± {interval.high - interval.mean:.2f}"
-
-
-def _share(records: Sequence[RunRecord]) -> str:
-    values = [r.ratio for r in records if r.ratio is not None]
-    return f"{100 * np.mean(values):.1f} %" if values else "-"
-
-
-def _quality(records: Sequence[RunRecord], split: str = "target", part: str = "_visible") -> list[str]:
-    return [_mean(records, f"{m}_{split}{part}", d) for m, d in (("psnr", 2), ("ssim", 3), ("lpips_vgg", 3))]
-
-
-QUALITY = ("PSNR", "SSIM", "LPIPS")
-
-
-def _words(record: RunRecord) -> str:
-    """A run's method and settings, for people."""
-    settings = [f"{name} {value}" for name, value in record.settings.items() if name != "budget"]
-    name = "the input" if record.method == INPUT else record.method
-    return ", ".join([name, *settings])
-
-
-def _grouped(
-    records: Sequence[RunRecord], key: Callable[[RunRecord], tuple[object, ...]]
-) -> dict[tuple[object, ...], list[RunRecord]]:
-    """Records by key in their order, without keys that lack a scene that others have."""
-    groups: dict[tuple[object, ...], list[RunRecord]] = {}
-    for record in records:
-        groups.setdefault(key(record), []).append(record)
-    most = max((len({r.scene for r in some}) for some in groups.values()), default=0)
-    return {k: some for k, some in groups.items() if len({r.scene for r in some}) == most}
-
-
 def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     """gsmerge and the baselines at several sizes."""
     records = parts.get("sizes", ())
-    groups = _grouped(records, lambda r: (r.method != INPUT, r.settings.get("budget", ""), r.method, _words(r)))
+    groups = group_runs(records, lambda r: (r.method != INPUT, r.settings.get("budget", ""), r.method, describe_run(r)))
     if not groups:
         return []
     size = {"": 1e9}
@@ -111,14 +72,15 @@ def _methods(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         groups, key=lambda k: (k[0], size.get(str(k[1]), float(str(k[1]).rstrip("%") or 0)), str(k[2]) != OURS)
     )
     rows = [
-        (_words(some[0]), _share(some), _interval(some, "psnr_target_visible"), *_quality(some)[1:],
-         "" if some[0].method == INPUT else _mean(some, "seconds", 1), _mean(some, "render_ms", 0))
+        (describe_run(some[0]), format_share(some), format_interval(some, "psnr_target_visible"),
+         *format_quality(some)[1:],
+         "" if some[0].method == INPUT else format_mean(some, "seconds", 1), format_mean(some, "render_ms", 0))
         for some in (groups[k] for k in order)
     ]  # fmt: skip
     head = ("method", "kept", "PSNR (dB)", *QUALITY[1:], "seconds", "ms a frame")
     figures = ("quality-seconds", "quality-ratio", "stages", "break-even")
     words = "`unmerged-fit` is the input after the same fit with fast effort."
-    return [_section("gsmerge and the baselines", "sizes", words, _table(head, rows), *figures)]
+    return [_section("gsmerge and the baselines", "sizes", words, make_table(head, rows), *figures)]
 
 
 def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -140,7 +102,7 @@ def _verdicts(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
             summary = f"Above gsmerge on the mean: {'; '.join(above)}."
         if cheaper:
             summary += f" {cheaper} points are cheaper than any of gsmerge, so not compared."
-        out.append(f"### {table.title}\n\n{summary}\n\n" + _table(head, rows))
+        out.append(f"### {table.title}\n\n{summary}\n\n" + make_table(head, rows))
     return ["## Is any baseline better than gsmerge at equal cost?", *out] if out else []
 
 
@@ -159,11 +121,11 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
                     if r.method == "moment-matching" and r.settings.get("budget") == "4.4%"
                 ),
             ]
-        for some in _grouped(records, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
-            label = (name, _words(some[0]), _share(some))
-            rows.append((*label, *_quality(some)))
-            bare.append((*label, *_quality(some, part="")))
-            own.append((*label, *_quality(some, "context", "")))
+        for some in group_runs(records, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
+            label = (name, describe_run(some[0]), format_share(some))
+            rows.append((*label, *format_quality(some)))
+            bare.append((*label, *format_quality(some, part="")))
+            own.append((*label, *format_quality(some, "context", "")))
     if not rows:
         return []
     head = ("export", "method", "kept", *QUALITY)
@@ -173,9 +135,9 @@ def _backbones(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     )
     title = "Backbones (the paper's table of novel view synthesis)"
     return [
-        _section(title, "ablation da3 depthsplat anysplat", words, _table(head, rows)),
-        "### Without the visibility mask\n\n" + _table(head, bare),
-        "### On the input views\n\n" + _table(head, own),
+        _section(title, "ablation da3 depthsplat anysplat", words, make_table(head, rows)),
+        "### Without the visibility mask\n\n" + make_table(head, bare),
+        "### On the input views\n\n" + make_table(head, own),
     ]
 
 
@@ -193,11 +155,11 @@ def _views(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         f"Evenly spread contexts, targets midway between them. Table and figures are of the scenes that have so many"
         f" views: {', '.join(sorted(common))}."
     )
-    same = _table(head, _by_count([r for r in records if r.scene in common]))
+    same = make_table(head, _by_count([r for r in records if r.scene in common]))
     title = "By number of input views"
     return [
         _section(title, "views", words, same, "quality-views", "count-views"),
-        "### Each number over all scenes that have as many\n\n" + _table(head, _by_count(records)),
+        "### Each number over all scenes that have as many\n\n" + make_table(head, _by_count(records)),
     ]
 
 
@@ -206,8 +168,8 @@ def _by_count(records: Sequence[RunRecord]) -> list[Row]:
     rows = []
     for count in sorted({r.views_asked for r in records if r.views_asked is not None}):
         at = [r for r in records if r.views_asked == count]
-        for some in _grouped(at, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
-            rows.append((str(count), str(len(some)), _words(some[0]), _share(some), *_quality(some)))
+        for some in group_runs(at, lambda r: (r.method != INPUT, r.method, r.settings.get("k", 1))).values():
+            rows.append((str(count), str(len(some)), describe_run(some[0]), format_share(some), *format_quality(some)))
     return rows
 
 
@@ -246,7 +208,7 @@ def _timing(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         "break-even",
     )
     words = "K = 1, on the processor."
-    return [_section("Storage, render time and break-even", "views", words, _table(head, rows))]
+    return [_section("Storage, render time and break-even", "views", words, make_table(head, rows))]
 
 
 def _pair_means(pairs: Sequence[tuple[RunRecord, RunRecord]], name: str) -> tuple[float, float]:
@@ -270,14 +232,16 @@ ABLATION = {
 
 def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     """The counterpart of the paper's ablation."""
-    groups = _grouped(parts.get("ablation", ()), lambda r: (r.method, *sorted(r.settings.items())))
+    groups = group_runs(parts.get("ablation", ()), lambda r: (r.method, *sorted(r.settings.items())))
     rows = []
     for some in groups.values():
         first = some[0]
-        label = ABLATION.get(tuple(sorted(first.settings.items())), _words(first))
+        label = ABLATION.get(tuple(sorted(first.settings.items())), describe_run(first))
         name = "the input" if first.method == INPUT else label
-        seconds = "" if first.method == INPUT else _mean(some, "seconds", 1)
-        rows.append((name, _share(some), _interval(some, "psnr_target_visible"), *_quality(some)[1:], seconds))
+        seconds = "" if first.method == INPUT else format_mean(some, "seconds", 1)
+        rows.append(
+            (name, format_share(some), format_interval(some, "psnr_target_visible"), *format_quality(some)[1:], seconds)
+        )
     if not rows:
         return []
     head = ("variant", "kept", "PSNR (dB)", *QUALITY[1:], "seconds")
@@ -285,7 +249,7 @@ def _ablation(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         "Plain export, all views. [Networks](internals/networks.md#stage-by-stage) says what encoder, merger and"
         " refiner add."
     )
-    return [_section("Ablation", "ablation", words, _table(head, rows))]
+    return [_section("Ablation", "ablation", words, make_table(head, rows))]
 
 
 def _voxels(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -294,13 +258,13 @@ def _voxels(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     records = [r for r in parts.get("anysplat", ()) if r.method in (INPUT, OURS)]
     if not plain or not records:
         return []
-    rows = [("unmerged, one per pixel", "100.0 %", *_quality(list(plain.values())))]
-    for some in _grouped(records, lambda r: (r.method != INPUT, r.settings.get("k", 1))).values():
+    rows = [("unmerged, one per pixel", "100.0 %", *format_quality(list(plain.values())))]
+    for some in group_runs(records, lambda r: (r.method != INPUT, r.settings.get("k", 1))).values():
         shares = [r.count / (plain[r.scene].count or 1) for r in some if r.scene in plain and r.count]
         name = "voxelised" if some[0].method == INPUT else f"voxelised, then merged, K = {some[0].settings.get('k', 1)}"
-        rows.append((name, f"{100 * np.mean(shares):.1f} %", *_quality(some)))
+        rows.append((name, f"{100 * np.mean(shares):.1f} %", *format_quality(some)))
     title, words = "Merging a scene that is voxelised already", "Kept is the share of the Gaussians before voxels."
-    return [_section(title, "ablation anysplat", words, _table(("method", "kept", *QUALITY), rows))]
+    return [_section(title, "ablation anysplat", words, make_table(("method", "kept", *QUALITY), rows))]
 
 
 def _proxy(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
@@ -316,8 +280,8 @@ def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     before = {r.scene: r for r in records if r.method == INPUT}
     after = {r.scene: r for r in records if r.method == OURS}
     rows = [
-        (scene, str(after[scene].views), f"{before[scene].num_input:,}", *_quality([before[scene]]),
-         *_quality([after[scene]]), _mean([after[scene]], "seconds", 1))
+        (scene, str(after[scene].views), f"{before[scene].num_input:,}", *format_quality([before[scene]]),
+         *format_quality([after[scene]]), format_mean([after[scene]], "seconds", 1))
         for scene in sorted(before) if scene in after
     ]  # fmt: skip
     if not rows:
@@ -330,7 +294,7 @@ def _scenes(parts: Mapping[str, Sequence[RunRecord]]) -> list[str]:
         *(f"{q}, gsmerge" for q in QUALITY),
         "seconds",
     )
-    return [_section("Scene by scene", "ablation", "Defaults (K = 1, 4.4 %).", _table(head, rows))]
+    return [_section("Scene by scene", "ablation", "Defaults (K = 1, 4.4 %).", make_table(head, rows))]
 
 
 def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
@@ -340,7 +304,7 @@ def _losing(parts: Mapping[str, Sequence[RunRecord]]) -> str:
     head = ("scene", "part", "views", "settings", "input (dB)", "gsmerge")
     listed = lost or gains[:5]
     words = "are below their input" if lost else "gain least (none is below its input)"
-    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{_table(head, listed)}"
+    text = f"## When not to use it\n\nRuns of gsmerge that {words} on held-out views:\n\n{make_table(head, listed)}"
     return "\n\n".join(filter(None, [text, _too_many(parts.get("sizes", ())), _without(parts.get("ablation", ()))]))
 
 
@@ -384,7 +348,7 @@ def _too_many(records: Sequence[RunRecord]) -> str:
         " rising and the held-out ones fall, the photos are learned by heart, because depth or poses do not fit them;"
         " ask for fewer, or for `--budget auto`."
     )
-    return f"### More Gaussians than a scene bears\n\n{words}\n\n{_table(('scene', *budgets), rows)}"
+    return f"### More Gaussians than a scene bears\n\n{words}\n\n{make_table(('scene', *budgets), rows)}"
 
 
 def _without(records: Sequence[RunRecord]) -> str:
@@ -393,10 +357,11 @@ def _without(records: Sequence[RunRecord]) -> str:
     bare = [r for r in records if r.method == OURS and dict(r.settings) == {"fit": "none", "checkpoint": "shipped"}]
     if not (plain and bare):
         return ""
+    inputs = [r for r in records if r.method == INPUT]
+    without, full, before = (format_mean(some, "psnr_target_visible") for some in (bare, plain, inputs))
     return (
         "### Without photos\n\nWithout photos nothing can be fitted, and the merge alone has to do: at most"
-        f" {_mean(bare, 'psnr_target_visible')} dB instead of {_mean(plain, 'psnr_target_visible')} dB (the input:"
-        f" {_mean([r for r in records if r.method == INPUT], 'psnr_target_visible')} dB)."
+        f" {without} dB instead of {full} dB (the input: {before} dB)."
     )
 
 
