@@ -21,7 +21,7 @@ from gsmerge.search import choose_count
 from gsmerge.stages.decode import MAX_CHILDREN, merged_count
 from gsmerge.stages.group import knee_count
 from gsmerge.stages.merge import MergedViews
-from gsmerge.stages.prepare import PreparedScene, prepare
+from gsmerge.stages.prepare import PreparedScene, prepare, require_children
 from gsmerge.types import PixelScene, UnalignedScene
 
 DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
@@ -60,6 +60,7 @@ def encode_scene(
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
         prepared = prepare(scene, options, log)
+        require_children("max k", max_k or 1, prepared.checkpoint)
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")

@@ -68,15 +68,19 @@ def run_tables(sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -
 
 def encode_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Feature Gaussians with latents, and with means moved by the encoder (paper section 4.2)."""
+    if context.networks.encoder is None:
+        return replace(features, latents=torch.zeros(len(features), context.networks.options.latent))
     group_features = context.describe(features)
     encoded = run_encoder(features, group_features, context)
     return apply_encoding(features, group_features, encoded, context.networks)[0]
 
 
 def run_encoder(features: FeatureGaussians, group_features: GroupFeatures, context: NetworkContext) -> Tensor:
-    """``[g,latent+3]`` raw latents and shifts."""
+    """``[g,latent+3]`` raw latents and shifts; zero without an encoder."""
     starts, ids = features.starts.numpy(), features.members.numpy()
-    sizes, options = np.diff(starts), context.networks.options
+    sizes, options, encoder = np.diff(starts), context.networks.options, context.networks.encoder
+    if encoder is None:
+        return torch.zeros(len(features), options.latent + 3)
     seeds, axes = point_seeds(features.means.numpy(), context.seed), _longest_axes(group_features.base)
 
     def run(rows: np.ndarray, width: int) -> Tensor:
@@ -87,7 +91,7 @@ def run_encoder(features: FeatureGaussians, group_features: GroupFeatures, conte
         own = torch.from_numpy(np.repeat(rows, width))
         tokens = member_tokens(context.members, ids[positions][sample.reshape(-1)], group_features, own)
         group = group_features.group[torch.from_numpy(rows)]
-        return context.run(context.networks.encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
+        return context.run(encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
 
     return run_tables(sizes, options.members, options.latent + 3, run)
 
@@ -134,6 +138,8 @@ def merge_features(
         cuts: ``[c]`` where each cluster begins in ``order``.
         context: The networks and the scene.
     """
+    if context.networks.merger is None:
+        return pooled
     group_features = context.describe(pooled)
     raw = run_merger(pooled, group_features, parts, order, cuts, context)
     return apply_corrections(pooled, group_features, raw, context.networks)[0]
@@ -147,9 +153,11 @@ def run_merger(
     cuts: np.ndarray,
     context: NetworkContext,
 ) -> Tensor:
-    """``[c,13+latent]`` raw corrections of clusters, see :func:`merge_features`."""
-    base = feature_to_gaussians(parts)
-    sizes, options = np.diff(np.append(cuts, len(order))), context.networks.options
+    """``[c,13+latent]`` raw corrections of clusters, see :func:`merge_features`; zero without a merger."""
+    base, columns = feature_to_gaussians(parts), RESIDUAL + context.networks.options.latent
+    sizes, merger = np.diff(np.append(cuts, len(order))), context.networks.merger
+    if merger is None:
+        return torch.zeros(len(pooled), columns)
     seeds = point_seeds(pooled.means.numpy(), context.seed)
 
     def run(rows: np.ndarray, width: int) -> Tensor:
@@ -160,14 +168,14 @@ def run_merger(
         relative = part_tokens(base[ids], group_features, torch.from_numpy(np.repeat(rows, width)))
         tokens = torch.cat([relative, parts.latents[ids]], 1).unflatten(0, mask.shape)
         group = group_features.group[torch.from_numpy(rows)]
-        return context.run(context.networks.merger, tokens, torch.from_numpy(mask), group)
+        return context.run(merger, tokens, torch.from_numpy(mask), group)
 
-    return run_tables(sizes, options.members, RESIDUAL + options.latent, run)
+    return run_tables(sizes, context.networks.options.members, columns, run)
 
 
 def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
     """Feature Gaussians with the refiner's corrections, which depend on their neighbours (paper section 4.5)."""
-    if len(features) == 0:
+    if len(features) == 0 or context.networks.refiner is None:
         return features
     neighbors = find_neighbors(features, context.networks.options.neighbors)
     group_features = context.describe(features)
@@ -178,8 +186,11 @@ def refine_features(features: FeatureGaussians, context: NetworkContext) -> Feat
 def run_refiner(
     features: FeatureGaussians, group_features: GroupFeatures, neighbors: np.ndarray, context: NetworkContext
 ) -> Tensor:
-    """``[g,13+latent]`` raw corrections from ``neighbors [g,k]``, -1 where there are fewer."""
-    count, width = len(features), neighbors.shape[1] + 1
+    """``[g,13+latent]`` raw corrections from ``neighbors [g,k]``, -1 where there are fewer; zero without a refiner."""
+    count, width, refiner = len(features), neighbors.shape[1] + 1, context.networks.refiner
+    columns = RESIDUAL + context.networks.options.latent
+    if refiner is None:
+        return torch.zeros(count, columns)
     table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
     views = features.views
 
@@ -191,9 +202,8 @@ def run_refiner(
         same_view = (views[ids] == views[own]).float()[:, None]
         tokens = torch.cat([relative, same_view, features.latents[ids]], 1).unflatten(0, (len(rows), width))
         group = group_features.group[torch.from_numpy(rows)]
-        return context.run(context.networks.refiner, tokens, mask.unflatten(0, (len(rows), width)), group)
+        return context.run(refiner, tokens, mask.unflatten(0, (len(rows), width)), group)
 
-    columns = RESIDUAL + context.networks.options.latent
     return run_tables(np.full(count, width), 1 << (width - 1).bit_length(), columns, run)
 
 

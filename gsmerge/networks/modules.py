@@ -175,13 +175,15 @@ class Refiner(nn.Module):
 
 
 class Networks(nn.Module):
-    """All networks of a checkpoint."""
+    """All networks of a checkpoint; those that the options leave out are None."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
-        self.options = options or NetworkOptions()
-        self.encoder, self.merger, self.refiner = Encoder(self.options), Merger(self.options), Refiner(self.options)
-        self.heads = nn.ModuleDict({str(slots): Head(slots, self.options) for slots in SLOTS})
+        self.options = chosen = options or NetworkOptions()
+        self.encoder = Encoder(chosen) if chosen.encoder else None
+        self.merger = Merger(chosen) if chosen.merger else None
+        self.refiner = Refiner(chosen) if chosen.refiner else None
+        self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
     @property
     def max_children(self) -> int:

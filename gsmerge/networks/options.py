@@ -8,8 +8,8 @@ from typing import Any
 
 
 def _expect_number(name: str, value: Any, maximum: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= maximum:
-        raise ValueError(f"{name}: expected a number above 0, at most {maximum:g}, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= maximum:
+        raise ValueError(f"{name}: expected a number from 0 to {maximum:g}, got {value!r}")
 
 
 def _expect_count(name: str, value: Any, maximum: int) -> None:
@@ -19,7 +19,7 @@ def _expect_count(name: str, value: Any, maximum: int) -> None:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Largest correction that the decoder may make; merger, refiner and encoder may each make half of it.
+    """Largest correction that the decoder may make, 0: none; merger, refiner and encoder may each make half of it.
 
     Args:
         mean: Shift along each axis of the group's frame, in units of the Gaussian's size.
@@ -29,7 +29,7 @@ class Bounds:
         color: Change of each channel of the base colour, sRGB in [0, 1].
 
     Raises:
-        ValueError: If one is not above 0, or too large to bound anything.
+        ValueError: If one is below 0, or too large to bound anything.
     """
 
     mean: float = 1.0
@@ -62,6 +62,9 @@ class NetworkOptions:
         bounds: Largest corrections.
         outputs: ``"residual"``: the heads correct the analytic children. ``"absolute"``, as in the paper: they do not
             read these, and correct a round Gaussian of the group's mean and base colour, within wide bounds.
+        encoder: Whether there is one; without it all latents are zero.
+        merger: Whether there is one; without it clusters are pooled, and no more.
+        refiner: Whether there is one.
 
     Raises:
         ValueError: If a size is out of range or they do not go together.
@@ -76,6 +79,9 @@ class NetworkOptions:
     neighbors: int = 8
     bounds: Bounds = field(default_factory=Bounds)
     outputs: str = "residual"
+    encoder: bool = True
+    merger: bool = True
+    refiner: bool = True
 
     @property
     def head_bounds(self) -> Bounds:
@@ -88,6 +94,9 @@ class NetworkOptions:
         limits = {"width": 512, "heads": 16, "blocks": 8, "refine_blocks": 8, "latent": 256, "members": 256}
         for name, limit in (limits | {"neighbors": 64}).items():
             _expect_count(name, getattr(self, name), limit)
+        for name in ("encoder", "merger", "refiner"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
         if self.width % self.heads:
             raise ValueError(f"width: expected a multiple of {self.heads} heads, got {self.width}")
 

@@ -46,7 +46,7 @@ from gsmerge.search import choose_count
 from gsmerge.stages.fit import visible_mask
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import MergedViews, merge, take
-from gsmerge.stages.prepare import PreparedScene, prepare
+from gsmerge.stages.prepare import PreparedScene, prepare, require_children
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, PixelScene, UnalignedScene
 
 
@@ -96,6 +96,7 @@ def extend(
     log = RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
         prepared = prepare(scene, options, log, None if state is None else state.frame)
+        require_children("max k", online.max_k if state is None else state.settings.max_k, prepared.checkpoint)
         prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):

@@ -31,7 +31,7 @@ class MatchOptions:
             that of the K = 1 head (paper section 4.3), which merges less, takes longer and is no better.
         overlap: Least overlap of ``"overlap"``, 0 to 1.
         iou: Least IoU of the boxes of ``"aabb"``, 0 to 1 (tau_g).
-        similarity: Least cosine of the latents of ``"aabb"``, -1 to 1 (tau_f). Without networks there are no
+        similarity: Least cosine of the latents of ``"aabb"``, -1 to 1 (tau_f). Without an encoder there are no
             latents, and colours are compared in their place.
         max_color: Largest difference of base colours (Euclidean, sRGB in [0, 1]).
         neighbors: Nearest neighbours of other views in 3D that are compared (k).
@@ -103,7 +103,8 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     covars = features.covars.double().numpy()[rows].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     colors = SH_C0 * features.sh0[:, 0].double().numpy()[rows]
     neighbors, boxes = nearest_of_other_views(means, views, options.neighbors), options.method == "aabb"
-    latents = normalize(features.latents if boxes else features.latents[:, :0], dim=1).detach().numpy()[rows]
+    known = boxes and bool(features.latents.any())  # networks without an encoder leave them zero
+    latents = normalize(features.latents if known else features.latents[:, :0], dim=1).detach().numpy()[rows]
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity
     edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, latents, views, *limits, boxes, scores)

@@ -223,15 +223,22 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
     Raises:
         UsageError: If not.
     """
-    outputs, most = checkpoint.networks.options.outputs, checkpoint.networks.max_children
+    outputs = checkpoint.networks.options.outputs
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
             " gsmerge train --preset paper makes them"
         )
-    if options.decode.max_k > most:
-        k, name = options.decode.k, checkpoint.path
-        raise UsageError(f"k: expected at most {most} with the absolute outputs of {name}, got {k}")
+    require_children("k", options.decode.max_k, checkpoint)
+
+
+def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> None:
+    """Raise UsageError where the heads of a checkpoint know fewer children than option ``name`` asks for."""
+    if checkpoint is not None and count > checkpoint.networks.max_children:
+        raise UsageError(
+            f"{name}: expected at most {checkpoint.networks.max_children} with the absolute outputs of"
+            f" {checkpoint.path}, got {count}"
+        )
 
 
 def drop_repeats(

@@ -79,7 +79,7 @@ def window_loss(
     crop = window.crop
     prediction = predict(crop, networks, options, step)
     image = draw_window(prediction.gaussians, window, rng.random(3, dtype=np.float32))
-    loss = photometric_loss(image, window, options)
+    loss = photometric_loss(image, window, options, step)
     regression, teacher, diversity = options.regularizer_weights(step)
     if regression:
         scaled = scaled_corrections(crop, prediction.corrections, scales, options)
@@ -116,13 +116,14 @@ def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
 
 
-def photometric_loss(image: Tensor, window: Window, options: TrainOptions) -> Tensor:
-    """Weighted sum of the difference of colours, 1 - SSIM and, if it has a weight, LPIPS (VGG)."""
+def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step: int) -> Tensor:
+    """Weighted sum of the difference of colours, 1 - SSIM and, if it has a weight in this step, LPIPS (VGG)."""
     photo, mask = window.image, window.mask
     color = color_loss(image, photo, mask, options.photo_loss)
     similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
     loss = options.photo_weight * color + options.ssim_weight * (1 - similar)
-    return loss + options.lpips_weight * lpips_loss(image, photo, mask) if options.lpips_weight else loss
+    weight = options.lpips_weight_at(step)
+    return loss + weight * lpips_loss(image, photo, mask) if weight else loss
 
 
 def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:

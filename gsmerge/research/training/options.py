@@ -71,6 +71,7 @@ class TrainOptions:
         photo_weight: Weight of the colour loss.
         ssim_weight: Weight of 1 - SSIM.
         lpips_weight: Weight of LPIPS (VGG), whose weights must be installed; a step takes twice as long with it.
+        lpips_start: Share of the steps after which LPIPS has its weight.
         regression_weight: Weight of the regression when renders are compared; it falls to 0 until the end of the run.
         teacher_weight: Weight of the distance from the moments of the groups (paper eq. teacher_mean, teacher_cov).
         teacher_steps: Steps that compare renders over which it falls to 0.
@@ -122,6 +123,7 @@ class TrainOptions:
     photo_weight: float = 0.8
     ssim_weight: float = 0.2
     lpips_weight: float = 0.0
+    lpips_start: float = 0.0
     regression_weight: float = 0.1
     teacher_weight: float = 0.0
     teacher_steps: int = 2000
@@ -142,7 +144,7 @@ class TrainOptions:
             self._expect(name, getattr(self, name), 0, 10**9, whole=True)
         self._expect("inner", self.inner, 1e-6, 1)
         self._expect("window", self.window, LOSS_WINDOW, 10**9, whole=True)
-        for name in ("average", "photo_start", "novel"):
+        for name in ("average", "photo_start", "novel", "lpips_start"):
             self._expect(name, getattr(self, name), 0, 1)
         for name in ("rate", "least_rate", "clip"):
             self._expect(name, getattr(self, name), 1e-12, 1e6)
@@ -214,6 +216,10 @@ class TrainOptions:
         """
         if self.lpips_weight:
             require_lpips("vgg")
+
+    def lpips_weight_at(self, step: int) -> float:
+        """Weight of LPIPS in a step, counted from 0."""
+        return self.lpips_weight if step >= self.lpips_start * self.steps else 0.0
 
     @property
     def photo_step(self) -> int:
@@ -314,7 +320,24 @@ PAPER: Mapping[str, Any] = MappingProxyType(
         "diversity_steps": 50_000,
     }
 )
-PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType({"default": MappingProxyType({}), "paper": PAPER})
+# What the package ships is trained with. Encoder and merger gained nothing that validation showed; colour corrections
+# learnt the exposure of the training photos. docs/internals/networks.md has the figures.
+SHIPPED: Mapping[str, Any] = MappingProxyType(
+    {
+        "network": {"encoder": False, "merger": False, "bounds": {"color": 0.0}},
+        "views": (3, 0),
+        "fit_steps": 100,
+        "steps": 2_600,
+        "lpips_weight": 0.06,
+        "lpips_start": 0.8,
+        "save_every": 100,
+        "validation_crops": 4,
+        "validation_windows": 6,
+    }
+)
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {"default": MappingProxyType({}), "shipped": SHIPPED, "paper": PAPER}
+)
 
 
 def preset_options(name: str) -> TrainOptions:

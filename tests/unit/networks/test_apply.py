@@ -332,3 +332,31 @@ def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
 def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:
     """The Feature Gaussian of each child."""
     return divide(features, scene.members, np.full(len(features), k))[1]
+
+
+@pytest.mark.parametrize("name", ["encoder", "merger", "refiner"])
+def test_a_network_that_is_left_out_has_no_weights_and_corrects_nothing(scene: Made, name: str) -> None:
+    """As the whole with this network silent: its stage is the analytic one."""
+    whole, without = noisy(), noisy(replace(SMALL, **{name: False}))  # type: ignore[arg-type]
+    assert getattr(without, name) is None
+    assert without.num_parameters < whole.num_parameters
+    without.load_state_dict({key: value for key, value in whole.state_dict().items() if not key.startswith(name)})
+    silent = [whole.encoder.latent, whole.encoder.shift] if name == "encoder" else [getattr(whole, name).out]
+    for parameter in (p for layer in silent for p in layer.parameters()):
+        torch.nn.init.zeros_(parameter)
+    results = []
+    for networks in (whole, without):
+        context = scene.networks(networks)
+        encoded = encode_features(scene.features, context)
+        refined = refine(merge(encoded, pairs(encoded), context), context)
+        results.append((refined, decode(refined, scene.members, DecodeOptions(k=2), networks=context)))
+    assert_close(results[0][0], results[1][0])
+    assert_close(results[0][1], results[1][1])
+
+
+def test_without_an_encoder_colours_are_compared(scene: Made) -> None:
+    """Latents that are all zero say nothing, so they keep nothing apart."""
+    features, options = scene.features, MatchOptions(match="aabb", iou=0.05)
+    encoded = encode_features(features, scene.networks(noisy(replace(SMALL, encoder=False))))
+    assert torch.equal(match(encoded, options).clusters, match(features, options).clusters)
+    assert match(encoded, options).count < len(features)

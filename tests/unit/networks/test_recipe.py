@@ -10,8 +10,11 @@ import scenes
 import torch
 
 from gsmerge import PixelScene
+from gsmerge.encoded.encode import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks import NetworkOptions, Networks, save_checkpoint
+from gsmerge.online.extend import extend
+from gsmerge.online.options import OnlineOptions
 from gsmerge.options import CompactOptions
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
@@ -86,6 +89,11 @@ def test_networks_with_absolute_outputs_ship(scene: PixelScene) -> None:
 def test_more_children_than_a_head_has_are_refused(scene: PixelScene, absolute: Path) -> None:
     with pytest.raises(UsageError, match=r"k: expected at most 4 with the absolute outputs of .*, got 5"):
         scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
+    options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": str(absolute)})
+    with pytest.raises(UsageError, match=r"max k: expected at most 4 with the absolute outputs of .*, got 8"):
+        encode_scene(scene, options, max_k=8)
+    with pytest.raises(UsageError, match=r"max k: expected at most 4 with the absolute outputs of .*, got 8"):
+        extend(None, scene, options, OnlineOptions(max_k=8))
 
 
 @pytest.mark.parametrize("rule", ["saliency", "distortion"])

@@ -110,6 +110,6 @@ def test_whatever_comes_out_is_bounded(raw: float) -> None:
 
 
 def test_bounds_are_checked() -> None:
-    for wrong in (0.0, -1.0, 100.0, float("nan"), "1"):
+    for wrong in (-0.1, -1.0, 100.0, float("nan"), "1"):
         with pytest.raises(ValueError, match="size"):
             Bounds(size=wrong)  # type: ignore[arg-type]

@@ -264,6 +264,10 @@ def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
     assert not paper.uses_fit
     assert paper.photo_level(952, 100) == 2
     assert paper.photo_level(320, 240) == 1
+    shipped = preset_options("shipped")
+    assert [shipped.lpips_weight_at(step) for step in (0, 2079, 2080, 2599)] == [0, 0, 0.06, 0.06]
+    assert not shipped.network.encoder
+    assert Bounds(color=0) == shipped.network.bounds
     with pytest.raises(ValueError, match="preset"):
         preset_options("papers")
 
