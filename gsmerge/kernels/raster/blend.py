@@ -1,11 +1,7 @@
 """Front-to-back blending of one view, tile by tile, and sums over its blending weights.
 
-All kernels here walk the same lists with the same weights: alpha clamped at 0.99, cut below 1/255, and a pixel
-stops before the Gaussian that would take its transmittance to 1e-4 or below (gsplat's rules).
-
-A tile's state lives in one flat buffer of 16 x 16 planes with constant offsets: with a single base pointer the
-16-wide inner loop needs no run-time alias checks and becomes straight vector code. Plane 0 is the transmittance;
-its sign bit marks pixels that have stopped. Gaussians are gathered 32 at a time into a small local array.
+All kernels here walk the same lists with the same weights, see :mod:`gsmerge.kernels.raster.walk`. Gaussians are
+gathered 32 at a time into a small local batch, with the rows of the tile in which they show.
 """
 
 from __future__ import annotations
@@ -16,76 +12,108 @@ from numpy import float32 as f4
 from gsmerge.kernels.jit import kernel
 from gsmerge.kernels.raster.prefetch import prefetch_row
 from gsmerge.kernels.raster.project import LN_CUT, TILE
+from gsmerge.kernels.raster.walk import BATCH, PLANE, PLANES, blend_rows, weigh_rows
 
-PLANE = TILE * TILE
-BATCH = 32
-MAX_ALPHA, MIN_TRANSMITTANCE = f4(0.99), f4(1e-4)
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
 
 P1, P2, P3, P4, P5 = (np.uint64(PLANE * plane) for plane in range(1, 6))
-
-# exp(p) = poly(p)^8 on [ln(1/255), 0]: minimax of relative error 8e-8 for exp(p / 8), coefficients scaled by 8^-k.
-E0, E1, E2 = f4(0.99999992), f4(0.12499907), f4(0.0078106653)
-E3, E4, E5 = f4(3.2416797e-4), f4(9.7100983e-6), f4(1.7842896e-7)
-
-
-@kernel(inline=True)
-def _alpha(p):
-    """Opacity of a pixel from its exponent: exp, clamp and cut; any p <= 0 is safe, far ones are cut."""
-    e = E0 + p * (E1 + p * (E2 + p * (E3 + p * (E4 + p * E5))))
-    e = e * e
-    e = e * e
-    e = e * e
-    a = e if e < MAX_ALPHA else MAX_ALPHA
-    return a if p >= LN_CUT else f4(0.0)
-
-
-@kernel(inline=True)
-def _take(t, p):
-    """A pixel's weight at exponent p, and what is left of its transmittance t; stopped pixels keep a negative one."""
-    w = _alpha(p) * t
-    left = t - w
-    stop = left <= MIN_TRANSMITTANCE
-    return f4(0.0) if stop else w, -abs(t) if stop else left
+MY, RATE, SLOPE, DECAY, LNOP, FIRST, LAST = (np.uint64(BATCH * plane) for plane in range(1, 8))  # of a batch; mean x: 0
+COLOR = np.uint64(BATCH * 8)
+SPARE = f4(0.02)  # rows beside those in which a Gaussian shows, for rounding
 
 
 @kernel
-def _gather(footprints, members, first, last, end, tile_x, tile_y, batch):
+def new_batch():
+    """A batch of Gaussians of no effect: lanes that are not filled are calculated with too."""
+    batch = np.empty(PLANES * BATCH, np.float32)
+    for i in range(batch.shape[0]):
+        batch[i] = f4(1.0)
+    return batch
+
+
+@kernel(inline=True)
+def _into_tile(x):
+    """A column clamped to those of a tile."""
+    x = x if x < f4(TILE - 1) else f4(TILE - 1)
+    return x if x > f4(0.0) else f4(0.0)
+
+
+@kernel
+def _tighten(batch):
+    """Narrow first and last row of the Gaussians of a batch to where a column of the tile reaches the cut.
+
+    With ``q`` the ln opacity above the cut, a Gaussian shows where ``decay y^2 + rate^2 (x - slope y)^2 <= q``. The
+    highest point of this ellipse lies at ``y = sqrt(q / decay)``; where that is outside the tile, the ellipse is
+    highest at the tile's column next to it.
+    """
+    for lane in range(BATCH):
+        i = np.uint64(lane)
+        mx, my, slope, decay = batch[i], batch[i + MY], batch[i + SLOPE], batch[i + DECAY]
+        q = batch[i + LNOP] - LN_CUT
+        q = q if q > f4(0.0) else f4(0.0)
+        squared = batch[i + RATE] * batch[i + RATE]
+        a = decay + squared * slope * slope
+        reach = np.sqrt(q / decay)
+        spare = SPARE + f4(1e-5) * reach
+        right, left = _into_tile(mx + slope * reach) - mx, _into_tile(mx - slope * reach) - mx
+        high = f4(1.00001) * a * q - decay * squared * right * right
+        low = f4(1.00001) * a * q - decay * squared * left * left
+        last = my + (squared * slope * right + np.sqrt(high if high > f4(0.0) else f4(0.0))) / a + spare
+        first = my + (squared * slope * left - np.sqrt(low if low > f4(0.0) else f4(0.0))) / a - spare
+        last = f4(-1.0) if high < f4(0.0) else np.floor(last)
+        last = f4(-1.0) if low < f4(0.0) else last
+        first = np.ceil(first)
+        first = first if first < f4(TILE) else f4(TILE)
+        batch[i + LAST] = last if last < batch[i + LAST] else batch[i + LAST]
+        batch[i + FIRST] = first if first > batch[i + FIRST] else batch[i + FIRST]
+
+
+@kernel
+def gather(footprints, members, first, last, end, tile_x, tile_y, batch):
     """Copy footprints into the batch, relative to the tile's first pixel centre, and call for the next batch's."""
     left, top = f4(tile_x) + f4(0.5), f4(tile_y) + f4(0.5)
     for i in range(first, last):
         k = np.uint64(members[i])
         j = np.uint64(i - first)
-        batch[j, 0] = footprints[k, 0] - left
-        batch[j, 1] = footprints[k, 1] - top
-        for q in range(2, 6):
-            batch[j, q] = footprints[k, q]
-        batch[j, 6] = footprints[k, 6] - f4(tile_y)
-        batch[j, 7] = footprints[k, 7] - f4(tile_y)
+        batch[j] = footprints[k, 0] - left
+        batch[j + MY] = footprints[k, 1] - top
+        batch[j + RATE], batch[j + SLOPE] = footprints[k, 2], footprints[k, 3]
+        batch[j + DECAY], batch[j + LNOP] = footprints[k, 4], footprints[k, 5]
+        batch[j + FIRST] = footprints[k, 6] - f4(tile_y)
+        batch[j + LAST] = footprints[k, 7] - f4(tile_y)
+    _tighten(batch)
     for i in range(last, min(end, last + BATCH)):
         prefetch_row(footprints, members[i])
 
 
 @kernel
-def _gather_colors(colors, members, first, last, end, batch):
+def batch_rows(batch, j, y_low, y_high):
+    """First and last of the rows ``y_low`` to ``y_high`` in which Gaussian j of a batch shows."""
+    i = np.uint64(j)
+    return max(y_low, int(batch[i + FIRST])), min(y_high, int(batch[i + LAST]))
+
+
+@kernel
+def gather_colors(colors, members, first, last, end, batch):
     """Copy colours into the batch and call for the next batch's."""
     for i in range(first, last):
         k = np.uint64(members[i])
         j = np.uint64(i - first)
-        batch[j, 8], batch[j, 9], batch[j, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
+        for c in range(3):
+            batch[j + COLOR + np.uint64(BATCH * c)] = colors[k, c]
     for i in range(last, min(end, last + BATCH)):
         prefetch_row(colors, members[i])
 
 
 @kernel
-def _tile_box(tile, columns, height, width):
+def tile_box(tile, columns, height, width):
     """First column and row of a tile, and its columns and rows inside the image."""
     left, top = tile % columns * TILE, tile // columns * TILE
     return left, top, min(TILE, width - left), min(TILE, height - top)
 
 
 @kernel
-def _open_tile(state, columns, lines):
+def open_tile(state, columns, lines):
     """All light passes, the other planes are zero; lanes outside the image have stopped."""
     for i in range(PLANE, state.shape[0]):
         state[i] = f4(0.0)
@@ -103,7 +131,7 @@ def _row_is_live(state, y):
 
 
 @kernel
-def _live_rows(state, y_low, y_high):
+def live_rows(state, y_low, y_high):
     """Narrow the range of rows to those where a pixel still goes on."""
     while y_low <= y_high and not _row_is_live(state, y_low):
         y_low += 1
@@ -113,44 +141,24 @@ def _live_rows(state, y_low, y_high):
 
 
 @kernel
-def _blend(state, batch, count, y_low, y_high):
-    """Blend a batch over the live rows of a tile; planes 1 to 3 collect the colour."""
-    for j in range(count):
-        y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-        mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-        red, green, blue = batch[j, 8], batch[j, 9], batch[j, 10]
-        for y in range(y0, y1 + 1):
-            dy = f4(y) - my
-            top = lnop - decay * dy * dy
-            centre = rate * (mx + slope * dy)
-            row = np.uint64(y * TILE)
-            for x in range(TILE):
-                i = row + np.uint64(x)
-                d = rate * f4(x) - centre
-                w, state[i] = _take(state[i], top - d * d)
-                state[i + P1] += w * red
-                state[i + P2] += w * green
-                state[i + P3] += w * blue
-
-
-@kernel
 def blend(footprints, colors, members, offsets, columns, first, last, background, image, transmittance):
     """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``."""
     height, width = transmittance.shape
     state = np.empty(4 * PLANE, np.float32)
-    batch = np.empty((BATCH, 12), np.float32)
+    batch = new_batch()
     for tile in range(first, last):
-        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
-        _open_tile(state, num_x, num_y)
+        left, top, num_x, num_y = tile_box(tile, columns, height, width)
+        open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, end, left, top, batch)
-            _gather_colors(colors, members, start, stop, end, batch)
-            _blend(state, batch, stop - start, y_low, y_high)
+            gather(footprints, members, start, stop, end, left, top, batch)
+            gather_colors(colors, members, start, stop, end, batch)
+            for j in range(stop - start):
+                blend_rows(state, batch, j, *batch_rows(batch, j, y_low, y_high))
             start = stop
-            y_low, y_high = _live_rows(state, y_low, y_high)
+            y_low, y_high = live_rows(state, y_low, y_high)
         for y in range(num_y):
             for x in range(num_x):
                 i = np.uint64(y * TILE + x)
@@ -161,27 +169,12 @@ def blend(footprints, colors, members, offsets, columns, first, last, background
                 transmittance[top + y, left + x] = t
 
 
-@kernel(inline=True)
-def _weights(state, batch, j, y0, y1):
-    """Blend one Gaussian over rows y0 to y1 of a tile; plane 1 receives its weights."""
-    mx, my, rate, slope, decay, lnop = batch[j, 0], batch[j, 1], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
-    for y in range(y0, y1 + 1):
-        dy = f4(y) - my
-        top = lnop - decay * dy * dy
-        centre = rate * (mx + slope * dy)
-        row = np.uint64(y * TILE)
-        for x in range(TILE):
-            i = row + np.uint64(x)
-            d = rate * f4(x) - centre
-            state[i + P1], state[i] = _take(state[i], top - d * d)
-
-
 @kernel
 def _sum_weights(state, batch, count, y_low, y_high, slots, start):
     """Per Gaussian of a batch: weights times planes 2 to 5, summed over the tile."""
     for j in range(count):
-        y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-        _weights(state, batch, j, y0, y1)
+        y0, y1 = batch_rows(batch, j, y_low, y_high)
+        weigh_rows(state, batch, j, y0, y1)
         s1, s2, s3, s4 = f4(0.0), f4(0.0), f4(0.0), f4(0.0)
         first = np.uint64(y0 * TILE)
         for x in range((y1 - y0 + 1) * TILE):
@@ -202,10 +195,10 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
     """
     height, width, channels = image.shape
     state = np.empty(6 * PLANE, np.float32)
-    batch = np.empty((BATCH, 12), np.float32)
+    batch = new_batch()
     for tile in range(first, last):
-        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
-        _open_tile(state, num_x, num_y)
+        left, top, num_x, num_y = tile_box(tile, columns, height, width)
+        open_tile(state, num_x, num_y)
         for y in range(num_y):
             for x in range(num_x):
                 for c in range(channels):
@@ -214,10 +207,10 @@ def weighted_sums(footprints, members, offsets, columns, first, last, image, slo
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, end, left, top, batch)
+            gather(footprints, members, start, stop, end, left, top, batch)
             _sum_weights(state, batch, stop - start, y_low, y_high, slots, start)
             start = stop
-            y_low, y_high = _live_rows(state, y_low, y_high)
+            y_low, y_high = live_rows(state, y_low, y_high)
         for i in range(start, end):
             for c in range(CHANNELS):
                 slots[i, c] = f4(0.0)
@@ -242,8 +235,8 @@ def add_slots(members, slots, ids, first, sums):
 def _mass_and_peak(state, bits, batch, count, y_low, y_high, start, members, totals):
     """Add a batch's weights to the masses, raise the peaks. ``bits`` is ``state`` seen as integers."""
     for j in range(count):
-        y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-        _weights(state, batch, j, y0, y1)
+        y0, y1 = batch_rows(batch, j, y_low, y_high)
+        weigh_rows(state, batch, j, y0, y1)
         total, most = f4(0.0), np.int32(0)
         first = np.uint64(y0 * TILE)
         for x in range((y1 - y0 + 1) * TILE):
@@ -265,17 +258,17 @@ def contributions(footprints, members, offsets, columns, height, width, totals):
     """
     state = np.empty(3 * PLANE, np.float32)
     bits = state.view(np.int32)
-    batch = np.empty((BATCH, 12), np.float32)
+    batch = new_batch()
     for tile in range(offsets.shape[0] - 1):
-        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
-        _open_tile(state, num_x, num_y)
+        left, top, num_x, num_y = tile_box(tile, columns, height, width)
+        open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, end, left, top, batch)
+            gather(footprints, members, start, stop, end, left, top, batch)
             for i in range(start, stop):
                 prefetch_row(totals, members[i])
             _mass_and_peak(state, bits, batch, stop - start, y_low, y_high, start, members, totals)
             start = stop
-            y_low, y_high = _live_rows(state, y_low, y_high)
+            y_low, y_high = live_rows(state, y_low, y_high)

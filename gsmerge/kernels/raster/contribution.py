@@ -11,9 +11,10 @@ import numpy as np
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.raster.blend import BATCH, P1, PLANE, _gather, _live_rows, _open_tile, _weights
+from gsmerge.kernels.raster.blend import P1, batch_rows, gather, live_rows, new_batch, open_tile
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.kernels.raster.weights import _columns
+from gsmerge.kernels.raster.walk import BATCH, PLANE, weigh_rows
+from gsmerge.kernels.raster.weights import batch_columns
 
 LAST_ROW = 7  # column of a footprint
 LABEL, SUM, NEXT, PAIR = 0, 1, 2, 3  # columns of a pair, the last the next pair of the same Gaussian, -1 for none
@@ -48,7 +49,7 @@ def _number_labels(labels, left, top, num_x, num_y, stamps, lanes, names):
 @kernel
 def _sum_tile(state, batch, j, y0, y1, num_x, lanes, sums, touched):
     """Sum one Gaussian's weights by the tile's superpixels -> how many of them are ``touched``."""
-    x0, x1 = _columns(batch, j, num_x)
+    x0, x1 = batch_columns(batch, j, num_x)
     count = 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
@@ -79,7 +80,7 @@ def add_row(footprints, members, offsets, columns, line, labels, heads, pairs, n
         The pairs, in a larger array if they needed one, their number, and that of the Gaussians that have some.
     """
     height, width = labels.shape
-    state, batch = np.empty(2 * PLANE, np.float32), np.empty((BATCH, 12), np.float32)
+    state, batch = np.empty(2 * PLANE, np.float32), new_batch()
     lanes, names = np.zeros(PLANE, np.int32), np.empty(PLANE, np.int32)
     sums, touched = np.zeros(PLANE, np.float32), np.empty(PLANE + 1, np.int32)
     for tile in range(line * columns, (line + 1) * columns):
@@ -87,18 +88,18 @@ def add_row(footprints, members, offsets, columns, line, labels, heads, pairs, n
         num_x, num_y = min(TILE, width - left), min(TILE, height - top)
         start, end = offsets[tile], offsets[tile + 1]
         _number_labels(labels, left, top, num_x, num_y, stamps, lanes, names)
-        _open_tile(state, num_x, num_y)
+        open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, end, left, top, batch)
+            gather(footprints, members, start, stop, end, left, top, batch)
             if num_pairs + BATCH * PLANE > pairs.shape[0]:
                 more = np.empty((2 * pairs.shape[0], PAIR))
                 more[:num_pairs] = pairs[:num_pairs]
                 pairs = more
             for j in range(stop - start):
-                y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-                _weights(state, batch, j, y0, y1)
+                y0, y1 = batch_rows(batch, j, y_low, y_high)
+                weigh_rows(state, batch, j, y0, y1)
                 count, k = _sum_tile(state, batch, j, y0, y1, num_x, lanes, sums, touched), members[start + j]
                 active[num_active] = k
                 num_active += 1 if (count > 0) & (heads[k] < 0) else 0
@@ -107,7 +108,7 @@ def add_row(footprints, members, offsets, columns, line, labels, heads, pairs, n
                     sums[touched[i]] = f4(0.0)
                 num_pairs += count
             start = stop
-            y_low, y_high = _live_rows(state, y_low, y_high)
+            y_low, y_high = live_rows(state, y_low, y_high)
     return pairs, num_pairs, num_active
 
 

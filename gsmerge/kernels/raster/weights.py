@@ -6,16 +6,30 @@ import numpy as np
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.raster.blend import BATCH, P1, PLANE, _gather, _live_rows, _open_tile, _tile_box, _weights
+from gsmerge.kernels.raster.blend import (
+    DECAY,
+    LNOP,
+    P1,
+    RATE,
+    SLOPE,
+    batch_rows,
+    gather,
+    live_rows,
+    new_batch,
+    open_tile,
+    tile_box,
+)
 from gsmerge.kernels.raster.project import LN_CUT, TILE
+from gsmerge.kernels.raster.walk import BATCH, PLANE, weigh_rows
 
 LANES = 4  # channels of an image row: one vector register
 
 
 @kernel
-def _columns(batch, j, width):
+def batch_columns(batch, j, width):
     """First and last column of the tile that a Gaussian of the batch can touch."""
-    mx, rate, slope, decay, lnop = batch[j, 0], batch[j, 2], batch[j, 3], batch[j, 4], batch[j, 5]
+    i = np.uint64(j)
+    mx, rate, slope, decay, lnop = batch[i], batch[i + RATE], batch[i + SLOPE], batch[i + DECAY], batch[i + LNOP]
     reach = np.sqrt(max(lnop - LN_CUT, f4(0.0)) * (f4(1.0) / (rate * rate) + slope * slope / decay)) + f4(0.01)
     return int(max(mx - reach, f4(0.0))), int(min(mx + reach, f4(width - 1)))
 
@@ -38,22 +52,22 @@ def list_weights(footprints, members, offsets, columns, height, width):
     starts = np.zeros(members.shape[0] + 1, np.int64)
     lanes = np.empty(max(BATCH * PLANE, 40 * height * width), np.uint8)
     weights = np.empty(lanes.shape[0], np.float32)
-    state, batch = np.empty(2 * PLANE, np.float32), np.empty((BATCH, 12), np.float32)
+    state, batch = np.empty(2 * PLANE, np.float32), new_batch()
     count = 0
     for tile in range(offsets.shape[0] - 1):
-        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
-        _open_tile(state, num_x, num_y)
+        left, top, num_x, num_y = tile_box(tile, columns, height, width)
+        open_tile(state, num_x, num_y)
         y_low, y_high = 0, num_y - 1
         start, end = offsets[tile], offsets[tile + 1]
         while start < end and y_low <= y_high:
             stop = min(end, start + BATCH)
-            _gather(footprints, members, start, stop, end, left, top, batch)
+            gather(footprints, members, start, stop, end, left, top, batch)
             if count + BATCH * PLANE > lanes.shape[0]:
                 lanes, weights = _grown(lanes, weights, count)
             for j in range(stop - start):
-                y0, y1 = max(y_low, int(batch[j, 6])), min(y_high, int(batch[j, 7]))
-                _weights(state, batch, j, y0, y1)
-                x0, x1 = _columns(batch, j, num_x)
+                y0, y1 = batch_rows(batch, j, y_low, y_high)
+                weigh_rows(state, batch, j, y0, y1)
+                x0, x1 = batch_columns(batch, j, num_x)
                 for y in range(y0, y1 + 1):
                     for x in range(x0, x1 + 1):
                         lane = np.uint64(y * TILE + x)
@@ -63,7 +77,7 @@ def list_weights(footprints, members, offsets, columns, height, width):
                         count += 1 if w > f4(0.0) else 0
                 starts[start + j + 1] = count
             start = stop
-            y_low, y_high = _live_rows(state, y_low, y_high)
+            y_low, y_high = live_rows(state, y_low, y_high)
         starts[start + 1 : end + 1] = count
     return starts, lanes[:count].copy(), weights[:count].copy()
 
@@ -84,7 +98,7 @@ def spread(starts, lanes, weights, members, offsets, columns, colors, image):
                 state[p, 1] += w * b
                 state[p, 2] += w * c
                 state[p, 3] += w * d
-        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
+        left, top, num_x, num_y = tile_box(tile, columns, height, width)
         for y in range(num_y):
             for x in range(num_x):
                 image[top + y, left + x] = state[y * TILE + x]
@@ -96,7 +110,7 @@ def collect(starts, lanes, weights, members, offsets, columns, image, sums):
     height, width = image.shape[:2]
     state = np.zeros((PLANE, LANES), np.float32)
     for tile in range(offsets.shape[0] - 1):
-        left, top, num_x, num_y = _tile_box(tile, columns, height, width)
+        left, top, num_x, num_y = tile_box(tile, columns, height, width)
         for y in range(num_y):
             for x in range(num_x):
                 state[y * TILE + x] = image[top + y, left + x]
