@@ -26,7 +26,8 @@ class CompactReport:
         num_input: Gaussians in the scene.
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views, of many some, rendered from the input; None without photos.
+        psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
+            quarter of each unless a quality was asked for; None without photos. :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
         choices: What the stages decided (count, curve, merge, scores, clusters, fit).
         notes: Warnings about the input and what was adapted, one sentence each.

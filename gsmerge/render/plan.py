@@ -141,12 +141,19 @@ def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, ant
     return camera
 
 
-def _visible(splats: Splats, opacities: Array, keep: Array, camera: Array, threads: int) -> Array:
+def _corner_sums(tiles: Array, lines: int, columns: int) -> Array:
+    """``[lines+1,columns+1]`` int32: how many of some tiles lie above and left of each corner."""
+    if tiles.shape != (lines, columns):
+        raise ValueError(f"tiles: expected shape {[lines, columns]}, got {list(tiles.shape)}")
+    return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
+
+
+def _visible(splats: Splats, opacities: Array, keep: Array, wanted: Array, camera: Array, threads: int) -> Array:
     """Ids of the Gaussians that may touch the image, ascending."""
 
     def cull(span: tuple[int, int]) -> Array:
         ids = np.empty(span[1] - span[0] + 1, np.int32)
-        return ids[: projection.cull(splats.means, splats.scales, opacities, keep, camera, *span, ids)].copy()
+        return ids[: projection.cull(splats.means, splats.scales, opacities, keep, wanted, camera, *span, ids)].copy()
 
     return np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
 
@@ -223,6 +230,7 @@ def plan_view(
     far: float = 1e10,
     opacities: Array | None = None,
     keep: Array | None = None,
+    tiles: Array | None = None,
 ) -> ViewPlan:
     """Project, sort by depth and bin into tiles, for one view.
 
@@ -238,6 +246,8 @@ def plan_view(
         far: Farthest depth drawn (exclusive).
         opacities: ``[n]`` in place of the Gaussians' own.
         keep: ``[n]`` bool or uint8, False leaves a Gaussian out.
+        tiles: ``[lines,columns]`` bool, the tiles of 16 x 16 pixels that have to be complete; others may lack
+            Gaussians. None: all.
 
     Returns:
         The plan; its size goes with what is visible, not with n.
@@ -258,8 +268,9 @@ def plan_view(
     camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
     columns, lines = -(-width // projection.TILE), -(-height // projection.TILE)
+    wanted = np.zeros((0, 0), np.int32) if tiles is None else _corner_sums(tiles, lines, columns)
     with use_threads() as threads:
-        ids = _visible(splats, opacities, keep, camera, threads)
+        ids = _visible(splats, opacities, keep, wanted, camera, threads)
         footprints, depths, boxes = _project(splats, opacities, ids, camera, threads)
         order = binning.depth_order(depths.view(np.uint32))
         members, offsets = _bin(order, boxes, lines, columns, threads)

@@ -42,9 +42,9 @@ def _between(value, low, high):
 
 @kernel
 def _cull_block(block, camera):
-    """Replace plane 0 by 1 where a bounding sphere may touch the image, else 0.
+    """Replace plane 0 by 1 where a bounding sphere may touch the image, else 0; 1 to 4 by the box that it may touch.
 
-    Planes: mean x, y, z, scales x, y, z, opacity.
+    Planes in: mean x, y, z, scales x, y, z, opacity. The box: first and last column, first and last row, pixels.
     """
     r00, r01, r02 = camera[0], camera[1], camera[2]
     r10, r11, r12 = camera[3], camera[4], camera[5]
@@ -77,19 +77,34 @@ def _cull_block(block, camera):
         inside = inside if my + ry > f4(0.0) else f4(0.0)
         inside = inside if my - ry < height else f4(0.0)
         block[i] = inside
+        block[i + P1], block[i + P2] = _between(mx - rx, f4(0.0), width), _between(mx + rx, f4(0.0), width)
+        block[i + P3], block[i + P4] = _between(my - ry, f4(0.0), height), _between(my + ry, f4(0.0), height)
 
 
 @kernel
-def cull(means, scales, opacities, keep, camera, first, last, ids):
+def _touches(block, lane, wanted):
+    """Whether the box of a Gaussian holds one of the tiles that are ``wanted``, see :func:`cull`."""
+    j = np.uint64(lane)
+    last_x, last_y = wanted.shape[1] - 1, wanted.shape[0] - 1
+    x0, x1 = int(block[j + P1]) // TILE, min(int(block[j + P2]) // TILE + 1, last_x)
+    y0, y1 = int(block[j + P3]) // TILE, min(int(block[j + P4]) // TILE + 1, last_y)
+    x0, y0 = min(x0, last_x), min(y0, last_y)
+    return wanted[y1, x1] - wanted[y0, x1] - wanted[y1, x0] + wanted[y0, x0] > 0
+
+
+@kernel
+def cull(means, scales, opacities, keep, wanted, camera, first, last, ids):
     """List the Gaussians of a range that may touch the image -> their number.
 
     Args:
         keep: ``[n]`` uint8, 0 drops a Gaussian; an empty array keeps all.
+        wanted: ``[lines + 1, columns + 1]`` int32: the number of tiles above and left of each corner that a Gaussian
+            has to touch one of; an empty array wants all.
         ids: ``[last - first + 1]`` int32, written: ascending.
     """
     block = np.zeros(7 * BLOCK, np.float32)
     count = 0
-    all_kept = keep.shape[0] == 0
+    all_kept, all_wanted = keep.shape[0] == 0, wanted.shape[0] == 0
     for start in range(first, last, BLOCK):
         size = min(BLOCK, last - start)
         for lane in range(size):
@@ -102,7 +117,8 @@ def cull(means, scales, opacities, keep, camera, first, last, ids):
         for lane in range(size):
             ids[count] = start + lane
             kept = all_kept or keep[start + lane] != 0
-            count += 1 if (block[lane] > f4(0.0)) & kept else 0
+            kept = kept and (block[lane] > f4(0.0)) and (all_wanted or _touches(block, lane, wanted))
+            count += 1 if kept else 0
     return count
 
 
