@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.io.alignment.incomplete import score_incomplete
-from gsmerge.io.alignment.layouts import Layout, depth_layouts, exact_layouts, subsample
+from gsmerge.io.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
 from gsmerge.io.alignment.score import (
     QUICK_SAMPLES,
     SAMPLES,
@@ -30,6 +30,7 @@ _UNCONFIRMED = 0.9  # of the colours' distance from shuffled pixels: as good as 
 _VARIES = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
 _SIMPLER = 1.15  # a simpler frame wins unless it is worse than this factor ...
 _SIMPLER_PX = 0.02  # ... and this many pixels
+_PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 _SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 
 
@@ -69,6 +70,9 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return None
+    plain = _plain(inputs)
+    if plain is not None:
+        return plain
     scores: list[AlignmentScore] = []
     layouts = _exact(inputs)
     for effort in (0,) if exact_frames else (0, 1, 2):
@@ -90,10 +94,38 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if not _stands_out(best, shuffled_px):
         return None
     next_px = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px)
-    confirmed = None
-    if shuffled_color > _VARIES:
-        confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
-    return Recovery(best, runner_up, next_px / max(best.worst_px, _SMALLEST_PX), None, confirmed)
+    margin = next_px / max(best.worst_px, _SMALLEST_PX)
+    return Recovery(best, runner_up, margin, None, _confirmed(inputs, best, shuffled_color))
+
+
+def _confirmed(inputs: AlignmentInput, best: AlignmentScore, shuffled_color: float) -> bool | None:
+    """Whether the photos' colours agree with a reading; None where shuffled pixels look alike, or without photos."""
+    if not shuffled_color > _VARIES:
+        return None
+    return color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
+
+
+def _plain(inputs: AlignmentInput) -> Recovery | None:
+    """The rows as they are, under the cameras as they are; None where that leaves a doubt and others are to be tried.
+
+    Most files are so, and trying the other readings takes longer than reading the file.
+    """
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    expected = len(cameras) * cameras.width * cameras.height
+    if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
+        return None
+    layout = plain_layout(len(cameras), cameras.width, cameras.height)
+    best, *others = (
+        score_layout(inputs, replace(layout, views=views), IDENTITY)
+        for views in dict.fromkeys(map(tuple, inputs.labellings))
+    )
+    distance = max(best.worst_px, _SMALLEST_PX)
+    if best.worst_px > _PLAIN_PX or any(other.worst_px < SHUFFLED_MARGIN * distance for other in others):
+        return None
+    shuffled_px, shuffled_color = shuffled_score(inputs, best)
+    if not _stands_out(best, shuffled_px):
+        return None
+    return Recovery(best, None, shuffled_px / distance, None, _confirmed(inputs, best, shuffled_color))
 
 
 def _by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery | None:

@@ -15,7 +15,7 @@ from gsmerge.io.alignment.similarity import Correspondences, Similarity, pixel_e
 from gsmerge.types import Cameras, Gaussians
 
 QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians that a reading is scored on; per view at least
-MAX_CHECKED = 20_000  # pixels per view that an alignment is checked on
+MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
 
 

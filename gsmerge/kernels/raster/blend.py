@@ -22,7 +22,7 @@ COLOR = np.uint64(BATCH * 8)
 SPARE = f4(0.02)  # rows beside those in which a Gaussian shows, for rounding
 
 
-@kernel
+@kernel(part=True)
 def new_batch():
     """A batch of Gaussians of no effect: lanes that are not filled are calculated with too."""
     batch = np.empty(PLANES * BATCH, np.float32)
@@ -68,7 +68,7 @@ def _tighten(batch):
         batch[i + FIRST] = first if first > batch[i + FIRST] else batch[i + FIRST]
 
 
-@kernel
+@kernel(part=True)
 def gather(footprints, members, first, last, end, tile_x, tile_y, batch):
     """Copy footprints into the batch, relative to the tile's first pixel centre, and call for the next batch's."""
     left, top = f4(tile_x) + f4(0.5), f4(tile_y) + f4(0.5)
@@ -86,14 +86,14 @@ def gather(footprints, members, first, last, end, tile_x, tile_y, batch):
         prefetch_row(footprints, members[i])
 
 
-@kernel
+@kernel(part=True)
 def batch_rows(batch, j, y_low, y_high):
     """First and last of the rows ``y_low`` to ``y_high`` in which Gaussian j of a batch shows."""
     i = np.uint64(j)
     return max(y_low, int(batch[i + FIRST])), min(y_high, int(batch[i + LAST]))
 
 
-@kernel
+@kernel(part=True)
 def gather_colors(colors, members, first, last, end, batch):
     """Copy colours into the batch and call for the next batch's."""
     for i in range(first, last):
@@ -105,14 +105,14 @@ def gather_colors(colors, members, first, last, end, batch):
         prefetch_row(colors, members[i])
 
 
-@kernel
+@kernel(part=True)
 def tile_box(tile, columns, height, width):
     """First column and row of a tile, and its columns and rows inside the image."""
     left, top = tile % columns * TILE, tile // columns * TILE
     return left, top, min(TILE, width - left), min(TILE, height - top)
 
 
-@kernel
+@kernel(part=True)
 def open_tile(state, columns, lines):
     """All light passes, the other planes are zero; lanes outside the image have stopped."""
     for i in range(PLANE, state.shape[0]):
@@ -130,7 +130,7 @@ def _row_is_live(state, y):
     return live
 
 
-@kernel
+@kernel(part=True)
 def live_rows(state, y_low, y_high):
     """Narrow the range of rows to those where a pixel still goes on."""
     while y_low <= y_high and not _row_is_live(state, y_low):

@@ -25,7 +25,7 @@ from gsmerge.kernels.raster.walk import BATCH, PLANE, weigh_rows
 LANES = 4  # channels of an image row: one vector register
 
 
-@kernel
+@kernel(part=True)
 def batch_columns(batch, j, width):
     """First and last column of the tile that a Gaussian of the batch can touch."""
     i = np.uint64(j)
