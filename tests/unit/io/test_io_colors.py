@@ -12,7 +12,8 @@ from exports import Smooth, export_rows, save_export, smooth_scene, write_transf
 from tiny_scene import make_tiny, write_images
 
 from gsmerge.io import load_scene
-from gsmerge.io.alignment.recover import COLOR_MARGIN, Recovery, recover
+from gsmerge.io.alignment import recover as recovery
+from gsmerge.io.alignment.recover import COLOR_MARGIN, SHUFFLED_MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput
 from gsmerge.types import SH_C0, Cameras
 
@@ -104,3 +105,28 @@ def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:
     strange = replace(tiny, images=make_tiny(48, 36).images)
     notes = load_scene(save_export(tmp_path, strange, export_rows(tiny, index))).notes
     assert any("view-fastest" in note and note.endswith("the photos' colours do not confirm it") for note in notes)
+
+
+def test_a_plain_file_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files in which the rows as they are leave a doubt are."""
+    tiny, searched = smooth_scene(48, 36), []
+    monkeypatch.setattr(recovery, "_exact", lambda inputs: searched.append(inputs) or [])
+    plain = clues_of(tiny, tiny.images)
+    actual = recover(plain)
+    assert isinstance(actual, Recovery)
+    assert actual.best.layout.is_plain
+    assert actual.runner_up is None
+    assert actual.margin > SHUFFLED_MARGIN
+    assert searched == []
+    order = torch.arange(len(tiny.gaussians)).reshape(3, -1).T.reshape(-1)
+    far = replace(plain.cameras, Ks=plain.cameras.Ks + torch.tensor([[0, 0, 0.7], [0, 0, 0], [0, 0, 0]]))
+    doubtful = (
+        replace(plain, gaussians=plain.gaussians[order]),
+        replace(plain, cameras=far),
+        replace(plain, scale=1.0),
+        replace(plain, order="column-major"),
+        replace(plain, gaussians=plain.gaussians[:-1], valid=plain.valid[:-1]),
+    )
+    for number, inputs in enumerate(doubtful, 1):
+        recover(inputs, exact_frames=True)
+        assert len(searched) == number
