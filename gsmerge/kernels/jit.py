@@ -80,13 +80,13 @@ def kernel(
 
     What other kernels call must become part of each of them: otherwise every caller's machine code brings a copy of
     its own, optimised in its own way, all under one name, and which of them runs, and how it rounds, depends on what
-    was compiled or loaded first. So functions whose names begin with an underscore are always inlined by LLVM, and
-    others that kernels call say ``part``.
+    was compiled or loaded first. So functions whose names begin with an underscore are inlined by numba before types
+    are known, which spares compiling them by themselves, and others that kernels call, inlined by LLVM, say ``part``.
 
     Args:
         function: The function, when used as a plain decorator.
         part: Other kernels call it.
-        inline: Inline by numba itself, before types are known (for the small pieces of a loop).
+        inline: Inline by numba, as those with an underscore.
         exact: No reassociation at all (for code whose order of operations matters).
     """
 
@@ -99,8 +99,8 @@ def kernel(
                 nogil=True,
                 error_model="numpy",
                 fastmath=False if exact else set(FAST),
-                inline="always" if inline else "never",
-                forceinline=part or f.__name__.startswith("_"),
+                inline="always" if inline or f.__name__.startswith("_") else "never",
+                forceinline=part,
             )(f)
         finally:
             config.CACHE_DIR = before

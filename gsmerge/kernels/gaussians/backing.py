@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.gaussians.pool import MAX_OPACITY, _member_caps, _rotation
+from gsmerge.kernels.gaussians.pool import MAX_OPACITY, _member_caps, _rotation, kth_smallest
 from gsmerge.kernels.jit import kernel
 
 
@@ -24,8 +24,7 @@ def draw_in(starts, ids, inverse_depths, pixel, out):
             continue
         for j in range(n):
             scratch[j] = inverse_depths[ids[starts[g] + j]]
-        scratch[:n].sort()
-        middle = scratch[n // 2]
+        middle = kth_smallest(scratch[:n], n // 2)
         reach = min(pixel * np.sqrt(n), 0.9)
         for j in range(n):
             i = ids[starts[g] + j]

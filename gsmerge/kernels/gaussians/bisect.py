@@ -113,7 +113,9 @@ def _split(order, count, features, weights, cuts, errors, plane_weight):
     if measured:
         error[0] = errors[0] = _error(order, weights, scatter, plane_weight)
     while runs < count:
-        widest = np.argmax(spread[:runs])
+        widest = 0
+        for run in range(1, runs):
+            widest = run if spread[run] > spread[widest] else widest
         if spread[widest] <= 1e-12:
             break
         start, end = cuts[widest], cuts[widest + 1]

@@ -7,7 +7,7 @@ import numpy as np
 from gsmerge.kernels.jit import kernel
 
 
-@kernel(inline=True)
+@kernel
 def _det(a):
     """Determinant of a symmetric 3 x 3 given as xx xy xz yy yz zz."""
     return a[0] * (a[3] * a[5] - a[4] * a[4]) - a[1] * (a[1] * a[5] - a[4] * a[2]) + a[2] * (a[1] * a[4] - a[3] * a[2])

@@ -68,7 +68,10 @@ def adam(
     c2 = f4(1.0) / (f4(1.0) - b2 ** f4(step))
     row = np.zeros(COLUMNS, np.float32)
     energy = np.empty(COLUMNS, np.float32)
-    k = np.searchsorted(ids, first)
+    k, end = 0, ids.shape[0]
+    while k < end:  # the first row with a gradient
+        middle = (k + end) // 2
+        k, end = (middle + 1, end) if ids[middle] < first else (k, middle)
     for i in range(first, last):
         unit = units[i]
         if k < ids.shape[0] and ids[k] == i:

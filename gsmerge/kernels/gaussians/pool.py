@@ -30,14 +30,39 @@ def group_members(labels, count):
     return starts, ids
 
 
-@kernel(inline=True)
+@kernel
 def _largest(a, b, c):
     return max(a, b, c)
 
 
-@kernel(inline=True)
+@kernel
 def _two_largest_product(a, b, c):
     return max(a * b, a * c, b * c)
+
+
+@kernel(part=True)
+def kth_smallest(values, k):
+    """The number that sorting would put at place k; reorders the values. (Numba's own sort compiles for a second.)"""
+    low, high = 0, values.shape[0] - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    return values[k]
 
 
 @kernel
@@ -49,13 +74,12 @@ def _member_caps(ids, scales, footprints, caps, scratch):
         extent = _largest(scales[i, 0], scales[i, 1], scales[i, 2]) / footprints[i]
         scratch[j] = extent
         caps[j] = extent
-    scratch[:n].sort()
-    limit = CAP * scratch[(n - 1) // 2]  # of two, the smaller one
+    limit = CAP * kth_smallest(scratch[:n], (n - 1) // 2)  # of two, the smaller one
     for j in range(n):
         caps[j] = limit / caps[j] if caps[j] > limit else 1.0
 
 
-@kernel(inline=True)
+@kernel
 def _rotation(q):
     """Rows of the rotation of a quaternion wxyz of any length; the identity for zero."""
     n = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
@@ -152,7 +176,7 @@ def _pool_group(members, caps, means, quats, scales, opacities, sh0, shN, footpr
     out[9], out[10], out[11], out[12] = total, mass * 15.749609945722419, extinction, footprint  # (2 pi)^(3/2)
 
 
-@kernel(inline=True)
+@kernel
 def _rotate_pair(a, u, p, q):
     """One Jacobi rotation of the symmetric 3 x 3 ``a`` that zeroes a[p, q]; ``u`` collects the eigenvectors."""
     if abs(a[p, q]) > 1e-300:
@@ -219,7 +243,9 @@ def _right_handed_quat(r, out):
     q[1] = 1 + r[0, 0] - r[1, 1] - r[2, 2]
     q[2] = 1 - r[0, 0] + r[1, 1] - r[2, 2]
     q[3] = 1 - r[0, 0] - r[1, 1] + r[2, 2]
-    best = np.argmax(q)
+    best = 0
+    for i in range(1, 4):
+        best = i if q[i] > q[best] else best
     big = 0.5 * np.sqrt(q[best])
     f = 0.25 / big
     a, b, c = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]

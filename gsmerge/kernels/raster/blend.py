@@ -31,7 +31,7 @@ def new_batch():
     return batch
 
 
-@kernel(inline=True)
+@kernel
 def _into_tile(x):
     """A column clamped to those of a tile."""
     x = x if x < f4(TILE - 1) else f4(TILE - 1)

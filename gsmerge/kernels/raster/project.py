@@ -33,7 +33,7 @@ CAMERA = 26
 MAX_SIGMA = f4(1e6)  # pixels; a wider footprint is flat over any image, and its square still fits float32
 
 
-@kernel(inline=True)
+@kernel
 def _between(value, low, high):
     """Clamp, in a form that vectorises."""
     value = value if value < high else high

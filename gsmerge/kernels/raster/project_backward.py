@@ -31,29 +31,29 @@ PLANES = 20 + POSE
 P = tuple(np.uint64(BLOCK * plane) for plane in range(PLANES))
 
 
-@kernel(inline=True)
+@kernel
 def _dot(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@kernel(inline=True)
+@kernel
 def _mix(x, u, y, v):
     """x u + y v."""
     return x * u[0] + y * v[0], x * u[1] + y * v[1], x * u[2] + y * v[2]
 
 
-@kernel(inline=True)
+@kernel
 def _scaled(u, s):
     return u[0] * s[0], u[1] * s[1], u[2] * s[2]
 
 
-@kernel(inline=True)
+@kernel
 def _times(m, u):
     """Rows m times u."""
     return _dot(m[0], u), _dot(m[1], u), _dot(m[2], u)
 
 
-@kernel(inline=True)
+@kernel
 def _transposed(m, u):
     """Columns of rows m times u."""
     return (
@@ -63,7 +63,7 @@ def _transposed(m, u):
     )
 
 
-@kernel(inline=True)
+@kernel
 def _rotation(w, x, y, z, h):
     """Rows of the rotation matrix of a unit quaternion; h is 2, or 0 for no rotation."""
     one = f4(1.0)
@@ -74,7 +74,7 @@ def _rotation(w, x, y, z, h):
     )
 
 
-@kernel(inline=True)
+@kernel
 def _rotation_backward(w, x, y, z, h, a, gc, b, gd):
     """Gradient of a quaternion, over h, from those of a M and b M, M its matrix: only what is across it."""
     g0, g1, g2 = _mix(a[0], gc, b[0], gd), _mix(a[1], gc, b[1], gd), _mix(a[2], gc, b[2], gd)
@@ -87,7 +87,7 @@ def _rotation_backward(w, x, y, z, h, a, gc, b, gd):
     return h * (gw - along * w), h * (gx - along * x), h * (gy - along * y), h * (gz - along * z)
 
 
-@kernel(inline=True)
+@kernel
 def _conic_backward(u, v, eps2d, sxx, sxy, syy, thinning):
     """Conic A, B, C (the exponent is -1/2 (A xx + 2 B xy + C yy)), and the gradient xx, xy, yy of the covariance.
 

@@ -74,7 +74,7 @@ def cut_gain(integral, near, far, step, side, num_pixels, compactness):
     return best / num_pixels, best_cut
 
 
-@kernel(inline=True)
+@kernel
 def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, heads, gain, bits):
     """Store a rectangle with its best cut, in the bucket of the cut's gain or ``limit``; single pixels wait nowhere.
 

@@ -19,7 +19,7 @@ NEVER = 1e18  # box of a region without pixels; sums of two of them still have f
 OVERSIZE = 1e9  # added to the cost of a merge beyond the largest extent: these come last, in their own order
 
 
-@kernel(inline=True)
+@kernel
 def _plane_error(n, w, wx, wy, wxx, wxy, wyy, z, zx, zy):
     """Least sum of (1 - z (a x + b y + c))² over n pixels, with a ridge on the slopes."""
     if w <= 0.0:
@@ -145,7 +145,7 @@ def _link(pairs, heads, nexts, ends):
     return num_edges
 
 
-@kernel(inline=True)
+@kernel
 def _before(costs, d, e):
     return costs[d] < costs[e] or (costs[d] == costs[e] and d < e)
 
