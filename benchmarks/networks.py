@@ -95,13 +95,12 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
     """The checkpoint with the last layers of some networks at zero: they change nothing."""
     out = folder / f"without-{names.replace(',', '-')}.safetensors"
     networks = load_checkpoint(checkpoint).networks
-    latent, width = networks.encoder.latent, networks.options.latent
+    width = networks.options.latent
     for name in names.split(","):
         if name in ("latent", "latents"):
-            silence = [*latent.parameters()]
-            silence += [p[-width:] for part in (networks.merger, networks.refiner) for p in part.out.parameters()] * (
-                name == "latents"
-            )
+            silence = [] if networks.encoder is None else [*networks.encoder.latent.parameters()]
+            later = [part for part in (networks.merger, networks.refiner) if part is not None and name == "latents"]
+            silence += [parameter[-width:] for part in later for parameter in part.out.parameters()]
         elif name == "heads":
             silence = [parameter for head in networks.heads.values() for parameter in head.out.parameters()]
         else:
@@ -110,6 +109,13 @@ def silenced(checkpoint: Path, names: str, folder: Path) -> Path:
             torch.nn.init.zeros_(parameter)
     save_checkpoint(out, networks, {})
     return out
+
+
+def applies(condition: Condition, checkpoint: Path) -> bool:
+    """Whether the checkpoint has the networks that a condition silences."""
+    networks = load_checkpoint(checkpoint).networks
+    names = (condition.silent or "").replace("latents", "refiner").replace("latent", "encoder").split(",")
+    return all(not name or getattr(networks, name) is not None for name in names)
 
 
 def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, lpips: bool) -> dict[str, Any]:
@@ -224,12 +230,11 @@ def main() -> None:
     args.store = Store(args.cache / "networks.jsonl")
     folders = [folder for folder in scene_folders(args.scenes) if folder.name not in LEFT_OUT]
     for part in args.only:
-        for _ in runs_of(folders, PARTS[part], args):
+        conditions = tuple(condition for condition in PARTS[part] if applies(condition, args.checkpoint))
+        for _ in runs_of(folders, conditions, args):
             pass
-        print(
-            f"\n{part}: {', '.join(folder.name for folder in folders)}\n\n{table(folders, PARTS[part], args)}\n",
-            flush=True,
-        )
+        names = ", ".join(folder.name for folder in folders)
+        print(f"\n{part}: {names}\n\n{table(folders, conditions, args)}\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from torch.nn import Parameter
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks import Networks, save_checkpoint
+from gsmerge.networks.residuals import LOGIT
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
 from gsmerge.research.training.options import TrainOptions
@@ -172,11 +173,21 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
     """Write the checkpoints, the table of losses and what a resumed run goes on from."""
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
     training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
+    networks = with_opacity_shift(state.smooth, options.opacity_shift)
     if is_best(rows, options):
-        save_checkpoint(out / "best.safetensors", state.smooth, training)
-    save_checkpoint(out / "last.safetensors", state.smooth, training)
+        save_checkpoint(out / "best.safetensors", networks, training)
+    save_checkpoint(out / "last.safetensors", networks, training)
     write_losses(out / "losses.csv", rows)
     save_state(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
+
+
+def with_opacity_shift(networks: Networks, shift: float) -> Networks:
+    """A copy whose heads add ``shift`` to the raw correction of the opacity's logit."""
+    shifted = deepcopy(networks)
+    with torch.no_grad():
+        for head in shifted.heads.values():
+            head.out.bias[LOGIT] += shift
+    return shifted
 
 
 def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:

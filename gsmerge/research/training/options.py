@@ -77,6 +77,8 @@ class TrainOptions:
         teacher_steps: Steps that compare renders over which it falls to 0.
         diversity_weight: Weight of the diversification of several children.
         diversity_steps: Steps that compare renders over which it falls to 0.
+        opacity_shift: Added to the raw correction of the opacity by the heads of the checkpoints. New captures have holes that
+            scenes in training lack.
         save_every: Steps between checkpoints, validation and lines of the table.
         validation_examples: Most examples for validation, evenly spread over those that there are.
         validation_crops: Crops of each of them, always the same; only where a loss uses the fit.
@@ -129,6 +131,7 @@ class TrainOptions:
     teacher_steps: int = 2000
     diversity_weight: float = 0.0
     diversity_steps: int = 50_000
+    opacity_shift: float = 0.0
     save_every: int = 200
     validation_examples: int = 24
     validation_crops: int = 8
@@ -143,6 +146,7 @@ class TrainOptions:
         for name in ("warmup", "seed", "photo_side"):
             self._expect(name, getattr(self, name), 0, 10**9, whole=True)
         self._expect("inner", self.inner, 1e-6, 1)
+        self._expect("opacity_shift", self.opacity_shift, -8, 8)
         self._expect("window", self.window, LOSS_WINDOW, 10**9, whole=True)
         for name in ("average", "photo_start", "novel", "lpips_start"):
             self._expect(name, getattr(self, name), 0, 1)
@@ -330,6 +334,7 @@ SHIPPED: Mapping[str, Any] = MappingProxyType(
         "steps": 2_600,
         "lpips_weight": 0.06,
         "lpips_start": 0.8,
+        "opacity_shift": 0.3,
         "save_every": 100,
         "validation_crops": 4,
         "validation_windows": 6,

@@ -250,6 +250,23 @@ def test_settings_are_checked(tmp_path: Path) -> None:
             TrainOptions.from_dict(values)
 
 
+def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_path: Path) -> None:
+    """By the shift of the opacities, which training itself does not see."""
+    weights = []
+    for shift in (0.0, 0.25):
+        done = train([shard], [], tmp_path / str(shift), replace(OPTIONS, steps=4, opacity_shift=shift))
+        weights.append(load_checkpoint(done.last).networks.state_dict())
+        rows = (tmp_path / str(shift) / "losses.csv").read_text()
+    before, after = weights
+    for name in before:
+        difference = after[name] - before[name]
+        if name in {f"heads.{slots}.out.bias" for slots in (1, 2, 4)}:
+            torch.testing.assert_close(difference, 0.25 * (torch.arange(13) == LOGIT))
+        else:
+            assert not bool(difference.any())
+    assert rows == (tmp_path / "0.0" / "losses.csv").read_text()
+
+
 def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
     paper, config = preset_options("paper"), tmp_path / "run.json"
     assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
