@@ -77,8 +77,8 @@ class TrainOptions:
         teacher_steps: Steps that compare renders over which it falls to 0.
         diversity_weight: Weight of the diversification of several children.
         diversity_steps: Steps that compare renders over which it falls to 0.
-        opacity_shift: Added to the raw correction of the opacity by the heads of the checkpoints. New captures have holes that
-            scenes in training lack.
+        opacity_shift: Added to the raw correction of the opacity by the heads of the checkpoints. New captures have
+            holes that scenes in training lack.
         save_every: Steps between checkpoints, validation and lines of the table.
         validation_examples: Most examples for validation, evenly spread over those that there are.
         validation_crops: Crops of each of them, always the same; only where a loss uses the fit.

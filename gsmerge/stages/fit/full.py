@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.kernels.gaussians import optimise as kernels
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.render import composite, plan_view, splat_adjoint
 from gsmerge.render.gradient import plan_gradients
 from gsmerge.render.photos import Photos, render_photos
@@ -175,6 +176,28 @@ def score_to_beat(own: float, baseline_start: Gaussians | None, plan: Plan) -> f
     return own if baseline_start is None else min(own, holdout_score(start_state(baseline_start), plan))
 
 
+@dataclass
+class TailMean:
+    """Mean of parameters ``[n,14]`` over the last steps, which a single step's noise moves less."""
+
+    mean: np.ndarray | None = None
+    count: int = 0
+
+    def add(self, x: np.ndarray) -> None:
+        """One more step; the first one after Gaussians were added begins anew."""
+        if self.mean is None or len(self.mean) != len(x):
+            self.mean, self.count = np.zeros_like(x), 0
+        self.count += 1
+        self.mean += (x - self.mean) / np.float32(self.count)
+
+    def of(self, x: np.ndarray) -> np.ndarray:
+        """The mean with unit quaternions; ``x`` itself where no step of as many Gaussians was added."""
+        if self.mean is None or len(self.mean) != len(x):
+            return x
+        self.mean[:, QUAT:LOGIT] /= np.linalg.norm(self.mean[:, QUAT:LOGIT], axis=1, keepdims=True)
+        return self.mean
+
+
 def fit_full(
     gaussians: Gaussians,
     photos: tuple[Photos, Photos],
@@ -203,6 +226,7 @@ def fit_full(
         baseline_start: Another start that the fit may beat instead, see :func:`score_to_beat`.
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
+    tail = TailMean()
     own, state.box_shares[:] = initial_scores(state, plan)
     after = before = score_to_beat(own, baseline_start, plan)
     queue: list[int] = []
@@ -222,6 +246,9 @@ def fit_full(
             queue = rng.permutation(len(photos[0])).tolist()
         error += (engine.step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
         step += 1
+        if step > steps * (1 - options.average_share):
+            engine.sync(state)
+            tail.add(state.x)
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, plan)
         if progress:
@@ -234,7 +261,7 @@ def fit_full(
     if grows:  # a time budget may end before the growth
         state = grow_to(state, photos[1], count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
-    return gaussians_of(state.x, state.splats.shN), FitReport("full", True, step, before, after, why)
+    return gaussians_of(tail.of(state.x), state.splats.shN), FitReport("full", True, step, before, after, why)
 
 
 def affordable_steps(seconds: float, plan: Plan) -> int:

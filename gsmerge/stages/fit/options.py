@@ -60,6 +60,7 @@ class FitOptions:
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
         half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all.
+        average_share: Share of the steps, the last ones, over which the parameters are averaged.
         ssim_lambda: Share of structural similarity in the loss, the rest is L1.
         opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
             the photos do not need fades, instead of standing in front of other views.
@@ -88,6 +89,7 @@ class FitOptions:
     time_budget: float | None = None
     dropout: float | None = None
     half_res_share: float | None = None
+    average_share: float = 0.05
     ssim_lambda: float = 0.2
     opacity_reg: float = 0.03
     scale_reg: float = 0.01
@@ -139,7 +141,7 @@ class FitOptions:
                 raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
         if not 0 < self.holdout < 1:
             raise ValueError(f"holdout: expected a number between 0 and 1, got {self.holdout}")
-        for name in ("half_res_share", "ssim_lambda", "min_contribution"):
+        for name in ("half_res_share", "average_share", "ssim_lambda", "min_contribution"):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise ValueError(f"{name}: expected a number from 0 to 1, got {value}")
