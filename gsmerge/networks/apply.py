@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gsmerge.geometry import covariances, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
+from gsmerge.networks.neighbors import nearest_points
 from gsmerge.networks.residuals import (
     HALF,
     RESIDUAL,
@@ -22,7 +23,7 @@ from gsmerge.networks.residuals import (
 )
 from gsmerge.networks.tables import group_rows, point_seeds, sample_members, split_tables
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, member_tokens, part_tokens
-from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 RunTable = Callable[[np.ndarray, int], Tensor]  # rows and width of a table -> [rows, columns]
@@ -209,20 +210,12 @@ def run_refiner(
 
 def find_neighbors(features: FeatureGaussians, count: int) -> np.ndarray:
     """``[g,k]`` int64 nearest other Feature Gaussians of the same layer in 3D; -1 where there are fewer."""
-    from scipy.spatial import cKDTree  # late: a quarter of a second that the analytic path does not need
-
     means, neighbors = features.means.double().numpy(), np.full((len(features), count), -1, np.int64)
-    with use_threads() as threads:
-        finite = np.isfinite(means).all(1)
-        for layer in (features.backing.numpy(), ~features.backing.numpy()):
-            rows = np.flatnonzero(layer & finite)
-            if len(rows) < 2:
-                continue
-            near = min(count + 1, len(rows))
-            _, ids = cKDTree(means[rows]).query(means[rows], k=near, workers=threads)
-            itself = ids == np.arange(len(rows))[:, None]
-            itself[~itself.any(1), -1] = True  # among many at the same place
-            neighbors[rows, : near - 1] = rows[ids[~itself].reshape(len(rows), -1)]
+    finite = np.isfinite(means).all(1)
+    for layer in (features.backing.numpy(), ~features.backing.numpy()):
+        rows = np.flatnonzero(layer & finite)
+        near = nearest_points(means[rows], count)
+        neighbors[rows] = np.where(near < 0, -1, rows[near]) if len(rows) else -1
     return neighbors
 
 

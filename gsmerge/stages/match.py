@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks import NetworkContext, match_geometry
-from gsmerge.runtime.threads import use_threads
+from gsmerge.networks.neighbors import nearest_of_other_views
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
 
 Method = Literal["overlap", "aabb", "none"]
@@ -113,30 +113,3 @@ def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOption
     order = np.lexsort((*means.T, -features.weights.numpy()[rows]))
     size = options.cluster_size or len(np.unique(views))
     return leader_clusters(order, neighbors, scores, views, options.overlap, size)
-
-
-def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
-    """``[g,count]`` int64 nearest points of other views than the own (paper section 4.4), nearest first.
-
-    Among the nearest 16 times as many of all views; -1 where there are fewer. What lies behind so many of the own
-    view overlaps nothing.
-
-    Args:
-        means: ``[g,3]``.
-        views: ``[g]``; points of views below 0 belong to none, and count as of another one.
-        count: Neighbours of each.
-    """
-    from scipy.spatial import cKDTree  # late: a quarter of a second that --match none does not need
-
-    tree, neighbors = cKDTree(means), np.full((len(means), count), -1, np.int64)
-    rows, num_near, most = np.arange(len(means)), min(count + count // 2 + 1, len(means)), min(16 * count, len(means))
-    with use_threads() as threads:
-        while len(rows):
-            _, ids = tree.query(means[rows], k=np.arange(1, num_near + 1), workers=threads)
-            other = (ids != rows[:, None]) & ((views[ids] != views[rows, None]) | (views[rows, None] < 0))
-            picked = np.argsort(~other, axis=1, kind="stable")[:, :count]
-            near = np.where(np.take_along_axis(other, picked, 1), np.take_along_axis(ids, picked, 1), -1)
-            neighbors[rows, : near.shape[1]] = near
-            rows = rows[other.sum(1) < count] if num_near < most else rows[:0]
-            num_near = min(2 * num_near, most)
-    return neighbors

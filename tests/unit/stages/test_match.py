@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import make_features
 
-from gsmerge.stages.match import MatchOptions, match, nearest_of_other_views
+from gsmerge.stages.match import MatchOptions, match
 from gsmerge.types import FeatureGaussians
 
 METHODS = ["overlap", "aabb"]
@@ -74,20 +74,6 @@ def test_a_crowd_of_the_own_view_hides_nobody(method: str) -> None:
     crowd = np.random.default_rng(0).normal(size=(40, 3)) * 1e-5
     features = make_features(np.concatenate([crowd, [[0, 0, 1e-3]]]), views=[0] * 40 + [1])
     assert max(map(len, sets(features, match=method))) == (2 if method == "overlap" else 41)
-
-
-@pytest.mark.parametrize("views", [1, 2, 5])
-@pytest.mark.parametrize("num", [1, 3, 40, 200])
-def test_neighbours_of_other_views(num: int, views: int) -> None:
-    """As a search through all of them."""
-    generator = np.random.default_rng(num)
-    means, owners, count = generator.normal(size=(num, 3)), generator.integers(-1, views, num), 4
-    neighbors = nearest_of_other_views(means, owners, count)
-    assert neighbors.shape == (num, count)
-    for i, row in enumerate(neighbors):
-        near = np.argsort(np.linalg.norm(means - means[i], axis=1))[: 16 * count]
-        others = [j for j in near if j != i and (owners[i] < 0 or owners[j] != owners[i])][:count]
-        assert row.tolist() == others + [-1] * (count - len(others))
 
 
 def test_none_leaves_everything_alone() -> None:

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.networks.neighbors import nearest_of_other_views
+from gsmerge.runtime.threads import use_threads
+
+
+@pytest.mark.parametrize("views", [1, 2, 5])
+@pytest.mark.parametrize("num", [1, 3, 16, 17, 40, 250])
+def test_neighbours_of_other_views(num: int, views: int) -> None:
+    """As a search through all of them."""
+    generator = np.random.default_rng(num)
+    means, owners, count = generator.normal(size=(num, 3)), generator.integers(-1, views, num), 4
+    neighbors = nearest_of_other_views(means, owners, count)
+    assert neighbors.shape == (num, count)
+    for i, row in enumerate(neighbors):
+        near = np.argsort(np.linalg.norm(means - means[i], axis=1))
+        others = [j for j in near if j != i and (owners[i] < 0 or owners[j] != owners[i])][:count]
+        assert row.tolist() == others + [-1] * (count - len(others))
+
+
+def test_neighbours_are_the_same_on_any_number_of_threads() -> None:
+    generator = np.random.default_rng(0)
+    means, owners = generator.normal(size=(40_000, 3)), generator.integers(0, 3, 40_000)
+    means[5000:5100] = means[5000]  # many at one place
+    results = []
+    for threads in (1, 3):
+        with use_threads(threads):
+            results.append(nearest_of_other_views(means, owners, 16))
+    np.testing.assert_array_equal(*results)
+    for i in generator.choice(40_000, 200):
+        near = np.sort(np.linalg.norm(means[owners != owners[i]] - means[i], axis=1))[:16]
+        np.testing.assert_allclose(np.linalg.norm(means[results[0][i]] - means[i], axis=1), near)
+
+
+def test_what_lies_behind_thousands_of_the_own_view_is_not_looked_for() -> None:
+    crowd = np.random.default_rng(0).normal(size=(5000, 3))
+    neighbors = nearest_of_other_views(np.concatenate([crowd, [[50, 0, 0]]]), np.array([0] * 5000 + [1]), 4)
+    assert (neighbors[:5000] == -1).mean() > 0.9
+    nearest = np.argsort(np.linalg.norm(crowd - [50, 0, 0], axis=1))[:4]
+    assert neighbors[5000].tolist() == nearest.tolist()
