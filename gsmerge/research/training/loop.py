@@ -26,6 +26,7 @@ from torch.nn import Parameter
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks import Networks, save_checkpoint
+from gsmerge.networks.modules import Head
 from gsmerge.networks.residuals import LOGIT
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss
@@ -186,6 +187,7 @@ def with_opacity_shift(networks: Networks, shift: float) -> Networks:
     shifted = deepcopy(networks)
     with torch.no_grad():
         for head in shifted.heads.values():
+            assert isinstance(head, Head)
             head.out.bias[LOGIT] += shift
     return shifted
 
