@@ -1,0 +1,63 @@
+"""The rows of a tile in which a Gaussian of a batch shows, against all its pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.kernels.raster.blend import DECAY, LNOP, MY, RATE, SLOPE, batch_rows, gather, new_batch
+from gsmerge.kernels.raster.project import LN_CUT, TILE
+from gsmerge.kernels.raster.walk import BATCH
+
+LEFT, TOP = 32, 48  # the tile's first pixel
+
+
+def footprints_of(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """``[BATCH,8]`` of Gaussians around the tile, their rows those of the whole image."""
+    rows = np.zeros((BATCH, 8), np.float32)
+    reach = {"near": 8, "far": 40, "huge": 3000}[kind]
+    rows[:, 0] = LEFT + 8 + rng.uniform(-reach, reach, BATCH)
+    rows[:, 1] = TOP + 8 + rng.uniform(-reach, reach, BATCH)
+    sizes = 10 ** rng.uniform(-0.3, {"near": 1, "far": 1.7, "huge": 4}[kind], (2, BATCH))
+    rows[:, 2], rows[:, 4] = 1 / (np.sqrt(2) * sizes[0]), 1 / (2 * sizes[1] ** 2)
+    rows[:, 3] = rng.normal(size=BATCH) * rng.choice([0, 0.5, 5, 50], BATCH)
+    rows[:, 5] = np.log(rng.uniform(1 / 255, 1, BATCH))
+    rows[:, 6], rows[:, 7] = 0, 1000
+    return rows
+
+
+@pytest.mark.parametrize("kind", ["near", "far", "huge"])
+@pytest.mark.parametrize("seed", range(20))
+def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
+    """None that shows is left out, and at most one beside them is kept."""
+    footprints, batch = footprints_of(kind, np.random.default_rng(seed)), new_batch()
+    gather(footprints, np.arange(BATCH, dtype=np.int32), 0, BATCH, BATCH, LEFT, TOP, batch)
+    i = np.arange(BATCH)
+    mx, my, rate = (batch[i + int(plane)].astype(np.float64)[:, None, None] for plane in (0, MY, RATE))
+    slope, decay, lnop = (batch[i + int(plane)].astype(np.float64)[:, None, None] for plane in (SLOPE, DECAY, LNOP))
+    y, x = np.mgrid[:TILE, :TILE].astype(np.float64)
+    exponents = lnop - (rate * (x - mx - slope * (y - my))) ** 2 - decay * (y - my) ** 2
+    # along a row without pixels between: what the bounds are of
+    line = np.linspace(0, TILE - 1, 4096)
+    for j in range(BATCH):
+        first, last = batch_rows(batch, j, 0, TILE - 1)
+        shows = np.flatnonzero((exponents[j] >= LN_CUT + 1e-5).any(1))
+        if len(shows):
+            assert first <= shows[0]
+            assert last >= shows[-1]
+        dy = np.arange(TILE)[:, None] - my[j, 0, 0]
+        along = (
+            lnop[j, 0, 0] - (rate[j, 0, 0] * (line - mx[j, 0, 0] - slope[j, 0, 0] * dy)) ** 2 - decay[j, 0, 0] * dy**2
+        )
+        touched = np.flatnonzero((along >= LN_CUT - 0.05).any(1))
+        if first <= last and len(touched):
+            assert first >= touched[0] - 1
+            assert last <= touched[-1] + 1
+
+
+def test_a_gaussian_that_misses_the_tile_has_no_rows() -> None:
+    footprints, batch = np.zeros((1, 8), np.float32), new_batch()
+    footprints[0] = LEFT + 60, TOP + 8, 1, 0, 1, 0, 0, 1000
+    gather(footprints, np.zeros(1, np.int32), 0, 1, 1, LEFT, TOP, batch)
+    first, last = batch_rows(batch, 0, 0, TILE - 1)
+    assert first > last
