@@ -3,6 +3,7 @@
 python benchmarks/networks.py eval                      # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
+python benchmarks/networks.py eval --only paper --no-lpips --checkpoint gsmerge/networks/paper.safetensors
 
 Plain exports, held-out views, pixels that the context views see; LPIPS (VGG) of two held-out views of each scene.
 """
@@ -69,7 +70,21 @@ ABLATION = (
     Condition("smaller superpixels", {"budget": "8.7%", **PLAIN}),
     Condition("the photos choose the merge", {**ONE, "fit": "none", "robust": True}),
 )
-PARTS = {"gain": GAIN, "children": MANY, "ablation": ABLATION}
+OWN = {"recipe": "paper", **ONE}
+PAPER = (
+    Condition("the whole, K = 1", OWN, learned=(True,)),
+    Condition("moment matching", {"method": "moment-matching", **ONE}, learned=(False,)),
+    *(Condition(f"K = {k}", {"recipe": "paper", "k": k, "budget": BUDGET[k]}, learned=(True,)) for k in (2, 4)),
+    Condition("no merging across views", {**OWN, "match": "none"}, learned=(True,)),
+    *(Condition(f"without the {name}", OWN, silent=name, learned=(True,)) for name in ("merger", "refiner", "heads")),
+    Condition("the encoder's latents zero", OWN, silent="latent", learned=(True,)),
+    Condition("geometry of the moments for matching", {**OWN, "geometry": "analytic"}, learned=(True,)),
+    *(
+        Condition(f"cosine of at least {cosine}", {**OWN, "similarity": cosine}, learned=(True,))
+        for cosine in (0.9, 0.95, 0.98)
+    ),
+)
+PARTS = {"gain": GAIN, "children": MANY, "ablation": ABLATION, "paper": PAPER}
 
 
 @dataclass
@@ -124,9 +139,8 @@ def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, l
     if condition.views is not None:
         scene = subset(scene, even_views(len(scene), min(condition.views, len(scene))))
     start = time.perf_counter()
-    result = gsmerge.compact(
-        scene, **condition.settings, checkpoint=checkpoint, require_checkpoint=checkpoint != "none"
-    )
+    chosen = {"checkpoint": checkpoint, "require_checkpoint": checkpoint != "none"}
+    result = gsmerge.compact(scene, **condition.settings, **chosen)
     seconds = time.perf_counter() - start
     views = Views(targets.cameras, torch.from_numpy(targets.images), tuple(map(str, range(len(targets.images)))))
     options = EvaluateOptions(lpips=("vgg",) if lpips else (), lpips_views=2, context=False, own=False)
@@ -137,7 +151,9 @@ def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, l
         if values:
             means[name] = sum(values) / len(values)
     stages = {name: result.report.seconds[name] for name in STAGES if name in result.report.seconds}
-    return {"count": len(result.gaussians), "seconds": seconds, "stages": stages, **means}
+    choices = result.report.choices
+    kept = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
+    return {"count": len(result.gaussians), "seconds": seconds, "stages": stages, "kept": kept, **means}
 
 
 def runs_of(folders: list[Path], conditions: tuple[Condition, ...], args: argparse.Namespace) -> Iterator[None]:
@@ -194,6 +210,19 @@ def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse
     return "\n".join(rows)
 
 
+def paper_table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse.Namespace) -> str:
+    """Markdown: means over the scenes, against the whole recipe."""
+    digest = hashlib.sha256(args.checkpoint.read_bytes()).hexdigest()[:16]
+    rows = ["| | groups kept across views | PSNR / SSIM | against the whole (95 %) |", "|---|---|---|---|"]
+    whole = scores(folders, conditions[0], digest, args)
+    for condition in conditions:
+        runs = scores(folders, condition, digest if condition.learned == (True,) else "none", args)
+        kept = sum(run["kept"] for run in runs.values()) / len(runs)
+        gain = words(paired_difference(pick(runs, "psnr"), pick(whole, "psnr"))) if runs is not whole else ""
+        rows.append(f"| {condition.name} | {100 * kept:.0f} % | {summary(runs)} | {gain} |")
+    return "\n".join(rows)
+
+
 def scores(
     folders: list[Path], condition: Condition, digest: str, args: argparse.Namespace
 ) -> dict[str, dict[str, Any]]:
@@ -221,7 +250,7 @@ def words(interval: Interval) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", help="train, eval, or names with commas between")
-    parser.add_argument("--only", nargs="*", default=list(PARTS), choices=list(PARTS))
+    parser.add_argument("--only", nargs="*", default=list(PARTS)[:3], choices=list(PARTS))
     parser.add_argument("--checkpoint", type=Path, default=SHIPPED)
     parser.add_argument("--no-lpips", dest="lpips", action="store_false")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
@@ -234,7 +263,8 @@ def main() -> None:
         for _ in runs_of(folders, conditions, args):
             pass
         names = ", ".join(folder.name for folder in folders)
-        print(f"\n{part}: {names}\n\n{table(folders, conditions, args)}\n", flush=True)
+        rows = (paper_table if part == "paper" else table)(folders, conditions, args)
+        print(f"\n{part}: {names}\n\n{rows}\n", flush=True)
 
 
 if __name__ == "__main__":
