@@ -278,7 +278,7 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
     front = np.flatnonzero(~features.backing.numpy())
     if max_children == 1 or len(front) == 0:
         return np.zeros(0, np.int64)
-    gains = _hull_gains(_child_errors(features, members, front, max_children))
+    gains = hull_gains(_child_errors(features, members, front, max_children))
     # Stable, group by group: of equal gains of one group the first step comes first.
     order = np.argsort(-gains.reshape(-1), kind="stable")
     return front[order[: int(np.isfinite(gains).sum())] // gains.shape[1]]
@@ -300,7 +300,7 @@ def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarra
     return np.concatenate(parallel_map(run, tasks))
 
 
-def _hull_gains(errors: np.ndarray) -> np.ndarray:
+def hull_gains(errors: np.ndarray) -> np.ndarray:
     """``[f,c-1]`` gain of each further child along the lower convex hull of the errors; -inf where there is none.
 
     Falls from child to child: the mean gain up to the farthest point of steepest descent, again and again.

@@ -261,9 +261,9 @@ def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Mem
 
 def test_a_first_step_that_only_pays_with_the_second() -> None:
     """Errors of 10, 9, 0: the two steps gain five each on average, so they come before a single gain of four."""
-    from gsmerge.stages.decode import _hull_gains
+    from gsmerge.stages.decode import hull_gains
 
-    gains = _hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
+    gains = hull_gains(np.array([[10.0, 9.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, np.nan], [1.0, np.nan, np.nan]]))
     assert gains.tolist() == [[5, 5], [4, 0], [2, -np.inf], [-np.inf, -np.inf]]
 
 

@@ -1,0 +1,79 @@
+"""feature gaussians -> gaussians, on a device: K children of every group; :mod:`gsmerge.stages.decode`."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import torch
+from torch import Tensor
+
+from gsmerge.gpu.axes import features_to_shapes, moments_to_shapes
+from gsmerge.gpu.halve import Division, halve, member_points
+from gsmerge.gpu.match import take
+from gsmerge.gpu.pool import pool_members
+from gsmerge.gpu.runs import owners_of
+from gsmerge.gpu.scene import DeviceMembers, Features, Shapes
+from gsmerge.stages.decode import MAX_CHILDREN, MIXED, DecodeOptions, hull_gains
+
+
+def covers(options: DecodeOptions) -> bool:
+    """Whether :func:`decode` does what the options ask for."""
+    return options.k != MIXED
+
+
+def decode(features: Features, members: DeviceMembers, options: DecodeOptions, count: int | None) -> Shapes:
+    """``count`` Gaussians, spent where they lower distortion most, or None: K of each Feature Gaussian.
+
+    Those below the least opacity are left out. See :func:`gsmerge.stages.decode.decode`; the rule is ``"depth"``.
+    """
+    if count is None:
+        children = torch.full((len(features),), options.max_k, device=features.means.device)
+    else:
+        children = split_counts(features, members, max(0, count - len(features)), MAX_CHILDREN)
+    shapes = divide(features, members, children)
+    return shapes[shapes.opacities >= options.min_opacity]
+
+
+def divide(features: Features, members: DeviceMembers, counts: Tensor) -> Shapes:
+    """At most ``counts [g]`` children of every Feature Gaussian, however faint, those of one next to each other."""
+    shapes = features_to_shapes(features)
+    groups = torch.nonzero((counts > 1) & ~features.backing)[:, 0]
+    if len(groups) == 0:
+        return shapes
+    few, division = _halve(features, members, groups, counts[groups])
+    moments = pool_members(members, division.starts, few.members[division.order])
+    gains, spreads = few.gains.double()[division.groups], few.spreads.double()[division.groups]
+    parts = moments_to_shapes(moments.covars, moments.extinctions * gains, spreads, moments.means, moments.sh)
+    whole = torch.ones(len(features), dtype=torch.bool, device=counts.device)
+    whole[groups] = False
+    rows = torch.nonzero(whole)[:, 0]
+    order = torch.sort(torch.cat([rows, groups[division.groups]]), stable=True).indices
+    names = [f.name for f in fields(Shapes)]
+    return Shapes(*(torch.cat([getattr(shapes, name)[rows], getattr(parts, name)])[order] for name in names))
+
+
+def split_counts(features: Features, members: DeviceMembers, extra: int, max_children: int = MAX_CHILDREN) -> Tensor:
+    """``[g]`` int64 children of every Feature Gaussian when ``extra`` more are spent where they lower distortion most.
+
+    See :func:`gsmerge.stages.decode.split_counts`.
+    """
+    ones = torch.ones(len(features), dtype=torch.int64, device=features.means.device)
+    front = torch.nonzero(~features.backing)[:, 0]
+    if extra <= 0 or len(front) == 0:
+        return ones
+    counts = torch.full((len(front),), max_children, device=front.device)
+    errors = _halve(features, members, front, counts)[1].errors
+    gains = torch.from_numpy(hull_gains(errors.cpu().numpy())).to(front.device)
+    order = torch.sort(-gains.reshape(-1), stable=True).indices
+    dealt = order[: min(extra, int(torch.isfinite(gains).sum()))] // gains.shape[1]
+    return ones.index_add_(0, front[dealt], ones.new_ones(len(dealt)))
+
+
+def _halve(features: Features, members: DeviceMembers, groups: Tensor, counts: Tensor) -> tuple[Features, Division]:
+    """Some Feature Gaussians, and their members halved."""
+    few = take(features, groups)
+    ids = few.members
+    owners = owners_of(few.starts, len(ids))
+    centres, footprints = few.means.double(), few.footprints.double()
+    points = member_points(members.means[ids], members.sh0[ids], members.opacities[ids], centres, footprints, owners)
+    return few, halve(points, few.starts, counts)

@@ -1,0 +1,144 @@
+"""The border between the core types and tensors on a device: one upload, one download."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.moments import Members
+from gsmerge.render.photos import Photos, scene_photos
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePhotos:
+    """V photos of one size on a device; see :class:`gsmerge.render.photos.Photos`.
+
+    Args:
+        images: ``[v,h,w,3]`` float32.
+        viewmats: ``[v,4,4]`` float32 world to camera.
+        Ks: ``[v,3,3]`` float32.
+        host: The same photos in the computer's memory, whose cameras the kernels read.
+    """
+
+    images: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    host: Photos
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return self.images.shape[1]
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return self.images.shape[2]
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceMembers:
+    """The scene's Gaussians on a device, float32; shapes as of :class:`gsmerge.moments.Members`."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+    footprints: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """n Gaussians on a device, float32; fields and shapes as of :class:`gsmerge.types.Gaussians`."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh0: Tensor
+    shN: Tensor
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, index: Tensor) -> Shapes:
+        """The rows that a mask or an integer tensor selects."""
+        return Shapes(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """g Feature Gaussians on a device; fields and shapes as of :class:`gsmerge.types.FeatureGaussians`, no latents."""
+
+    means: Tensor
+    covars: Tensor
+    weights: Tensor
+    masses: Tensor
+    extinctions: Tensor
+    gains: Tensor
+    spreads: Tensor
+    sh0: Tensor
+    shN: Tensor
+    footprints: Tensor
+    views: Tensor
+    backing: Tensor
+    starts: Tensor
+    members: Tensor
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def to_device(array: Any, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+    """A tensor or an array of a core type on a device."""
+    return torch.as_tensor(array).to(device, dtype)
+
+
+def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
+    """Photos and their cameras on a device."""
+    single = torch.float32
+    images = to_device(np.ascontiguousarray(photos.images), device, single)
+    return DevicePhotos(
+        images, to_device(photos.viewmats, device, single), to_device(photos.Ks, device, single), photos
+    )
+
+
+def upload_pair(scene: PixelScene | UnalignedScene, device: torch.device) -> tuple[DevicePhotos, DevicePhotos]:
+    """A scene's photos at full and at half size on a device."""
+    return upload_photos(scene_photos(scene), device), upload_photos(scene_photos(scene, 2), device)
+
+
+def upload_members(members: Members, device: torch.device) -> DeviceMembers:
+    """The scene's Gaussians on a device."""
+    return DeviceMembers(*(to_device(getattr(members, f.name), device) for f in fields(DeviceMembers)))
+
+
+def upload_gaussians(gaussians: Gaussians, device: torch.device) -> Shapes:
+    """Gaussians on a device, in float32."""
+    return Shapes(*(to_device(getattr(gaussians, f.name), device, torch.float32) for f in fields(Shapes)))
+
+
+def upload_features(features: FeatureGaussians, device: torch.device) -> Features:
+    """Feature Gaussians that a stage on the CPU made, on a device; latents stay behind."""
+    return Features(*(to_device(getattr(features, f.name), device) for f in fields(Features)))
+
+
+def download_gaussians(shapes: Shapes) -> Gaussians:
+    """The core type of Gaussians on a device. The one place that makes it: what its arrays are is decided here."""
+    return Gaussians(*(getattr(shapes, f.name).float().cpu() for f in fields(Shapes)))
+
+
+def download_features(features: Features) -> FeatureGaussians:
+    """The core type of Feature Gaussians on a device, without latents; as :func:`download_gaussians`."""
+    columns = {f.name: getattr(features, f.name).cpu() for f in fields(Features)}
+    return FeatureGaussians(**columns, latents=torch.zeros(len(features), 0))
