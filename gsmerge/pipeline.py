@@ -1,13 +1,15 @@
 """The story of a run: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted.
 
 :func:`compact` prepares the scene, chooses how many Gaussians, builds, and scores; :func:`build` is every arrow by its
-name, whose first half, :func:`merge_views`, encoding and views in batches share. A baseline takes the place of the
-arrows alone: preparing, scores and report stay the same.
+name, whose first half, :func:`merge_views`, encoding and views in batches share. A baseline, or the same arrows on a
+GPU, take the place of the arrows alone: preparing, scores and report stay the same.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -20,7 +22,7 @@ from gsmerge.report import CompactReport, CompactResult
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.run_log import STAGES, Progress, RunLog
 from gsmerge.runtime.threads import use_threads
-from gsmerge.search import choose_count, level_counts, search_quality
+from gsmerge.search import Build, choose_count, level_counts, search_quality
 from gsmerge.stages.assign import assign_members
 from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
@@ -34,6 +36,8 @@ from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.stages.segment import scene_saliency
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import scored_views
+
+Psnr = Callable[[Gaussians, PreparedScene], float]
 
 
 def compact(
@@ -60,23 +64,35 @@ def compact(
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
     options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
-    log = RunLog(progress)
+    options, log = options.with_chosen_device(scene.num_gaussians), RunLog(progress)
     with use_threads(options.threads), torch.no_grad():
         baseline, log.notes[:] = choose_baseline(options, scene)
         prepared = prepare(scene, options, log)
-        make = build if baseline is None else baseline.build
+        own_build, psnr = choose_builder(prepared)
+        make, judge = own_build if baseline is None else baseline.build, partial(score, psnr=psnr)
         if options.budget.target_psnr is not None:
-            result = search_quality(prepared, make, score, log)
+            result = search_quality(prepared, make, judge, log)
         else:
-            result = score(make(prepared, choose_count(prepared, build, log), log), prepared, log)
+            result = judge(make(prepared, choose_count(prepared, own_build, log), log), prepared, log)
         coarser = []
         for count in level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count):
             own = RunLog(progress)
-            coarser.append(score(make(prepared, count, own), prepared, own))
-        result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress))
+            coarser.append(judge(make(prepared, count, own), prepared, own))
+        result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress), psnr)
     if progress:
         progress("done", len(STAGES), len(STAGES))
     return result
+
+
+def choose_builder(prepared: PreparedScene) -> tuple[Build, Psnr]:
+    """What makes the Gaussians of a prepared scene and what scores them: :func:`build`, or the same on a GPU."""
+    device = prepared.options.fit.device
+    if device == "cpu":
+        return build, input_psnr
+    from gsmerge.gpu.build import DeviceScene  # loaded where it is used alone
+
+    on_device = DeviceScene(prepared, torch.device(device), begin)
+    return on_device.build, on_device.input_psnr
 
 
 def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
@@ -88,17 +104,7 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
         log: Takes seconds, choices and notes.
     """
     scene, options = prepared.scene, prepared.options
-    if prepared.keeps_all(count):  # merging some and splitting others would only blur
-        gaussians, count, exact, analytic = scene.gaussians, len(scene.gaussians), True, None
-    else:
-        merged = merge_views(prepared, count, log)
-        with log.stage("decode"):
-            gaussians = decode_merged(merged, options.decode, options.encode.rule, grows=options.fit.grows)
-        count, exact, analytic = merged.segmentation.count, merged.segmentation.exact, None
-        if merged.networks is not None and options.fit.fit == "full" and scene.images is not None:
-            groups = merged.segmentation.groups
-            analytic = feature_to_gaussians(encode(scene, merged.members, groups, options.encode))
-        del merged  # frees more memory than the fit takes
+    gaussians, count, exact, analytic = begin(prepared, count, log)
     if scene.images is None or not options.fit.needs_photos:
         return gaussians
     with log.stage("fit"):
@@ -109,6 +115,26 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
         )
     log.add_fit(report)
     return gaussians
+
+
+def begin(prepared: PreparedScene, count: int | None, log: RunLog) -> tuple[Gaussians, int, bool, Gaussians | None]:
+    """The arrows up to decoding; arguments as of :func:`build`.
+
+    Returns:
+        Gaussians; the number that the fit may grow to, and whether it is to be met; another start that the fit may
+        beat instead, None for none.
+    """
+    scene, options = prepared.scene, prepared.options
+    if prepared.keeps_all(count):  # merging some and splitting others would only blur
+        return scene.gaussians, len(scene.gaussians), True, None
+    merged = merge_views(prepared, count, log)
+    with log.stage("decode"):
+        gaussians = decode_merged(merged, options.decode, options.encode.rule, grows=options.fit.grows)
+    analytic = None
+    if merged.networks is not None and options.fit.fit == "full" and scene.images is not None:
+        groups = merged.segmentation.groups
+        analytic = feature_to_gaussians(encode(scene, merged.members, groups, options.encode))
+    return gaussians, merged.segmentation.count, merged.segmentation.exact, analytic
 
 
 def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> MergedViews:
@@ -157,15 +183,18 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
     return start
 
 
-def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog) -> CompactResult:
-    """Canonical Gaussians as a result in the world frame, with its report, scored on the input views."""
+def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr | None = None) -> CompactResult:
+    """Canonical Gaussians as a result in the world frame, with its report, scored on the input views.
+
+    By ``psnr``, or :func:`input_psnr`.
+    """
     if prepared.hidden is not None:
         gaussians = Gaussians.concat([gaussians, prepared.hidden])
     gaussians = prepared.frame.leave(gaussians)
     after = None
     if prepared.given.images is not None:
         with log.stage("score"):
-            after = input_psnr(gaussians, prepared)
+            after = (psnr or input_psnr)(gaussians, prepared)
     settings = prepared.settings.to_dict() | {"fit_steps": prepared.options.fit.steps}
     counts = prepared.given.num_gaussians, len(gaussians)
     return CompactResult(
@@ -174,7 +203,7 @@ def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog) -> Compact
     )
 
 
-def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog) -> CompactResult:
+def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog, psnr: Psnr) -> CompactResult:
     """The result and its further levels, with the PSNR of the input beside their own.
 
     It comes last, when the kernels are compiled and memory is free again.
@@ -182,7 +211,7 @@ def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog) -> 
     if prepared.given.images is None:
         return result
     with log.stage("input"):
-        before = input_psnr(prepared.given.file_gaussians, prepared)
+        before = psnr(prepared.given.file_gaussians, prepared)
 
     def with_input(one: CompactResult, seconds: dict[str, float]) -> CompactResult:
         report = replace(one.report, psnr_before=before, seconds=one.report.seconds | seconds)

@@ -14,8 +14,8 @@ SWEEPS = 8  # of Jacobi rotations; they converge quadratically
 def principal_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Standard deviations ``[g,3]`` (rising) and unit quaternions ``[g,4]`` (w at least 0) of covariances ``[g,3,3]``.
 
-    Cyclic Jacobi sweeps in float64, all matrices at once, as the kernel ``decompose`` does them one by one. (The batched
-    ``eigh`` of CUDA is limited in the size of a batch, and slower on matrices as small as these.)
+    Cyclic Jacobi sweeps in float64, all matrices at once, as the kernel ``decompose`` does them one by one. (The
+    batched ``eigh`` of CUDA is limited in the size of a batch, and slower on matrices as small as these.)
     """
     a = [[covars[:, i, j].double() for j in range(3)] for i in range(3)]
     one, zero = torch.ones_like(a[0][0]), torch.zeros_like(a[0][0])

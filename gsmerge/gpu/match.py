@@ -106,9 +106,9 @@ def leader_clusters(
     """The kernel ``leader_clusters`` in rounds, with the same clusters and numbers.
 
     There each Gaussian in ``order`` that is still free leads its free neighbours that overlap it enough, at most
-    ``max_size`` to a cluster and one of each view, the best overlaps first. A Gaussian can be decided on once no earlier
-    one that is undecided may take it or one of its neighbours; all such are decided on at once. Since they share
-    nothing, their order does not matter.
+    ``max_size`` to a cluster and one of each view, the best overlaps first. A Gaussian can be decided on once no
+    earlier one that is undecided may take it or one of its neighbours; all such are decided on at once. Since they
+    share nothing, their order does not matter.
 
     Args:
         order: ``[g]`` leaders in turn.

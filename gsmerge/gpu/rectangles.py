@@ -1,8 +1,8 @@
 """Over-split of pictures into rectangles, the most rewarding cuts first, all views and a level of cuts at a time.
 
-The kernel ``split_rectangles`` takes one cut after another from a queue. The same rectangles come from whole levels: a cut
-is never made before the one that it lies in, so the gain that counts is the smallest on the way to it, and the cuts that
-are made are the largest of those numbers. Cuts below as many known ones as are wanted are not looked into.
+The kernel ``split_rectangles`` takes one cut after another from a queue. The same rectangles come from whole levels: a
+cut is never made before the one that it lies in, so the gain that counts is the smallest on the way to it, and the
+cuts that are made are the largest of those numbers. Cuts below as many known ones as are wanted are not looked into.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Merging of neighbouring regions with Ward's rule, and moves of border pixels, all views at a time.
 
-Both follow the kernels ``merge_tree`` and ``sweep``. Merging has rounds there too; here a round is over all edges at once. A
-sweep goes from pixel to pixel there; here a quarter of the pixels decides at once, none of which is next to another, so
-that each decision about connectivity stands, whatever the others do. Means follow after every quarter. Sums are of whole
-numbers, so results repeat bit for bit.
+Both follow the kernels ``merge_tree`` and ``sweep``. Merging has rounds there too; here a round is over all edges at
+once. A sweep goes from pixel to pixel there; here a quarter of the pixels decides at once, none of which is next to
+another, so that each decision about connectivity stands, whatever the others do. Means follow after every quarter.
+Sums are of whole numbers, so results repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _first_ceilings(pairs: Tensor, tree: _Tree, views: int, share: float) -> Ten
 
 
 def _merge_round(pairs: Tensor, tree: _Tree, ceilings: Tensor) -> tuple[Tensor, Tensor]:
-    """Merge the two regions of every edge that is the cheapest of both -> the edges left, merges ``[v]`` of each view."""
+    """Merge the two regions of every edge that is the cheapest of both -> edges left, merges ``[v]`` of each view."""
     costs = _costs(pairs, tree)
     cheap = costs <= ceilings[tree.views[pairs[:, 0]]]
     bids = torch.where(cheap, costs, torch.inf)

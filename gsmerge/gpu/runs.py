@@ -1,7 +1,7 @@
 """Runs: rows that belong together lie next to one another, so that sums have a fixed order on every device.
 
-Sums by scattering have none on a GPU, and differ in their last bits from run to run. Here rows are sorted by their group
-once, and every group is summed from its first row to its last.
+Sums by scattering have none on a GPU, and differ in their last bits from run to run. Here rows are sorted by their
+group once, and every group is summed from its first row to its last.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def owners_of(starts: Tensor, count: int) -> Tensor:
 
 
 def sum_runs(values: Tensor, starts: Tensor) -> Tensor:
-    """``[g,...]`` sums over the runs that begin at ``starts [g+1]`` of ``values [m,...]``, each in the order of its rows."""
+    """``[g,...]`` sums over the runs that begin at ``starts [g+1]`` of ``values [m,...]``, in the order of the rows."""
     return _reduce(values, starts, "sum")
 
 
@@ -113,7 +113,7 @@ def ranks_by_part(values: Tensor, parts: Tensor, num_parts: int) -> Tensor:
 
 
 def smallest_by_part(values: Tensor, parts: Tensor, ranks: Tensor) -> Tensor:
-    """``[p]`` the number of rank ``ranks [p]`` (0: the smallest) among the values of each part; inf where there is none."""
+    """``[p]`` the number of rank ``ranks [p]`` (0: smallest) among the values of each part; inf where there is none."""
     counts = torch.bincount(parts, minlength=len(ranks))
     ordered = values[order_by_part(values, parts)]
     if len(ordered) == 0:

@@ -21,7 +21,7 @@ gsplat is imported when it is first used.
 from __future__ import annotations
 
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -31,6 +31,10 @@ from gsmerge.render.images import Rendering
 from gsmerge.render.plan import EPS2D, Array, check_range
 from gsmerge.types import Cameras, Gaussians
 
+# Pixels of all views, as many as an aligned scene has Gaussians, from which "auto" takes CUDA. Starting it and
+# importing gsplat takes one to three seconds, in which two processors do a scene of this size from end to end.
+MIN_PIXELS = 400_000
+EVERY_BATCH = 1 << 24  # past the last batch of 256 Gaussians of any tile
 INSTALL = 'pip install "gsmerge[cuda]"'
 
 
@@ -44,7 +48,7 @@ def cuda_problem() -> str | None:
 
 
 def usable_device(device: str) -> str:
-    """The device that ``"cpu"``, ``"cuda"`` or ``"auto"`` (CUDA where it can be used) means on this machine.
+    """The same of ``"cpu"``, ``"cuda"`` and ``"auto"``, but ``"cpu"`` for ``"auto"`` where CUDA cannot be used.
 
     Raises:
         ValueError: If ``"cuda"`` is asked for and cannot be used.
@@ -52,7 +56,23 @@ def usable_device(device: str) -> str:
     problem = None if device == "cpu" else cuda_problem()
     if device == "cuda" and problem:
         raise ValueError(f'device: expected "cpu" or a CUDA device that can be used, got "cuda", but {problem}')
-    return "cpu" if device == "cpu" or problem else "cuda"
+    return "cpu" if problem else device
+
+
+def chosen_device(device: str, num_pixels: int) -> Literal["cpu", "cuda"]:
+    """``"cpu"`` or ``"cuda"``: the one that ``"auto"`` takes for views of so many pixels, all others as they are."""
+    if device != "auto":
+        return "cuda" if device == "cuda" else "cpu"
+    return "cuda" if num_pixels >= MIN_PIXELS and cuda_problem() is None else "cpu"
+
+
+def start_cuda(device: torch.device) -> None:
+    """Draw one Gaussian, so that loading and compiling are not taken for the time of the first stages."""
+    means, quats, colors = (torch.ones(1, size, device=device, requires_grad=True) for size in (3, 4, 3))
+    camera = torch.eye(4, device=device)[None], torch.eye(3, device=device)[None] * 8, 8, 8
+    with torch.enable_grad():
+        shape = means, quats, torch.ones(1, 3, device=device), torch.ones(1, device=device) / 2
+        rasterize(shape, colors, camera, torch.zeros(3, device=device))[0].images.sum().backward()
 
 
 def _gsplat() -> Any:
@@ -75,6 +95,7 @@ def rasterize(
     near: float = 0.01,
     far: float = 1e10,
     with_depths: bool = False,
+    unit_quats: bool = False,
 ) -> tuple[Rendering, Tensor]:
     """One call of gsplat's ``rasterization``.
 
@@ -85,6 +106,7 @@ def rasterize(
         background: ``[3]``.
         eps2d: Dilation of the footprints, pixels squared.
         antialiased: Lower the opacity by what the dilation adds to the footprint.
+        unit_quats: The quaternions are known to have a length, which need not be checked.
 
     Returns:
         Images, alphas and depths, on the device of the tensors, the depths without gradients; and ``[c,n]`` bool: which
@@ -99,9 +121,8 @@ def rasterize(
     if len(means) == 0 or len(viewmats) == 0:  # nothing that a kernel could be launched for
         reached = torch.zeros(len(viewmats), len(means), dtype=torch.bool, device=means.device)
         return _empty((*gaussians, colors, viewmats), backgrounds, (height, width), with_depths), reached
-    # a zero quaternion is no rotation, as on the CPU; gsplat would divide by its length
-    identity = torch.eye(4, device=quats.device)[0]
-    quats = torch.where((quats * quats).sum(1, keepdim=True) > 1e-30, quats, identity)
+    if not unit_quats:
+        quats = _no_zero(quats)
     images, alphas, details = _gsplat().rasterization(
         means=means,
         quats=quats,
@@ -124,6 +145,62 @@ def rasterize(
     radii = details["radii"]  # one per axis from gsplat 1.5 on
     reached = (radii > 0).all(-1) if radii.ndim == 3 else radii > 0
     return Rendering(images[..., :3], alphas, images[..., 3:].detach() if with_depths else None), reached
+
+
+def _no_zero(quats: Tensor) -> Tensor:
+    """A zero quaternion is no rotation, as on the CPU; gsplat would divide by its length."""
+    identity = torch.eye(4, device=quats.device)[0]
+    return torch.where((quats * quats).sum(1, keepdim=True) > 1e-30, quats, identity)
+
+
+def peak_weights(
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor],
+    cameras: tuple[Tensor, Tensor, int, int],
+    *,
+    eps2d: float = EPS2D,
+    near: float = 0.01,
+) -> tuple[Tensor, Tensor]:
+    """Largest blending weight of every Gaussian at some pixel of one view, and which have a footprint there.
+
+    gsplat lists the Gaussians of every pixel, nearest first; their weights follow from its footprints.
+
+    Args:
+        gaussians: As of :func:`rasterize`.
+        cameras: The same of one view: matrices ``[1,4,4]`` and ``[1,3,3]``, width and height.
+
+    Returns:
+        ``[n]`` float32 and ``[n]`` bool.
+    """
+    means, quats, scales, opacities = (tensor.float() for tensor in gaussians)
+    viewmats, Ks, width, height = cameras
+    peaks = torch.zeros(len(means), device=means.device)
+    if len(means) == 0:
+        return peaks, peaks.bool()
+    gsplat = _gsplat()
+    _, _, drawn = gsplat.rasterization(
+        means=means, quats=_no_zero(quats), scales=scales, opacities=opacities, colors=torch.zeros_like(means),
+        viewmats=viewmats.float(), Ks=Ks.float(), width=width, height=height, near_plane=near, eps2d=eps2d,
+        packed=False, backgrounds=torch.zeros(1, 3, device=means.device),
+    )  # fmt: skip
+    clear = torch.ones(1, height, width, device=means.device)
+    ids, pixels, _ = gsplat.rasterize_to_indices_in_range(
+        0, EVERY_BATCH, clear, drawn["means2d"], drawn["conics"], drawn["opacities"],
+        width, height, drawn["tile_size"], drawn["isect_offsets"], drawn["flatten_ids"],
+    )  # fmt: skip
+    ids, pixels = ids.long(), pixels.long()
+    centres = torch.stack([pixels % width, pixels // width], 1) + 0.5
+    dx, dy = (drawn["means2d"][0, ids] - centres).unbind(1)
+    xx, xy, yy = drawn["conics"][0, ids].unbind(1)
+    alphas = (drawn["opacities"][0, ids] * (-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy).exp()).clamp_max(0.999)
+    logs = torch.log1p(-alphas.double())
+    before = logs.cumsum(0) - logs  # of all pixels before; less those of the pixel's first entry: of this pixel
+    first = torch.ones(len(pixels), dtype=torch.bool, device=means.device)
+    first[1:] = pixels[1:] != pixels[:-1]
+    starts = torch.nonzero(first)[:, 0]
+    weights = alphas * (before - before[starts][first.cumsum(0) - 1]).exp().float()
+    radii = drawn["radii"]
+    reached = (radii > 0).all(-1) if radii.ndim == 3 else radii > 0
+    return peaks.scatter_reduce_(0, ids, weights, "amax"), reached[0]
 
 
 def _empty(tensors: tuple[Tensor, ...], backgrounds: Tensor, size: tuple[int, int], with_depths: bool) -> Rendering:

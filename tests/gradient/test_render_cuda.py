@@ -19,10 +19,11 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsmerge import Cameras, Gaussians, render
 from gsmerge.errors import GsmergeError
+from gsmerge.options import CompactOptions
 from gsmerge.render import Rendering
 from gsmerge.render import cuda as adapter
 from gsmerge.render.colored import draw_colored, seen_colors
-from gsmerge.render.cuda import harmonic_colors, rasterize, render_cuda, usable_device
+from gsmerge.render.cuda import chosen_device, harmonic_colors, rasterize, render_cuda, usable_device
 from gsmerge.stages.fit import FitOptions
 
 Calls = list[dict[str, Any]]
@@ -256,11 +257,16 @@ def test_without_gsplat_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPat
 def test_device_is_resolved(monkeypatch: pytest.MonkeyPatch, fake_gsplat: Calls) -> None:  # noqa: F811
     assert usable_device("cpu") == FitOptions().device == "cpu"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert [usable_device(name) for name in ("cuda", "auto")] == ["cuda", "cuda"]
-    assert FitOptions(device="auto").device == "cuda"
+    assert [usable_device(name) for name in ("cuda", "auto")] == ["cuda", "auto"]
+    assert FitOptions(device="auto").device == "auto"
+    sizes = (adapter.MIN_PIXELS - 1, adapter.MIN_PIXELS)
+    assert [chosen_device("auto", size) for size in sizes] == ["cpu", "cuda"]
+    assert [chosen_device(name, 1) for name in ("cpu", "cuda")] == ["cpu", "cuda"]
+    options = CompactOptions().with_settings({"device": "auto"})
+    assert [options.with_chosen_device(size).fit.device for size in sizes] == ["cpu", "cuda"]
     monkeypatch.delitem(sys.modules, "gsplat")
     monkeypatch.setattr(adapter, "find_spec", lambda name: None)
-    assert usable_device("auto") == "cpu"
+    assert usable_device("auto") == chosen_device("auto", 10**9) == "cpu"
     with pytest.raises(ValueError, match=r'got "cuda", but gsplat is not installed; pip install "gsmerge\[cuda\]"$'):
         usable_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

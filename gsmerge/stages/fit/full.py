@@ -114,22 +114,6 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     return error / max(3 * float(weight.sum()), 1)
 
 
-@dataclass(frozen=True)
-class Engine:
-    """What a run steps with.
-
-    Args:
-        step: One step on one view, as :func:`fit_step`, which may leave the state's arrays behind.
-        sync: Brings the state's arrays up to date, before anything else reads them.
-    """
-
-    step: Callable[[State, Plan, int, int, float, np.random.Generator], float]
-    sync: Callable[[State], None]
-
-
-KERNELS = Engine(fit_step, lambda state: None)
-
-
 def step_sizes(rates: LearningRates, progress: float, steps: int) -> np.ndarray:
     """Step of each of the fourteen columns at a point of the run, decaying geometrically; farther in longer runs."""
     decay = rates.decay * min(1.0, LONG_RUN / steps)
@@ -205,7 +189,6 @@ def fit_full(
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
-    engine: Engine = KERNELS,
     masks: Masks | None = None,
     baseline_start: Gaussians | None = None,
 ) -> tuple[Gaussians, FitReport]:
@@ -221,7 +204,6 @@ def fit_full(
         count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
         seed: Order of the views, backgrounds, dropout, held-out blocks.
         progress: Called after every step.
-        engine: What takes the steps.
         masks: Pixels that count; None: all. Where no Gaussian is, none should be drawn to.
         baseline_start: Another start that the fit may beat instead, see :func:`score_to_beat`.
     """
@@ -235,25 +217,21 @@ def fit_full(
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
-            engine.sync(state)
             state = grow_to(state, photos[1], count)
         if part >= options.half_res_part and not judged:
-            engine.sync(state)
             after, judged = holdout_score(state, plan), True
             if after <= before:
                 break
         if not queue:
             queue = rng.permutation(len(photos[0])).tolist()
-        error += (engine.step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
+        error += (fit_step(state, plan, queue.pop(), step + 1, part, rng) - error) / min(step + 1, 10)
         step += 1
         if step > steps * (1 - options.average_share):
-            engine.sync(state)
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, plan)
         if progress:
             progress(step, steps, -10 * np.log10(max(error, 1e-12)), after)
-    engine.sync(state)
     after = after if judged else holdout_score(state, plan)
     if after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"

@@ -76,8 +76,9 @@ class FitOptions:
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
             lie in are left out.
-        device: Where the full fit's steps run: ``"cpu"``; ``"cuda"``, through gsplat, whose sums have no fixed order,
-            so that runs differ in the last bits; ``"auto"``: CUDA where it can be used, resolved at once.
+        device: Where the fit runs, and in :func:`gsmerge.compact` all stages that can: ``"cpu"``; ``"cuda"``, which
+            draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits; ``"auto"``: CUDA
+            where it can be used and the scene is large enough that it pays.
 
     Raises:
         ValueError: If a setting is unknown or out of range, or CUDA is asked for and cannot be used.

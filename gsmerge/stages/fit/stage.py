@@ -11,7 +11,6 @@ from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import Photos, photo_errors
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.fit.color import draw, fit_colors
-from gsmerge.stages.fit.device import engine_for
 from gsmerge.stages.fit.full import Progress, fit_full
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
@@ -53,6 +52,13 @@ def fit(
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
+    device = _device(options, photos[0])
+    if device != "cpu":
+        from gsmerge.gpu.fit import fit_gaussians  # it stands above all stages, and is loaded where it is used alone
+
+        return fit_gaussians(
+            gaussians, photos, options, count, seed, progress, baseline_start, exact=exact, device=torch.device(device)
+        )
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
     if not options.needs_photos:  # it costs as much as all that was done before
@@ -62,9 +68,7 @@ def fit(
         return gaussians[keep], None
     if options.fit == "full":
         kept = gaussians[keep]
-        fitted, report = fit_full(
-            kept, photos, options, count, seed, progress, engine_for(options.device), None, baseline_start
-        )
+        fitted, report = fit_full(kept, photos, options, count, seed, progress, None, baseline_start)
         fitted, report = _better_of(kept, fitted, report, photos[0])
         if report.accepted:
             return fitted, report
@@ -75,6 +79,15 @@ def fit(
             return _better_of(kept, fitted, report, photos[0], ALWAYS) if report.accepted else (kept, report)
     fitted, report = fit_colors(gaussians, draw(gaussians, photos[1]), photos[1], options, seed)
     return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
+
+
+def _device(options: FitOptions, photos: Photos) -> str:
+    """Where a fit to some photos runs, ``"cpu"`` or ``"cuda"``."""
+    if options.device == "cpu":
+        return "cpu"
+    from gsmerge.render.cuda import chosen_device
+
+    return chosen_device(options.device, len(photos) * photos.height * photos.width)
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> torch.Tensor:

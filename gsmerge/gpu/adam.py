@@ -1,0 +1,147 @@
+"""One optimiser step on all parameters of all Gaussians, on a device: the kernel ``optimise.adam``.
+
+On CUDA one Triton kernel does all of it (:mod:`gsmerge.gpu.adam_kernel`), elsewhere torch. Both also write what the new
+parameters mean to the rasterizer, so a step begins with nothing to compute.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+
+import torch
+from torch import Tensor
+
+from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
+from gsmerge.stages.fit.options import FitOptions
+
+
+@dataclass(eq=False)
+class FitState:
+    """Parameters under optimisation, and what they mean to the rasterizer; see :class:`gsmerge.stages.fit.state.State`.
+
+    Args:
+        x: ``[n,14]`` float32: mean, log scale, quaternion, opacity logit, colour; so are the next three.
+        x0: Where each began.
+        m: First moment.
+        v: Second moment.
+        units: ``[n]`` size of each Gaussian when it began.
+        box_shares: ``[n]`` share of the box about the start that each may use.
+        shN: ``[n,k-1,3]`` higher harmonics.
+        means: ``[n,3]``.
+        quats: ``[n,4]``.
+        scales: ``[n,3]``.
+        opacities: ``[n]``.
+        colors: ``[n,3]`` base colours.
+    """
+
+    x: Tensor
+    x0: Tensor
+    m: Tensor
+    v: Tensor
+    units: Tensor
+    box_shares: Tensor
+    shN: Tensor
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Gradients of a loss in what the rasterizer is given; shapes as there. ``reached [n]`` bool: drawn in the view."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    reached: Tensor
+
+
+def state_of(x: Tensor, shN: Tensor) -> FitState:
+    """A fresh state at parameters ``[n,14]`` and higher harmonics ``[n,k-1,3]``."""
+    sizes = x[:, SIZE:QUAT].sort(1).values
+    units = ((sizes[:, 1] + sizes[:, 2]) / 2).exp()
+    shown = (x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid(), x[:, COLOR:])
+    return FitState(
+        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, torch.ones_like(units), shN,
+        *(tensor.clone(memory_format=torch.contiguous_format) for tensor in shown),
+    )  # fmt: skip
+
+
+def adam_step(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    """Adam on a view's gradients, then the box about the start, in place.
+
+    Args:
+        state: n Gaussians.
+        gradients: Of the image loss; the pulls on opacity and size are added here.
+        options: Pulls, decays, limits.
+        rates: ``[14]`` step of each column, see :func:`gsmerge.stages.fit.full.step_sizes`.
+        step: From 1.
+    """
+    if state.x.is_cuda and has_triton():
+        from gsmerge.gpu.adam_kernel import launch
+
+        launch(state, gradients, options, rates, step)
+    else:
+        _step_in_torch(state, gradients, options, rates, step)
+
+
+@cache
+def has_triton() -> bool:
+    """Whether Triton is there; CUDA builds of torch for Linux bring it."""
+    return find_spec("triton") is not None
+
+
+def _step_in_torch(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    gradient, limits = parameter_gradient(state, gradients, options), options.rates
+    energy = gradient * gradient
+    for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
+        energy[:, shared] = energy[:, shared].sum(1, keepdim=True) / 3  # degrees of freedom, of a rotation too
+    state.m.lerp_(gradient, 1 - limits.beta1)
+    state.v.lerp_(energy, 1 - limits.beta2)
+    first, second = state.m / (1 - limits.beta1**step), state.v / (1 - limits.beta2**step)
+    move = rates * first / (second.sqrt() + 1e-15)
+    move[:, :SIZE] *= state.units[:, None]
+    state.x.copy_(confine(state, state.x - move, options))
+    for shown, meaning in (
+        (state.means, state.x[:, :SIZE]), (state.quats, state.x[:, QUAT:LOGIT]),
+        (state.scales, state.x[:, SIZE:QUAT].exp()), (state.opacities, state.x[:, LOGIT].sigmoid()),
+        (state.colors, state.x[:, COLOR:]),
+    ):  # fmt: skip
+        shown.copy_(meaning)
+
+
+def parameter_gradient(state: FitState, gradients: Gradients, options: FitOptions) -> Tensor:
+    """``[n,14]`` gradient in the optimiser's parameters: means in units of each size, log scales, logit."""
+    units, each = state.units[:, None], gradients.reached[:, None] / max(len(state), 1)
+    slope = (state.opacities * (1 - state.opacities))[:, None]
+    fade = gradients.opacities[:, None] + options.opacity_reg * each
+    shrink = gradients.scales + options.scale_reg * each / units
+    return torch.cat(
+        (gradients.means * units, shrink * state.scales, gradients.quats, fade * slope, gradients.colors), 1
+    )
+
+
+def confine(state: FitState, x: Tensor, options: FitOptions) -> Tensor:
+    """New parameters ``[n,14]``, brought into the box about the start, with unit quaternions."""
+    x0, rates, shares = state.x0, options.rates, state.box_shares[:, None]
+    offset = x[:, :SIZE] - x0[:, :SIZE]
+    far, reach = offset.norm(dim=1, keepdim=True), shares * rates.max_mean_shift * state.units[:, None]
+    x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])
+    sizes, logits, colors = x0[:, SIZE:QUAT], x0[:, LOGIT], x0[:, COLOR:]
+    grown = shares * rates.max_scale_change
+    x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown)
+    logit = x[:, LOGIT].clamp(logits - rates.max_opacity_change, logits + rates.max_opacity_change)
+    x[:, LOGIT] = logit.clamp(float(MIN_LOGIT), float(MAX_LOGIT))
+    x[:, COLOR:] = x[:, COLOR:].clamp(colors.clamp_max(-0.05), colors.clamp_min(1.05))
+    norm = x[:, QUAT:LOGIT].norm(dim=1, keepdim=True)
+    x[:, QUAT:LOGIT] = torch.where(norm > 0, x[:, QUAT:LOGIT] / norm, 0)
+    return x

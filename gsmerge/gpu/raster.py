@@ -1,0 +1,112 @@
+"""Drawing on a device: one function for an image, one for each of its transposes.
+
+On CUDA gsplat draws, on the CPU the project's own kernels; all other files here work with either.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsmerge.gpu.scene import DevicePhotos, Shapes
+from gsmerge.render import contributions, plan_view
+from gsmerge.render.colored import Shape, draw_colored, seen_colors
+from gsmerge.render.photos import NEAR
+from gsmerge.render.plan import Splats
+from gsmerge.types import SH_C0
+
+
+def draw(
+    shape: Shape, colors: Tensor, photos: DevicePhotos, view: int, background: Tensor, *, near: float = NEAR
+) -> tuple[Tensor, Tensor]:
+    """Image ``[h,w,3]`` of one view and ``[n]`` bool, which Gaussians have a footprint in it.
+
+    Args:
+        shape: Means ``[n,3]``, quaternions ``[n,4]`` of length one, scales ``[n,3]`` and opacities ``[n]``, float32.
+        colors: ``[n,3]``, any sign. The image is differentiable in them and in the shape.
+        photos: Whose cameras.
+        view: Of the photos.
+        background: ``[3]``.
+        near: Nearest depth drawn.
+    """
+    if colors.device.type == "cpu":
+        camera = photos.host.camera(view) | {"near": near}
+        return draw_colored(shape, colors, camera, background.numpy())
+    from gsmerge.render.cuda import rasterize
+
+    eps2d = photos.host.eps2d
+    drawn, reached = rasterize(
+        shape, colors, _cameras(photos, view), background, eps2d=eps2d, near=near, unit_quats=True
+    )
+    return drawn.images[0], reached[0]
+
+
+def _cameras(photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor, int, int]:
+    return photos.viewmats[view : view + 1], photos.Ks[view : view + 1], photos.width, photos.height
+
+
+def draw_all(shapes: Shapes, photos: DevicePhotos, colors: Tensor | None = None, *, near: float = NEAR) -> list[Tensor]:
+    """``[h,w,3]`` render of every photo over black, not clipped; with ``colors [n,3]`` in place of the harmonics."""
+    return [draw_shapes(shapes, photos, view, colors, near=near) for view in range(len(photos))]
+
+
+def draw_shapes(
+    shapes: Shapes, photos: DevicePhotos, view: int, colors: Tensor | None = None, *, near: float = NEAR
+) -> Tensor:
+    """``[h,w,3]`` render of one photo over black, see :func:`draw_all`."""
+    seen = shown_colors(shapes, photos, view) if colors is None else colors
+    return draw(shape_of(shapes), seen, photos, view, torch.zeros(3, device=seen.device), near=near)[0]
+
+
+def shape_of(shapes: Shapes) -> Shape:
+    """Means, quaternions, scales and opacities."""
+    return shapes.means, shapes.quats, shapes.scales, shapes.opacities
+
+
+def shown_colors(shapes: Shapes, photos: DevicePhotos, view: int) -> Tensor:
+    """``[n,3]`` colours that Gaussians show a view, not below 0."""
+    if shapes.shN.shape[1] == 0:
+        return (0.5 + SH_C0 * shapes.sh0[:, 0]).clamp_min(0)
+    return harmonic_colors(shapes.means, shapes.sh0, shapes.shN, photos, view)
+
+
+def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhotos, view: int) -> Tensor:
+    """``[n,3]`` colours of harmonics ``[n,1,3]`` and ``[n,k-1,3]`` in a view, not below 0, without gradient."""
+    return seen_colors(means, sh0, shN, photos.host.viewmats[view])
+
+
+def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> tuple[Tensor, Transpose]:
+    """The image of a view over black, and the function that takes images back to the Gaussians that show there."""
+    with torch.enable_grad():
+        leaf = colors.detach().requires_grad_()
+        image, _ = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
+    return image.detach(), Transpose(image, leaf)
+
+
+class Transpose:
+    """Sums over the pixels of a view of every Gaussian's blending weight times an image.
+
+    It is the transpose of drawing as a linear map from colours to images, which is the gradient in the colours.
+    """
+
+    def __init__(self, image: Tensor, colors: Tensor):
+        self.image, self.colors = image, colors
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """``[n,3]`` of an image ``[h,w,3]``."""
+        return torch.autograd.grad(self.image, self.colors, values.contiguous(), retain_graph=True)[0]
+
+
+def peak_weights(shapes: Shapes, photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor]:
+    """``[n]`` largest blending weight of every Gaussian at some pixel of a view; ``[n]`` bool: it lies in the view."""
+    if shapes.means.device.type != "cpu":
+        from gsmerge.render.cuda import peak_weights as gsplat_peaks
+
+        return gsplat_peaks(shape_of(shapes), _cameras(photos, view), eps2d=photos.host.eps2d)
+    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape_of(shapes))
+    sh0, shN = shapes.sh0.numpy(), shapes.shN.numpy()
+    plan = plan_view(Splats(means, quats, scales, opacities, sh0, shN, np.zeros(3)), **photos.host.camera(view))
+    inside = torch.zeros(len(shapes), dtype=torch.bool)
+    inside[torch.from_numpy(plan.ids).long()] = True
+    return torch.from_numpy(contributions(plan)[1]), inside
