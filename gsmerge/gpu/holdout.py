@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -82,5 +84,5 @@ def exposure_gains(images: Tensor, photos: Tensor, weights: Tensor, min_gain: fl
     with_photo, with_image = ((weighted * other).sum((1, 2), dtype=torch.float64) for other in (photos, images))
     gains = (with_photo / with_image.clamp_min(1e-9)).clamp(1 / max_gain, max_gain)
     gains = gains / gains.log().mean(0).exp()
-    differs = gains.log().abs().max() >= torch.log(torch.tensor(min_gain, dtype=torch.float64))
+    differs = gains.log().abs().max() >= math.log(min_gain)
     return torch.where(differs, gains, 1.0).float()

@@ -73,7 +73,12 @@ def shown_colors(shapes: Shapes, photos: DevicePhotos, view: int) -> Tensor:
 
 def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhotos, view: int) -> Tensor:
     """``[n,3]`` colours of harmonics ``[n,1,3]`` and ``[n,k-1,3]`` in a view, not below 0, without gradient."""
-    return seen_colors(means, sh0, shN, photos.host.viewmats[view])
+    if means.device.type == "cpu":
+        return seen_colors(means, sh0, shN, photos.host.viewmats[view])
+    from gsmerge.render.cuda import harmonic_colors as by_gsplat
+
+    with torch.no_grad():
+        return by_gsplat(means, torch.cat([sh0, shN], 1), photos.eyes[view])
 
 
 def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int) -> tuple[Tensor, Transpose]:

@@ -22,12 +22,14 @@ class DevicePhotos:
         images: ``[v,h,w,3]`` float32.
         viewmats: ``[v,4,4]`` float32 world to camera.
         Ks: ``[v,3,3]`` float32.
+        eyes: ``[v,3]`` float32 centres of the cameras.
         host: The same photos in the computer's memory, whose cameras the kernels read.
     """
 
     images: Tensor
     viewmats: Tensor
     Ks: Tensor
+    eyes: Tensor
     host: Photos
 
     def __len__(self) -> int:
@@ -106,11 +108,11 @@ def to_device(array: Any, device: torch.device, dtype: torch.dtype | None = None
 
 def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
     """Photos and their cameras on a device."""
-    single = torch.float32
-    images = to_device(np.ascontiguousarray(photos.images), device, single)
-    return DevicePhotos(
-        images, to_device(photos.viewmats, device, single), to_device(photos.Ks, device, single), photos
-    )
+    rotations, shifts = photos.viewmats[:, :3, :3], photos.viewmats[:, :3, 3]
+    eyes = -np.einsum("vji,vj->vi", rotations, shifts)
+    arrays = np.ascontiguousarray(photos.images), photos.viewmats, photos.Ks, eyes
+    images, viewmats, Ks, centres = (to_device(array, device, torch.float32) for array in arrays)
+    return DevicePhotos(images, viewmats, Ks, centres, photos)
 
 
 def upload_pair(scene: PixelScene | UnalignedScene, device: torch.device) -> tuple[DevicePhotos, DevicePhotos]:

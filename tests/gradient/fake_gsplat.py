@@ -14,11 +14,12 @@ from typing import Any
 import pytest
 import torch
 from reference_gradients import NAMES  # which makes the renderer's folder known
-from renderer import harmonics, render_reference
+from renderer import footprints, harmonics, render_reference
 from torch import Tensor
 
 assert NAMES
 CALLS: list[dict[str, Any]] = []
+WEIGHTS: list[Tensor] = []  # of every view of the last call, [n,h,w]
 
 
 def rasterization(
@@ -72,7 +73,8 @@ def rasterization(
     else:
         assert colors.shape == (n, (sh_degree + 1) ** 2, 3)
     doubles = [tensor.double() for tensor in (means, quats, scales, opacities)]
-    images, alphas = [], []
+    images, alphas, shapes = [], [], []
+    WEIGHTS.clear()
     for viewmat, K, background in zip(viewmats.double(), Ks.double(), backgrounds.double(), strict=True):
         eye = torch.inverse(viewmat)[:3, 3]
         seen = colors.double()
@@ -85,9 +87,42 @@ def rasterization(
         image = drawn.image + drawn.transmittance[..., None] * background
         images.append(torch.cat([image, drawn.depth[..., None]], -1) if render_mode == "RGB+ED" else image)
         alphas.append(1 - drawn.transmittance[..., None])
+        WEIGHTS.append(drawn.weights)
+        places, covars2d, _ = footprints(*doubles[:3], viewmat, K, width, height)
+        conics = torch.linalg.inv(covars2d + eps2d * torch.eye(2, dtype=torch.float64)).flatten(1)[:, [0, 1, 3]]
+        shapes.append((places.float(), conics.float(), opacities))
     depths = torch.einsum("cij,nj->cni", viewmats[:, :3, :3], means)[..., 2] + viewmats[:, 2, 3:]
     radii = (depths > near_plane).int()[..., None].expand(-1, -1, 2)
-    return torch.stack(images).float(), torch.stack(alphas).float(), {"radii": radii}
+    means2d, conics, drawn_opacities = (torch.stack(parts) for parts in zip(*shapes, strict=True))
+    details = {"radii": radii, "means2d": means2d, "conics": conics, "opacities": drawn_opacities}
+    tiles = torch.zeros(c, -(-height // tile_size), -(-width // tile_size), dtype=torch.int32)
+    details |= {"isect_offsets": tiles, "flatten_ids": depths.flatten().argsort().int(), "tile_size": tile_size}
+    return torch.stack(images).float(), torch.stack(alphas).float(), details
+
+
+def rasterize_to_indices_in_range(
+    range_start: int,
+    range_end: int,
+    transmittances: Tensor,
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gaussians, pixels and images of all weights of the last view that was drawn, pixel by pixel, nearest first."""
+    assert range_start == 0
+    assert range_end >= 1 << 20, "all batches"
+    assert transmittances.shape == (1, image_height, image_width)
+    assert (transmittances == 1).all()
+    assert (means2d.shape[2], conics.shape[2], opacities.shape) == (2, 3, means2d.shape[:2])
+    assert isect_offsets.shape == (1, -(-image_height // tile_size), -(-image_width // tile_size))
+    order = flatten_ids.long()
+    pixels, places = torch.nonzero(WEIGHTS[0][order].flatten(1).T > 0, as_tuple=True)
+    return order[places].int(), pixels.int(), torch.zeros_like(pixels)
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
@@ -105,7 +140,8 @@ def fake_gsplat(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """``import gsplat`` finds the functions above; gives their calls."""
     module = ModuleType("gsplat")
     module.__spec__ = ModuleSpec("gsplat", None)
-    module.rasterization, module.spherical_harmonics = rasterization, spherical_harmonics  # type: ignore[attr-defined]
+    for function in (rasterization, spherical_harmonics, rasterize_to_indices_in_range):
+        setattr(module, function.__name__, function)
     monkeypatch.setitem(sys.modules, "gsplat", module)
     CALLS.clear()
     return CALLS

@@ -20,7 +20,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from gsmerge import Cameras, Gaussians, render
 from gsmerge.errors import GsmergeError
 from gsmerge.options import CompactOptions
-from gsmerge.render import Rendering
+from gsmerge.render import Rendering, contributions, plan_view, prepare
 from gsmerge.render import cuda as adapter
 from gsmerge.render.colored import draw_colored, seen_colors
 from gsmerge.render.cuda import chosen_device, harmonic_colors, rasterize, render_cuda, usable_device
@@ -100,6 +100,27 @@ def test_gradients_are_the_cpu_s(degree: int, fake_gsplat: Calls) -> None:  # no
     actual, expected = (gradients(draw, gaussians, cameras) for draw in (by_adapter, on_cpu))
     assert_close(actual, [one.double() for one in expected])
     assert all(float(one.norm()) > 0 for one in expected if one.numel())
+
+
+@pytest.mark.parametrize("eps2d", [0.3, 0.075])
+def test_peaks_are_the_cpu_s(eps2d: float, fake_gsplat: Calls) -> None:  # noqa: F811
+    gaussians, cameras = random_gaussians(40), cameras_of(1)
+    shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    views = cameras.viewmats, cameras.Ks, cameras.width, cameras.height
+    peaks, reached = adapter.peak_weights(shape, views, eps2d=eps2d)
+    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, eps2d=eps2d)
+    expected = contributions(plan)[1]
+    assert (expected > 0.01).sum() > 20
+    np.testing.assert_allclose(peaks, expected, atol=2e-4)
+    assert reached[torch.from_numpy(expected > 0)].all()
+    assert len(adapter.peak_weights(tuple(tensor[:0] for tensor in shape), views)[0]) == 0  # type: ignore[arg-type]
+
+
+def test_starting_draws_and_differentiates(fake_gsplat: Calls) -> None:  # noqa: F811
+    with torch.no_grad():  # as within a run
+        adapter.start_cuda(torch.device("cpu"))
+    assert len(fake_gsplat) == 1
+    assert fake_gsplat[0]["means"].requires_grad
 
 
 def test_geographic_coordinates_keep_their_detail(fake_gsplat: Calls) -> None:  # noqa: F811
