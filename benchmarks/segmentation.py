@@ -1,6 +1,9 @@
 """Superpixels of six photos: quality and CPU time of every method, as ratios within one run.
 
-    python benchmarks/segmentation.py [--density 5000] [--repeats 3]
+    python benchmarks/segmentation.py [--density 5000] [--repeats 3] [--method rdseg] [--scenes desk,beercan]
+
+``device`` is ``rdseg`` as a GPU does it, here by torch on one processor, whose time says nothing about a GPU. With
+``--scenes`` four photos of each of these captures stand in for the six.
 
 ``ms`` is process CPU time for 476 x 476 pixels, best of the repeats, kernels warm. ``/bass-st`` is that time over
 the one of ``bass-st``. With the folder of reference material next to the repository (``GSMERGE_SHARED`` or
@@ -23,9 +26,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-from segmentation_scores import DENSITIES, SIDE, count_at, photos, proxy_psnr, splat_psnr  # noqa: E402
+import torch  # noqa: E402
+from segmentation_scores import DENSITIES, SIDE, count_at, photos, proxy_psnr, shrink, splat_psnr  # noqa: E402
+from shared_scenes import scene_folders  # noqa: E402
 
-from gsmerge.stages.segment import superpixels  # noqa: E402
+from gsmerge.gpu.segment import segment  # noqa: E402
+from gsmerge.stages.segment import SegmentOptions, superpixels  # noqa: E402
 
 RUNS = [
     ("bass-st", "default"),
@@ -34,9 +40,11 @@ RUNS = [
     ("rdseg", "fast"),
     ("rdseg", "default"),
     ("rdseg", "best"),
+    ("device", "default"),
 ]
+PHOTOS_EACH = 4  # of a capture, evenly spread
 
-Method = Callable[[np.ndarray, int], object]
+Method = Callable[[np.ndarray, int], np.ndarray]
 
 
 def sketches() -> dict[tuple[str, str], Method]:
@@ -52,7 +60,7 @@ def sketches() -> dict[tuple[str, str], Method]:
 
     numba.set_num_threads(1)
 
-    def bass_st(image: np.ndarray, count: int) -> object:
+    def bass_st(image: np.ndarray, count: int) -> np.ndarray:
         density = sketch.density(sketch.saliency(image), count)
         seeds = sketch.seeds_dither(density, 1, count)
         start = sketch.bfs_voronoi(seeds, *image.shape[:2])
@@ -78,7 +86,21 @@ def cpu_ms(methods: list[Method], image: np.ndarray, count: int, repeats: int) -
     return [1e3 * t * SIDE**2 / (image.shape[0] * image.shape[1]) for t in best]
 
 
+def captures(names: str) -> dict[str, np.ndarray]:
+    """Some photos of each capture, ``[h,w,3]`` uint8, the longer side 476 pixels."""
+    found = {}
+    for folder in scene_folders(names):
+        files = sorted((folder / "images").iterdir())
+        for i in range(PHOTOS_EACH):
+            path = files[i * (len(files) - 1) // (PHOTOS_EACH - 1)]
+            found[f"{folder.name}/{path.name}"] = shrink(cv2.imread(str(path))[..., ::-1])
+    return found
+
+
 def ours(name: str, effort: str) -> Method:
+    if name == "device":
+        options = SegmentOptions(effort=effort)
+        return lambda image, count: segment(torch.from_numpy(image / np.float32(255))[None], options, count)[0].numpy()
     return lambda image, count: superpixels(image, count, name, effort=effort).numpy()
 
 
@@ -86,20 +108,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--density", type=int, action="append", help="superpixels per 476 x 476 pixels; repeatable")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--method", action="append", help="of the first column; repeatable, all where left out")
+    parser.add_argument("--scenes", help="captures next to the repository, comma-separated")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    pictures, others = photos(), sketches()
+    torch.set_num_threads(1)
+    pictures, others = captures(options.scenes) if options.scenes else photos(), sketches()
     print(
         f"{'density':>7} {'method':8} {'effort':8} {'proxy':>6} {'splat':>6} {'ms':>7} {'/bass-st':>8} {'/sketch':>8}"
     )
     for density in options.density or DENSITIES:
         reference = None
         for name, effort in RUNS:
+            if options.method and name not in options.method:
+                continue
             methods = [ours(name, effort), *([others[name, effort]] if (name, effort) in others else [])]
             rows = []
             for image in pictures.values():
                 count = count_at(image, density)
-                labels = superpixels(image, count, name, effort=effort).numpy()
+                labels = ours(name, effort)(image, count)
                 times = cpu_ms(methods, image, count, options.repeats)
                 rows.append((proxy_psnr(image, labels), splat_psnr(image, labels), *times))
             proxy, splat, ms, *sketch_ms = np.mean(rows, 0)

@@ -18,10 +18,11 @@ def photos() -> dict[str, np.ndarray]:
     """Six photos, ``[h,w,3]`` uint8, the longer side 476 pixels."""
     actual = {name: getattr(skimage.data, name)() for name in ("astronaut", "coffee", "chelsea", "rocket")}
     actual |= {name: sklearn.datasets.load_sample_image(f"{name}.jpg") for name in ("china", "flower")}
-    return {name: _shrink(image) for name, image in actual.items()}
+    return {name: shrink(image) for name, image in actual.items()}
 
 
-def _shrink(image: np.ndarray) -> np.ndarray:
+def shrink(image: np.ndarray) -> np.ndarray:
+    """A photo whose longer side is 476 pixels."""
     height, width, _ = image.shape
     scale = SIDE / max(height, width)
     return cv2.resize(image, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)

@@ -312,8 +312,8 @@ _TABLE = (
         option("fit", ("full", "color", "none"), "What is fitted to the photos.", wording="full"),
         option("effort", ("draft", "fast", "default", "best"), "How much work goes into superpixels and fit.",
                wording="default"),
-        option("device", ("cpu", "cuda", "auto"), "Where the full fit runs; cuda needs gsmerge[cuda]. auto: a GPU "
-               "where there is one.", wording="cpu"),
+        option("device", ("cpu", "cuda", "auto"), "Where the stages run; cuda needs gsmerge[cuda]. auto: a GPU "
+               "where there is one and the scene is large enough.", wording="cpu"),
         option("fit_steps", int, "Steps of the full fit.", wording="by effort", rare=True, min=1),
         option("time_budget", float, "Seconds that the full fit may take.", rare=True, min=0.0),
     ),

@@ -8,7 +8,7 @@ from torch import Tensor
 from gsmerge.gpu.scene import Features, Shapes
 from gsmerge.moments import MAX_OPACITY, MIN_SCALE
 
-SWEEPS = 8  # of Jacobi rotations; they converge quadratically
+SWEEPS = 6  # of Jacobi rotations: they converge quadratically, and matrices of 3 x 3 are done after five
 
 
 def principal_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
