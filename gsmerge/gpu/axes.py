@@ -57,7 +57,7 @@ def right_handed_quats(axes: Tensor) -> Tensor:
     Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
     """
     signs = torch.ones_like(axes[:, :1])
-    signs[:, 0, 0] = torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)
+    signs[:, 0, 0] = torch.where(determinants(axes) < 0, -1.0, 1.0)
     axes = axes * signs
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = (row.unbind(1) for row in axes.unbind(1))
     a, b, c, d, e, f = r21 - r12, r02 - r20, r10 - r01, r10 + r01, r20 + r02, r21 + r12
@@ -68,6 +68,12 @@ def right_handed_quats(axes: Tensor) -> Tensor:
     quats = ways.gather(1, best[:, None, None].expand(-1, 1, 4))[:, 0]
     quats = quats / quats.norm(dim=1, keepdim=True)
     return torch.where(quats[:, :1] < 0, -quats, quats)
+
+
+def determinants(matrices: Tensor) -> Tensor:
+    """``[g]`` of matrices ``[g,3,3]``, written out: libraries for small matrices take longer to start than this."""
+    x, y, z = matrices.unbind(1)
+    return (torch.linalg.cross(x, y) * z).sum(1)
 
 
 def moments_to_shapes(covars: Tensor, extinctions: Tensor, spreads: Tensor, means: Tensor, sh: Tensor) -> Shapes:

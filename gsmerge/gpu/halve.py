@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsmerge.gpu.axes import determinants
 from gsmerge.gpu.runs import max_runs, owners_of, start_of, sum_runs
 from gsmerge.kernels.gaussians.bisect import COLOR, NUM_FEATURES, PIXEL
 from gsmerge.stages.decode import PLANE_WEIGHT
@@ -136,7 +137,7 @@ def _measure(points: Points, order: Tensor, starts: Tensor) -> _Spreads:
     for _ in range(POWER_STEPS):
         length = axis.norm(dim=1, keepdim=True)
         flat |= length[:, 0] <= 1e-30
-        axis = torch.einsum("rij,rj->ri", scatter, axis / length.clamp_min(1e-30))
+        axis = (scatter * (axis / length.clamp_min(1e-30))[:, None]).sum(2)
     spread = torch.where(flat, 0.0, axis.norm(dim=1))
     # as if every member weighed one
     error = starts.diff() / total * (diagonal[:, :3].sum(1) + PLANE_WEIGHT * thickness(scatter[:, 3:, 3:]))
@@ -148,7 +149,7 @@ def thickness(scatter: Tensor) -> Tensor:
     middle = scatter.diagonal(dim1=1, dim2=2).mean(1)
     shifted = scatter - middle[:, None, None] * torch.eye(3, dtype=scatter.dtype, device=scatter.device)
     p = (shifted.square().sum((1, 2)) / 6).sqrt()
-    half = torch.linalg.det(shifted) / (2 * p**3).clamp_min(1e-300)
+    half = determinants(shifted) / (2 * p**3).clamp_min(1e-300)
     angle = half.clamp(-1, 1).acos() / 3
     least = middle + 2 * p * (angle + 2 * torch.pi / 3).cos()
     return torch.where(p <= 1e-30, middle, least).clamp_min(0)

@@ -82,7 +82,7 @@ def overlaps(features: Features, rows: Tensor, neighbors: Tensor, max_color: flo
     delta = features.means.double()[near] - features.means.double()[rows][:, None]
     half = 0.5 * (own + other)
     adjugate, det = _adjugate(half)
-    distance = torch.einsum("rki,rkij,rkj->rk", delta, adjugate, delta) / det
+    distance = (delta[..., None] * adjugate * delta[..., None, :]).sum((-2, -1)) / det
     volume = _adjugate(own)[1].clamp_min(0).sqrt() * _adjugate(other)[1].clamp_min(0).sqrt()
     score = torch.where(det > 0, (-0.125 * distance).exp() * (volume / det).sqrt(), 0.0)
     return torch.where(known & alike, score, -1.0)

@@ -14,6 +14,7 @@ from gsmerge.gpu.runs import Rows, middle_of_runs, owners_of, sum_runs
 from gsmerge.gpu.scene import DeviceMembers, Features
 from gsmerge.kernels.gaussians.pool import CAP, FLOOR, MAX_OPACITY
 
+ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 AT_ONCE = 1 << 21  # members that are pooled at once: about 1 GB of float64 columns
 
 
@@ -64,19 +65,20 @@ def _pool(members: DeviceMembers, starts: Tensor, ids: Tensor) -> Moments:
     means, footprints = averages[:, :3], averages[:, 3]
     delta = own_means - means[owners]
     half = quat_to_rotmat(_no_zero(members.quats[ids].double())) * scales[:, None]
-    spread = shares[:, None, None] * (delta[:, :, None] * delta[:, None] + half @ half.transpose(1, 2))
+    spread = torch.stack(
+        [shares * (delta[:, i] * delta[:, j] + (half[:, i] * half[:, j]).sum(1)) for i, j in ENTRIES], 1
+    )
     pairs = torch.stack([scales[:, 0] * scales[:, 1], scales[:, 0] * scales[:, 2], scales[:, 1] * scales[:, 2]], 1)
     extinctions = -torch.log1p(-opacities) * pairs.amax(1)
-    sums = sum_runs(
-        torch.cat([spread.reshape(-1, 9), (opacities * scales.prod(1))[:, None], extinctions[:, None]], 1), starts
-    )
+    sums = sum_runs(torch.cat([spread, (opacities * scales.prod(1))[:, None], extinctions[:, None]], 1), starts)
+    xx, xy, xz, yy, yz, zz = sums[:, :6].unbind(1)
     floor = torch.eye(3, dtype=torch.float64, device=ids.device) * ((FLOOR * footprints) ** 2)[:, None, None]
     return Moments(
         means=means,
-        covars=sums[:, :9].reshape(-1, 3, 3) + floor,
+        covars=torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], 1).reshape(-1, 3, 3) + floor,
         weights=weights,
-        masses=(2 * math.pi) ** 1.5 * sums[:, 9],
-        extinctions=sums[:, 10],
+        masses=(2 * math.pi) ** 1.5 * sums[:, 6],
+        extinctions=sums[:, 7],
         footprints=footprints,
         sh=averages[:, 4:].reshape(len(means), -1, 3).float(),
     )

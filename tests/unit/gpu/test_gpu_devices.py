@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import scenes
 import torch
 from other_device import DEVICE, Elsewhere, SecondDevice
+from torch.utils._pytree import tree_flatten, tree_map
 
 from gsmerge import CompactOptions
 from gsmerge.gpu import color, full, holdout, raster
 from gsmerge.gpu.build import DeviceScene
-from gsmerge.gpu.scene import DevicePhotos
+from gsmerge.gpu.scene import DevicePhotos, upload_gaussians, upload_photos
 from gsmerge.pipeline import begin
 from gsmerge.render import contributions, plan_view
+from gsmerge.render import cuda as cuda_module
 from gsmerge.render.colored import draw_colored
+from gsmerge.render.photos import photos_of
 from gsmerge.render.plan import Splats
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.prepare import PreparedScene, prepare
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "gradient"))
+
+import fake_gsplat
+from reference_gradients import random_gaussians, turned_cameras
 
 
 class _Draw(torch.autograd.Function):
@@ -81,6 +93,38 @@ def test_build_and_scores_stay_on_the_device(settings: dict[str, Any], monkeypat
         psnr = on_device.input_psnr(prepared.frame.leave(gaussians), prepared)
     assert not isinstance(gaussians.means, Elsewhere)
     assert psnr > 15
+
+
+class _Gsplat:
+    """The stand-in for gsplat, for tensors that are elsewhere."""
+
+    def __getattr__(self, name: str) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            assert all(isinstance(one, Elsewhere) for one in tree_flatten((args, kwargs))[0] if torch.is_tensor(one))
+            args, kwargs = tree_map(lambda one: one.inner if isinstance(one, Elsewhere) else one, (args, kwargs))
+            with torch._C._DisableTorchDispatch():
+                made = getattr(fake_gsplat, name)(*args, **kwargs)
+            return tree_map(lambda one: Elsewhere(one) if torch.is_tensor(one) else one, made)
+
+        return call
+
+
+def test_what_gsplat_is_given_and_gives_stays_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images, colours of harmonics and largest weights, as the kernels have them."""
+    monkeypatch.setattr(cuda_module, "_gsplat", _Gsplat)
+    gaussians, cameras = random_gaussians(30, 1), turned_cameras()
+    gaussians = replace(gaussians, quats=torch.nn.functional.normalize(gaussians.quats))
+    photos = photos_of(np.zeros((2, cameras.height, cameras.width, 3), np.float32), cameras, 1)
+    made: list[list[Any]] = []
+    for device in (torch.device("cpu"), DEVICE):
+        with torch.no_grad(), SecondDevice():
+            shapes, resident = upload_gaussians(gaussians, device), upload_photos(photos, device)
+            images = raster.draw_all(shapes, resident)
+            peaks, reached = raster.peak_weights(shapes, resident, 1)
+            made.append([one.cpu() for one in (*images, peaks, reached & (peaks > 0))])
+    for expected, ours in zip(*made, strict=True):
+        torch.testing.assert_close(ours, expected, atol=1e-3, rtol=1e-3)
+    assert float(made[0][0].max()) > 0.1
 
 
 def test_the_second_device_refuses_what_a_gpu_refuses() -> None:
