@@ -28,12 +28,13 @@ from gsmerge.gpu.scene import (
     Shapes,
     download_features,
     download_gaussians,
+    download_groups,
     to_device,
     upload_gaussians,
     upload_members,
     upload_pair,
     upload_photos,
-)  # fmt: skip
+)
 from gsmerge.gpu.score import photo_psnr
 from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
@@ -44,7 +45,7 @@ from gsmerge.stages.match import match as match_on_cpu
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import scene_saliency
-from gsmerge.types import Gaussians, Groups, PixelScene, Segmentation
+from gsmerge.types import Gaussians, PixelScene, Segmentation
 from gsmerge.views import scored_views
 
 Begin = Callable[[PreparedScene, int | None, RunLog], tuple[Gaussians, int, bool, Gaussians | None]]
@@ -197,7 +198,7 @@ class DeviceScene:
     def _decode_on_cpu(self, prepared: PreparedScene, merged: Features, cut: Superpixels) -> Shapes:
         assert prepared.members is not None
         options = prepared.options
-        segmentation = Segmentation(Groups(cut.labels.int().cpu(), cut.counts), None, cut.count, cut.exact)
+        segmentation = Segmentation(download_groups(cut.labels, cut.counts), None, cut.count, cut.exact)
         saliency = scene_saliency(prepared.pictures)
         views = MergedViews(download_features(merged), prepared.members, segmentation, saliency=saliency)
         gaussians = decode_merged(views, options.decode, options.encode.rule, grows=options.fit.grows)

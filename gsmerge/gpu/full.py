@@ -29,7 +29,7 @@ from gsmerge.stages.fit.full import (
     affordable_steps,
     plan_run,
     step_sizes,
-)  # fmt: skip
+)
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.types import SH_C0

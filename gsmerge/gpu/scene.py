@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsmerge.moments import Members
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import FeatureGaussians, Gaussians, Groups, PixelScene, UnalignedScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,14 @@ class Features:
 
 def to_device(array: Any, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
     """A tensor or an array of a core type on a device."""
+    if isinstance(array, np.ndarray) and not array.flags.writeable:  # torch warns of those, though none is written to
+        array = array.copy()
     return torch.as_tensor(array).to(device, dtype)
+
+
+def to_core(tensor: Tensor) -> Any:
+    """A tensor as the core types hold it. What they hold is decided here, and nowhere else in this package."""
+    return tensor.cpu()
 
 
 def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
@@ -136,11 +143,16 @@ def upload_features(features: FeatureGaussians, device: torch.device) -> Feature
 
 
 def download_gaussians(shapes: Shapes) -> Gaussians:
-    """The core type of Gaussians on a device. The one place that makes it: what its arrays are is decided here."""
-    return Gaussians(*(getattr(shapes, f.name).float().cpu() for f in fields(Shapes)))
+    """The core type of Gaussians on a device."""
+    return Gaussians(*(to_core(getattr(shapes, f.name).float()) for f in fields(Shapes)))
 
 
 def download_features(features: Features) -> FeatureGaussians:
-    """The core type of Feature Gaussians on a device, without latents; as :func:`download_gaussians`."""
-    columns = {f.name: getattr(features, f.name).cpu() for f in fields(Features)}
-    return FeatureGaussians(**columns, latents=torch.zeros(len(features), 0))
+    """The core type of Feature Gaussians on a device, without latents."""
+    columns = {f.name: to_core(getattr(features, f.name)) for f in fields(Features)}
+    return FeatureGaussians(**columns, latents=to_core(torch.zeros(len(features), 0)))
+
+
+def download_groups(labels: Tensor, counts: tuple[int, ...]) -> Groups:
+    """The core type of superpixels ``[v,h,w]`` on a device."""
+    return Groups(to_core(labels.int()), counts)

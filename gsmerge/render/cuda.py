@@ -121,11 +121,9 @@ def rasterize(
     if len(means) == 0 or len(viewmats) == 0:  # nothing that a kernel could be launched for
         reached = torch.zeros(len(viewmats), len(means), dtype=torch.bool, device=means.device)
         return _empty((*gaussians, colors, viewmats), backgrounds, (height, width), with_depths), reached
-    if not unit_quats:
-        quats = _no_zero(quats)
     images, alphas, details = _gsplat().rasterization(
         means=means,
-        quats=quats,
+        quats=quats if unit_quats else _no_zero(quats),
         scales=scales,
         opacities=opacities,
         colors=colors.float(),
