@@ -142,7 +142,7 @@ def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, l
     chosen = {"checkpoint": checkpoint, "require_checkpoint": checkpoint != "none"}
     result = gsmerge.compact(scene, **condition.settings, **chosen)
     seconds = time.perf_counter() - start
-    views = Views(targets.cameras, torch.from_numpy(targets.images), tuple(map(str, range(len(targets.images)))))
+    views = Views(targets.cameras, targets.images, tuple(map(str, range(len(targets.images)))))
     options = EvaluateOptions(lpips=("vgg",) if lpips else (), lpips_views=2, context=False, own=False)
     scores = evaluate(scene, {"it": result.gaussians}, views, options).results[0].scores
     means: dict[str, float] = {}

@@ -79,7 +79,7 @@ def cpu_ms(methods: list[Method], image: np.ndarray, count: int, repeats: int) -
 
 
 def ours(name: str, effort: str) -> Method:
-    return lambda image, count: superpixels(image, count, name, effort=effort).numpy()
+    return lambda image, count: superpixels(image, count, name, effort=effort)
 
 
 def main() -> None:
@@ -99,7 +99,7 @@ def main() -> None:
             rows = []
             for image in pictures.values():
                 count = count_at(image, density)
-                labels = superpixels(image, count, name, effort=effort).numpy()
+                labels = superpixels(image, count, name, effort=effort)
                 times = cpu_ms(methods, image, count, options.repeats)
                 rows.append((proxy_psnr(image, labels), splat_psnr(image, labels), *times))
             proxy, splat, ms, *sketch_ms = np.mean(rows, 0)

@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from gsmerge.baselines import choose_baseline
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.options import CompactOptions
@@ -47,7 +45,7 @@ def compact(
 
     Args:
         scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`; or Gaussians that belong to no pixels,
-            which are given to the superpixels by what they add to the views.
+            which are given to the superpixels by what they add to the views. Tensors give tensors on their device.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the longer ones with ("fit: ...", step, steps).
@@ -60,8 +58,9 @@ def compact(
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
     options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
-    log = RunLog(progress)
-    with use_threads(options.threads), torch.no_grad():
+    log, device = RunLog(progress), scene.gaussians.device
+    scene = scene.numpy()
+    with use_threads(options.threads):
         baseline, log.notes[:] = choose_baseline(options, scene)
         prepared = prepare(scene, options, log)
         make = build if baseline is None else baseline.build
@@ -76,7 +75,7 @@ def compact(
         result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress))
     if progress:
         progress("done", len(STAGES), len(STAGES))
-    return result
+    return result if device is None else result.to(device)
 
 
 def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:

@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-from torch import Tensor
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
@@ -61,7 +60,7 @@ class Photos:
         }
 
 
-def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
+def scene_pictures(scene: PixelScene | UnalignedScene) -> np.ndarray:
     """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none.
 
     Raises:
@@ -72,14 +71,14 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
     if isinstance(scene, UnalignedScene):
         raise ValueError("expected a scene with images")
     shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
+    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).reshape(shape)
 
 
 def scene_photos(scene: PixelScene | UnalignedScene, level: float = 1) -> Photos:
     """The scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
-    return photos_of(scene.images.numpy(), scene.cameras, level)
+    return photos_of(scene.images, scene.cameras, level)
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
@@ -94,7 +93,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
     """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
     black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))

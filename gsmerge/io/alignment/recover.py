@@ -176,12 +176,14 @@ def _readings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Align
 
 def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> AlignmentScore:
     pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout, samples))
-    frames = candidate_similarities(pairs, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=effort)
+    frames = candidate_similarities(
+        pairs, inputs.cameras.viewmats, inputs.cameras.Ks, scale=inputs.scale, effort=effort
+    )
     scores = [score_layout(inputs, layout, frame, pairs) for frame in frames]
     lowest = min(score.worst_px for score in scores)
     best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
     if best.ok and best.frame is not IDENTITY and inputs.scale is None:
-        return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.viewmats, inputs.Ks))
+        return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.cameras.viewmats, inputs.cameras.Ks))
     return best
 
 
@@ -201,7 +203,10 @@ def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
         if not len(own.rows):
             return None
         views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
-        errors = [np.median(pixel_errors(replace(own, views=some), inputs.viewmats, inputs.Ks)) for some in views]
+        errors = [
+            np.median(pixel_errors(replace(own, views=some), inputs.cameras.viewmats, inputs.cameras.Ks))
+            for some in views
+        ]
         chosen.append(int(np.argmin(errors)))
     return chosen if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE
 from gsmerge.render.colored import draw_colored, seen_colors
-from gsmerge.stages.fit.full import KERNELS, Engine, Plan, step_sizes
+from gsmerge.stages.fit.full import Engine, Plan, step_sizes
 from gsmerge.stages.fit.loss import loss_ssim
 from gsmerge.stages.fit.options import FitOptions, LearningRates
 from gsmerge.stages.fit.state import State, state_of
@@ -48,10 +48,8 @@ class DeviceState:
     shN: Tensor
 
 
-def engine_for(device: str) -> Engine:
-    """What a run steps with on ``"cpu"`` or ``"cuda"``."""
-    if device == "cpu":
-        return KERNELS
+def gpu_engine(device: str) -> Engine:
+    """What a run steps with on a GPU, which is ready for it."""
     start_gpu(torch.device(device))
     return torch_engine(torch.device(device))
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import Photos, photo_errors
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.fit.color import draw, fit_colors
-from gsmerge.stages.fit.device import engine_for
-from gsmerge.stages.fit.full import Progress, fit_full
+from gsmerge.stages.fit.full import KERNELS, Engine, Progress, fit_full
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
@@ -77,7 +75,16 @@ def fit(
     return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
 
 
-def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> torch.Tensor:
+def engine_for(device: str) -> Engine:
+    """What a run steps with on ``"cpu"`` or ``"cuda"``."""
+    if device == "cpu":
+        return KERNELS
+    from gsmerge.stages.fit.device import gpu_engine  # torch
+
+    return gpu_engine(device)
+
+
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
     """``[n]`` mask of the Gaussians worth keeping.
 
     Args:
@@ -95,7 +102,7 @@ def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> tor
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
-    return torch.from_numpy(~inside | (peak >= min_weight))
+    return ~inside | (peak >= min_weight)
 
 
 def _better_of(
