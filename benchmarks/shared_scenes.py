@@ -16,6 +16,7 @@ import torch
 from gsmerge.types import Cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
+LEFT_OUT = ("terrace", "mamechun")  # failure cases: depth mostly wrong, targets mostly unseen
 
 
 def shared_folder() -> Path | None:
