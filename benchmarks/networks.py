@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared_scenes import export, read_held_out, scene_folders
+from shared_scenes import LEFT_OUT, export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
@@ -30,7 +30,6 @@ from gsmerge.networks.checkpoint import SHIPPED
 from gsmerge.research.charts.statistics import Interval, mean_interval, paired_difference
 from gsmerge.views import even_views, subset
 
-LEFT_OUT = ("terrace", "mamechun")  # failure cases: depth mostly wrong, targets mostly unseen
 MEASURES = ("psnr", "ssim", "lpips_vgg")
 STAGES = ("encode", "match", "refine", "decode")  # that networks take part in
 

@@ -15,6 +15,7 @@ import numpy as np
 from gsmerge.types import Cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
+LEFT_OUT = ("terrace", "mamechun")  # failure cases: depth mostly wrong, targets mostly unseen
 
 
 def shared_folder() -> Path | None:

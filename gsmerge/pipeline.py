@@ -13,7 +13,7 @@ from typing import Any
 from gsmerge.baselines import choose_baseline
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import NEAR, photo_psnr, quarter_psnr, scene_photos
+from gsmerge.render.photos import NEAR, photo_psnr, scene_photos
 from gsmerge.report import CompactReport, CompactResult
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.run_log import STAGES, Progress, RunLog
@@ -196,5 +196,5 @@ def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
     In a quarter of every photo, or in the whole where a quality was asked for.
     """
     photos, exact = scene_photos(prepared.given), prepared.options.budget.target_psnr is not None
-    psnr = photo_psnr if exact else quarter_psnr
-    return psnr(gaussians, photos, scored_views(len(photos)), near=NEAR * prepared.frame.unit)
+    views, near = scored_views(len(photos)), NEAR * prepared.frame.unit
+    return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)

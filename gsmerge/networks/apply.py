@@ -221,7 +221,7 @@ def find_neighbors(features: FeatureGaussians, count: int) -> np.ndarray:
     for layer in (features.backing, ~features.backing):
         rows = np.flatnonzero(layer & finite)
         near = nearest_points(means[rows], count)
-        neighbors[rows] = np.where(near < 0, -1, rows[near]) if len(rows) else -1
+        neighbors[rows] = np.where(near < 0, -1, rows[near])
     return neighbors
 
 

@@ -90,17 +90,18 @@ def extend(
             is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
-    _check(state, scene, options, online.max_k if state is None else state.settings.max_k)
+    max_k = online.max_k if state is None else state.settings.max_k
+    _check(state, scene, options, max_k)
     log = RunLog(progress)
     with use_threads(options.threads):
         prepared = prepare(scene.numpy(), options, log, None if state is None else state.frame)
-        require_children("max k", online.max_k if state is None else state.settings.max_k, prepared.checkpoint)
+        require_children("max k", max_k, prepared.checkpoint)
         prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
         merged = merge_views(prepared, count, log)
-        state, counts = _add_batch(state, prepared, merged, online, log)
+        state, counts = _add_batch(state, prepared, merged, online, max_k, log)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = to_schema(options.to_dict()) | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
@@ -112,11 +113,15 @@ def extend(
 
 
 def _add_batch(
-    state: OnlineState | None, prepared: PreparedScene, merged: MergedViews, online: OnlineOptions, log: RunLog
+    state: OnlineState | None,
+    prepared: PreparedScene,
+    merged: MergedViews,
+    online: OnlineOptions,
+    max_k: int,
+    log: RunLog,
 ) -> tuple[OnlineState, dict[str, int]]:
     """The state with a batch in it, and what became of the batch's groups by key of the report."""
     scene, options = prepared.scene, prepared.options
-    max_k = online.max_k if state is None else state.settings.max_k
     size = scene.cameras if state is None else state.cameras
     photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
     counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}

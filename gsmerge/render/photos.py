@@ -135,29 +135,25 @@ def photo_errors(
     return parallel_map(one_view, chosen)
 
 
-def photo_psnr(gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], **settings: Any) -> float:
-    """Mean over some views of the PSNR (dB) of their photos; ``settings`` as of :func:`photo_errors`."""
+def photo_psnr(
+    gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
+) -> float:
+    """Mean over some views of the PSNR (dB) of their photos.
 
-    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
-        return psnr(np.clip(image, 0, 1), photos.images[view])
-
-    return float(np.mean(photo_errors(gaussians, photos, score, views, **settings)))
-
-
-def quarter_psnr(gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, near: float) -> float:
-    """:func:`photo_psnr` of the :func:`scored_tiles` alone, for a quarter to a half of the time."""
+    Args:
+        quarter: Of the :func:`scored_tiles` alone, for a quarter to a half of the time.
+        settings: As of :func:`photo_errors`.
+    """
 
     def tiles(view: int) -> np.ndarray | None:
-        return scored_tiles(view, photos.width, photos.height)
+        return scored_tiles(view, photos.width, photos.height) if quarter else None
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
-        chosen, photo = tiles(view), photos.images[view]
-        if chosen is None:
-            return psnr(np.clip(image, 0, 1), photo)
-        pixels = chosen.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
-        return psnr(np.clip(image[pixels], 0, 1)[None], photo[pixels][None])
+        chosen = tiles(view)
+        mask = None if chosen is None else chosen.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
+        return psnr(np.clip(image, 0, 1), photos.images[view], mask)
 
-    return float(np.mean(photo_errors(gaussians, photos, score, views, near=near, tiles=tiles)))
+    return float(np.mean(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings)))
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:

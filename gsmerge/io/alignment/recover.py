@@ -90,6 +90,11 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if close:
         return _by_colors(inputs, [first, *close])
     runner_up = min(others, key=lambda e: e.worst_px, default=None)
+    return _accepted(inputs, best, runner_up)
+
+
+def _accepted(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentScore | None) -> Recovery | None:
+    """A reading that the pixels alone decide for; None where shuffled pixels are about as near."""
     shuffled_px, shuffled_color = shuffled_score(inputs, best)
     if not _stands_out(best, shuffled_px):
         return None
@@ -122,10 +127,7 @@ def _plain(inputs: AlignmentInput) -> Recovery | None:
     distance = max(best.worst_px, _SMALLEST_PX)
     if best.worst_px > _PLAIN_PX or any(other.worst_px < SHUFFLED_MARGIN * distance for other in others):
         return None
-    shuffled_px, shuffled_color = shuffled_score(inputs, best)
-    if not _stands_out(best, shuffled_px):
-        return None
-    return Recovery(best, None, shuffled_px / distance, None, _confirmed(inputs, best, shuffled_color))
+    return _accepted(inputs, best, None)
 
 
 def _by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery | None:
