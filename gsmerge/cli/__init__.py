@@ -17,6 +17,7 @@ def main(args: Sequence[str] | None = None) -> int:
         130 interrupted.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # we report damaged images ourselves
+    os.environ.setdefault("GSMERGE_COMMAND", "1")  # see gsmerge.kernels.jit
     from gsmerge.cli.app import run
 
     return run(args)
