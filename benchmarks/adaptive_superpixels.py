@@ -51,7 +51,7 @@ def measure(photo: np.ndarray, start: int, adapt: float | None) -> tuple[int, li
     rows, count = [], start
     for method in METHODS:
         begin = time.process_time()
-        labels = superpixels(photo, count, method, adapt=adapt).numpy()
+        labels = superpixels(photo, count, method, adapt=adapt)
         rows.append(scores(photo, labels, time.process_time() - begin))
         count = int(labels.max()) + 1
     return count, rows

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from quality import score
 from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
@@ -96,9 +95,9 @@ def _targets(scene: Path, recovery: Recovery | None, nested: float) -> Targets:
     targets = read_held_out(scene)
     if recovery is None:
         return targets
-    viewmats = targets.cameras.viewmats.numpy().copy()
+    viewmats = targets.cameras.viewmats.copy()
     viewmats[:, :3, 3] *= nested  # into the world of the exported cameras
-    moved = torch.from_numpy(recovery.best.frame.move_viewmats(viewmats))
+    moved = recovery.best.frame.move_viewmats(viewmats)
     return replace(targets, cameras=replace(targets.cameras, viewmats=moved))
 
 

@@ -47,11 +47,11 @@ class Run:
 def run_once(scene: PixelScene | UnalignedScene, options: CompactOptions, device: str | None) -> Run:
     """One run on a device, or with None the stages of the CPU."""
     log, started = RunLog(), time.perf_counter()
-    with use_threads(), torch.no_grad():
+    with use_threads():
         prepared = prepare(scene, options, log)
         make, psnr = build, input_psnr
         if device is not None:
-            on_device = DeviceScene(prepared, torch.device(device), begin)
+            on_device = DeviceScene(prepared, device, begin)
             make, psnr = on_device.build, on_device.input_psnr
         result = score(make(prepared, prepared.limits.count, log), prepared, log, psnr)
         report = score_input(result, prepared, RunLog(), psnr).report

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from shared_scenes import export, read_held_out, scene_folders
+from shared_scenes import LEFT_OUT, export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
@@ -30,7 +30,6 @@ from gsmerge.networks.checkpoint import SHIPPED
 from gsmerge.research.charts.statistics import Interval, mean_interval, paired_difference
 from gsmerge.views import even_views, subset
 
-LEFT_OUT = ("terrace", "mamechun")  # failure cases: depth mostly wrong, targets mostly unseen
 MEASURES = ("psnr", "ssim", "lpips_vgg")
 STAGES = ("encode", "match", "refine", "decode")  # that networks take part in
 
@@ -142,7 +141,7 @@ def measured(folder: Path, condition: Condition, checkpoint: str, cache: Path, l
     chosen = {"checkpoint": checkpoint, "require_checkpoint": checkpoint != "none"}
     result = gsmerge.compact(scene, **condition.settings, **chosen)
     seconds = time.perf_counter() - start
-    views = Views(targets.cameras, torch.from_numpy(targets.images), tuple(map(str, range(len(targets.images)))))
+    views = Views(targets.cameras, targets.images, tuple(map(str, range(len(targets.images)))))
     options = EvaluateOptions(lpips=("vgg",) if lpips else (), lpips_views=2, context=False, own=False)
     scores = evaluate(scene, {"it": result.gaussians}, views, options).results[0].scores
     means: dict[str, float] = {}

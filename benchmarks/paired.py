@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from quality import score, setting
-from shared_scenes import Targets, export, read_held_out, scene_folders
+from shared_scenes import LEFT_OUT, Targets, export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.research.charts.statistics import mean_interval
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--other", nargs="*", required=True, help="settings, as name=value")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG")
-    parser.add_argument("--leave-out", default="terrace,mamechun", help="scenes, with commas between")
+    parser.add_argument("--leave-out", default=",".join(LEFT_OUT), help="scenes, with commas between")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
     both = [{k: setting(v) for k, v in (s.split("=") for s in some)} for some in (args.base, args.other)]
@@ -55,11 +55,8 @@ def main() -> None:
         runs = [[run(scene, targets, one, seed, args.lpips) for one in both] for seed in range(args.seeds)]
         rows.append(np.mean(runs, 0))
         spread = np.std([base[1] for base, _ in runs], ddof=1) if args.seeds > 1 else 0.0
-        values = {
-            name: np.round(rows[-1], 4)[:, i].tolist()
-            for i, name in enumerate(("CPU s", *NAMES), 0)
-            if i < len(rows[-1][0])
-        }
+        columns = np.round(rows[-1], 4).T.tolist()
+        values = dict(zip(("CPU s", *NAMES), columns, strict=False))  # LPIPS where it was asked for
         print(json.dumps({"scene": folder.name, **values, "deviation of a seed": round(float(spread), 3)}), flush=True)
     means = np.stack(rows)
     print(f"CPU seconds: {means[:, 1, 0].sum() / means[:, 0, 0].sum():.3f} of the base's")

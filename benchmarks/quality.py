@@ -29,7 +29,7 @@ LPIPS_VIEWS = 4  # at most this many target views of a scene, every second, thir
 
 def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> tuple[float, ...]:
     """Mean PSNR (dB) and SSIM over the visible pixels of all target views; LPIPS-VGG of some of them if asked."""
-    images = gsmerge.render(gaussians, targets.cameras).images.numpy().clip(0, 1)
+    images = gsmerge.render(gaussians, targets.cameras).images.clip(0, 1)
     values = [
         (psnr(a, b, mask), ssim(a, b, mask)) for a, b, mask in zip(images, targets.images, targets.masks, strict=True)
     ]

@@ -28,7 +28,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -91,10 +90,9 @@ def walk_back(plan: Any, image: Any, transmittance: Any, gradient: Any, colors: 
 
 def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int) -> tuple[dict[str, float], Any]:
     """Best times of both, and our image."""
-    tensors = {key: torch.from_numpy(scene[key]) for key in ("means", "quats", "scales", "opacities", "sh")}
-    num = (degree + 1) ** 2
-    sh = tensors.pop("sh")[:, :num]
-    splats = prepare(Gaussians(**tensors, sh0=sh[:, :1], shN=sh[:, 1:]), np.zeros(3))
+    columns, num = {key: scene[key] for key in ("means", "quats", "scales", "opacities")}, (degree + 1) ** 2
+    sh = scene["sh"][:, :num]
+    splats = prepare(Gaussians(**columns, sh0=sh[:, :1], shN=sh[:, 1:]), np.zeros(3))
     view = scene["viewmat"], scene["K"], int(scene["width"]), int(scene["height"])
     theirs = dict(scene, sh=np.ascontiguousarray(scene["sh"][:, :num]), deg=degree, W=view[2], H=view[3])
     raster, clock = sketch.Raster(1), Clock()
@@ -121,11 +119,8 @@ def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int
 
 def wall(scene: dict[str, Any], threads: int, repeats: int) -> float:
     """Best wall milliseconds of plan and composite of one view."""
-    splats = prepare(
-        Gaussians(*(torch.from_numpy(scene[key]) for key in ("means", "quats", "scales", "opacities")),
-                  torch.from_numpy(scene["sh"][:, :1]), torch.zeros(len(scene["means"]), 0, 3)),
-        np.zeros(3),
-    )  # fmt: skip
+    columns = [scene[key] for key in ("means", "quats", "scales", "opacities")]
+    splats = prepare(Gaussians(*columns, scene["sh"][:, :1], scene["sh"][:, :0]), np.zeros(3))
     view, clock = (scene["viewmat"], scene["K"], int(scene["width"]), int(scene["height"])), Clock()
     with use_threads(threads):
         for _ in range(repeats):

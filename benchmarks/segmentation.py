@@ -101,7 +101,7 @@ def ours(name: str, effort: str) -> Method:
     if name == "device":
         options = SegmentOptions(effort=effort)
         return lambda image, count: segment(torch.from_numpy(image / np.float32(255))[None], options, count)[0].numpy()
-    return lambda image, count: superpixels(image, count, name, effort=effort).numpy()
+    return lambda image, count: superpixels(image, count, name, effort=effort)
 
 
 def main() -> None:

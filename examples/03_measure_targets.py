@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 import gsmerge
 
@@ -29,8 +28,8 @@ def target_psnr(targets: Path, ply: Path) -> float:
         photo = cv2.imread(str(targets / name))
         if photo is None:
             raise SystemExit(f"{targets / name}: cannot be read")
-        error = image.clamp(0, 1).double() - torch.from_numpy(photo[..., ::-1] / 255.0)
-        values.append(-10 * np.log10(float(error.square().mean())))
+        error = image.clip(0, 1) - photo[..., ::-1] / 255.0
+        values.append(-10 * np.log10((error**2).mean()))
     return float(np.mean(values))
 
 

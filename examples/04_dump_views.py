@@ -65,7 +65,7 @@ def main() -> None:
     scene = gsmerge.read_scene(folder)
     cameras = scene.cameras
     target = str(folder / "views.npz")
-    dump_views(target, np.linalg.inv(cameras.viewmats.numpy()), cameras.Ks.numpy(), scene.images.numpy())
+    dump_views(target, np.linalg.inv(cameras.viewmats), cameras.Ks, scene.images)
     again = gsmerge.read_scene(folder, cameras=target)
     print(f"{target}: {len(again)} views of {again.cameras.width} x {again.cameras.height}")
 

@@ -1,7 +1,5 @@
 """``python -m gsmerge``."""
 
-import sys
+from gsmerge.cli import program
 
-from gsmerge.cli import main
-
-sys.exit(main())
+program()

@@ -1,21 +1,15 @@
-"""Quaternions, covariances and projection, on batches of tensors."""
+"""Quaternions, covariances and projection, on batches of arrays."""
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.types import SH_C0, Cameras
-
-Colors = TypeVar("Colors", np.ndarray, Tensor)
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 
 
-def quat_to_rotmat(quats: Tensor) -> Tensor:
+def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
     """Rotation matrices of quaternions.
 
     Args:
@@ -24,33 +18,42 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
     Returns:
         ``[...,3,3]`` rotations, local to world.
     """
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    w, x, y, z = np.moveaxis(normalize(quats), -1, 0)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+    return np.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
-def rotmat_to_quat(rotations: Tensor) -> Tensor:
+def normalize(vectors: np.ndarray) -> np.ndarray:
+    """Vectors ``[...,d]`` of length 1; zero stays zero."""
+    with np.errstate(over="ignore"):  # what is too long becomes zero
+        norms = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
+    return vectors / np.maximum(norms, norms.dtype.type(1e-12))
+
+
+def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
     """Unit quaternions ``[n,4]`` wxyz of rotation matrices ``[n,3,3]``, the largest component positive.
 
     Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
     """
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
-    ways = [
-        torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
-        torch.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
-        torch.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
-        torch.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
-    ]
-    best = torch.stack([way[..., k] for k, way in enumerate(ways)], -1).argmax(-1)
-    chosen = torch.stack(ways, -2)[torch.arange(len(best)), best]
-    return torch.nn.functional.normalize(chosen, dim=-1)
+    a, b, c, d, e, f, g, h, i = rotations.reshape(-1, 9).T
+    ways = np.stack(
+        [
+            np.stack([1 + a + e + i, h - f, c - g, d - b], -1),
+            np.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
+            np.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
+            np.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
+        ],
+        -2,
+    )
+    best = np.diagonal(ways, axis1=-2, axis2=-1).argmax(-1)
+    return normalize(ways[np.arange(len(best)), best])
 
 
-def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Covariances ``R diag(scales)^2 R^T`` (paper section 3).
 
     Args:
@@ -61,10 +64,10 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
         ``[...,3,3]``.
     """
     half = quat_to_rotmat(quats) * scales[..., None, :]
-    return half @ half.transpose(-1, -2)
+    return half @ half.swapaxes(-1, -2)
 
 
-def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Pixel positions and depths of points in every camera.
 
     Args:
@@ -75,11 +78,12 @@ def project(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
         ``[c,n,2]`` positions in pixels (pixel centres at +0.5; meaningless where the depth is not positive)
         and ``[c,n]`` depths along z, both in float64.
     """
-    return project_points(means.double(), cameras.viewmats.double(), cameras.Ks.double())
+    with np.errstate(divide="ignore", invalid="ignore"):  # behind or on the plane of a camera
+        return project_points(*(array.astype(np.float64) for array in (means, cameras.viewmats, cameras.Ks)))
 
 
-def project_points(points: Colors, viewmats: Colors, Ks: Colors) -> tuple[Colors, Colors]:
-    """:func:`project` for NumPy arrays and tensors of any leading shape, in their own precision.
+def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`project` for any leading shape, in their own precision.
 
     Args:
         points: ``[...,n,3]`` world positions.
@@ -107,11 +111,11 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
     return codes
 
 
-def sh0_to_rgb(sh0: Colors) -> Colors:
-    """Base colours (sRGB, 0 to 1 where they can be shown) of spherical harmonics of degree 0, same shape and type."""
+def sh0_to_rgb(sh0: np.ndarray) -> np.ndarray:
+    """Base colours (sRGB, 0 to 1 where they can be shown) of spherical harmonics of degree 0."""
     return 0.5 + SH_C0 * sh0
 
 
-def rgb_to_sh0(rgb: Colors) -> Colors:
+def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
     """The inverse of :func:`sh0_to_rgb`."""
     return (rgb - 0.5) / SH_C0

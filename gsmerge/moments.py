@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import FeatureGaussians, Gaussians, PixelScene, UnalignedScene, to_float32
 
 Rule = Literal["depth", "paper"]
 
@@ -46,8 +44,8 @@ class Members:
     pixels: np.ndarray | None = None
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
+def _array(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def scene_members(scene: PixelScene) -> Members:
@@ -59,8 +57,8 @@ def scene_members(scene: PixelScene) -> Members:
 
     def fill(view: int) -> None:
         rows = slice(view * pixels, (view + 1) * pixels)
-        third = cameras.viewmats[view, 2].numpy().astype(np.float32)
-        focal = float((cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1]).abs().sqrt())
+        third = cameras.viewmats[view, 2].astype(np.float32)
+        focal = float(np.sqrt(abs(cameras.Ks[view, 0, 0] * cameras.Ks[view, 1, 1])))
         depths = np.abs(means[rows] @ third[:3] + third[3])
         footprints[rows] = np.maximum(depths, 1e-6) / focal
 
@@ -77,15 +75,15 @@ def unaligned_members(scene: UnalignedScene, pixels: np.ndarray) -> Members:
             camera.
     """
     means, cameras = _array(scene.gaussians.means), scene.cameras
-    focals = (cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]).abs().sqrt().double().numpy()
-    thirds = cameras.viewmats[:, 2].double().numpy()
+    focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
+    thirds = cameras.viewmats[:, 2].astype(np.float64)
     views = pixels // scene.pixels_per_view
     depths = np.abs(np.einsum("nd,nd->n", means, thirds[views, :3]) + thirds[views, 3])
     footprints = np.maximum(depths, 1e-6) / focals[views]
     alone = np.flatnonzero(pixels < 0)
     if len(alone):
         nearest = np.full(len(alone), np.inf)
-        for centre, focal in zip(cameras.centres.double().numpy(), focals, strict=True):
+        for centre, focal in zip(cameras.centres.astype(np.float64), focals, strict=True):
             np.minimum(nearest, np.linalg.norm(means[alone] - centre, axis=1) / focal, out=nearest)
         footprints[alone] = np.maximum(nearest, 1e-6)
     return gaussian_members(scene.gaussians, footprints.astype(np.float32), pixels)
@@ -158,27 +156,27 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(
-    covars: np.ndarray, extinctions: np.ndarray, spreads: np.ndarray, means: Tensor, sh: Tensor
+    covars: np.ndarray, extinctions: np.ndarray, spreads: np.ndarray, means: np.ndarray, sh: np.ndarray
 ) -> Gaussians:
     """Gaussians of given moments; opacity from the conserved optical depth over the (unspread) disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(
-        means=means.float(),
-        quats=torch.from_numpy(quats).float(),
-        scales=torch.from_numpy(scales * spreads[:, None]).float(),
-        opacities=torch.from_numpy(np.clip(opacities, 0, MAX_OPACITY)).float(),
-        sh0=sh[:, :1].float(),
-        shN=sh[:, 1:].float(),
+        means=to_float32(means),
+        quats=to_float32(quats),
+        scales=to_float32(scales * spreads[:, None]),
+        opacities=np.clip(opacities, 0, MAX_OPACITY).astype(np.float32),
+        sh0=sh[:, :1],
+        shN=sh[:, 1:],
     )
 
 
 def feature_to_gaussians(features: FeatureGaussians) -> Gaussians:
     """One Gaussian per Feature Gaussian (K = 1)."""
     return to_gaussians(
-        features.covars.double().numpy(),
-        (features.extinctions * features.gains).double().numpy(),
-        features.spreads.double().numpy(),
+        features.covars,
+        features.extinctions.astype(np.float64) * features.gains,
+        features.spreads.astype(np.float64),
         features.means,
-        torch.cat([features.sh0, features.shN], 1),
+        np.concatenate([features.sh0, features.shN], 1),
     )

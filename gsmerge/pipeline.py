@@ -12,12 +12,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import torch
-
 from gsmerge.baselines import choose_baseline
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import NEAR, photo_psnr, quarter_psnr, scene_photos
+from gsmerge.render.photos import NEAR, photo_psnr, scene_photos
 from gsmerge.report import CompactReport, CompactResult
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.run_log import STAGES, Progress, RunLog
@@ -51,7 +49,7 @@ def compact(
 
     Args:
         scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`; or Gaussians that belong to no pixels,
-            which are given to the superpixels by what they add to the views.
+            which are given to the superpixels by what they add to the views. Tensors give tensors on their device.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the longer ones with ("fit: ...", step, steps).
@@ -64,8 +62,10 @@ def compact(
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
     options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
-    options, log = options.with_chosen_device(scene.num_gaussians), RunLog(progress)
-    with use_threads(options.threads), torch.no_grad():
+    options = options.with_chosen_device(scene.num_gaussians)
+    log, device = RunLog(progress), scene.gaussians.device
+    scene = scene.numpy()
+    with use_threads(options.threads):
         baseline, log.notes[:] = choose_baseline(options, scene)
         prepared = prepare(scene, options, log)
         own_build, psnr = choose_builder(prepared)
@@ -81,7 +81,7 @@ def compact(
         result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress), psnr)
     if progress:
         progress("done", len(STAGES), len(STAGES))
-    return result
+    return result if device is None else result.to(device)
 
 
 def choose_builder(prepared: PreparedScene) -> tuple[Build, Psnr]:
@@ -89,9 +89,9 @@ def choose_builder(prepared: PreparedScene) -> tuple[Build, Psnr]:
     device = prepared.options.fit.device
     if device == "cpu":
         return build, input_psnr
-    from gsmerge.gpu.build import DeviceScene  # loaded where it is used alone
+    from gsmerge.gpu.build import DeviceScene  # torch; loaded where it is used alone
 
-    on_device = DeviceScene(prepared, torch.device(device), begin)
+    on_device = DeviceScene(prepared, device, begin)
     return on_device.build, on_device.input_psnr
 
 
@@ -226,5 +226,5 @@ def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
     In a quarter of every photo, or in the whole where a quality was asked for.
     """
     photos, exact = scene_photos(prepared.given), prepared.options.budget.target_psnr is not None
-    psnr = photo_psnr if exact else quarter_psnr
-    return psnr(gaussians, photos, scored_views(len(photos)), near=NEAR * prepared.frame.unit)
+    views, near = scored_views(len(photos)), NEAR * prepared.frame.unit
+    return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)

@@ -6,14 +6,17 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge import __version__
 from gsmerge.options import to_schema
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Gaussians
+
+if TYPE_CHECKING:
+    import torch
 
 SCHEMA_VERSION = 1
 
@@ -61,6 +64,11 @@ class CompactResult:
     gaussians: Gaussians
     report: CompactReport
     coarser: tuple[CompactResult, ...] = ()
+
+    def to(self, device: torch.device | str) -> CompactResult:
+        """The same result with tensors on a device."""
+        coarser = tuple(one.to(device) for one in self.coarser)
+        return replace(self, gaussians=self.gaussians.to(device), coarser=coarser)
 
 
 def file_sha256(path: Path) -> str:

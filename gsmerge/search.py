@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.render.metrics import WINDOW, ssim
 from gsmerge.render.photos import Photos, render_photos, scene_photos
 from gsmerge.report import CompactResult
@@ -126,9 +125,12 @@ def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.nd
     views = range(len(photos))
     similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
     perceptual = None
-    if min(photos.height, photos.width) >= PERCEPTUAL_SIDE and lpips_available(NET):
-        some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
-        perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in some]))
+    if min(photos.height, photos.width) >= PERCEPTUAL_SIDE:
+        from gsmerge.measure.lpips import lpips, lpips_available  # which needs torch
+
+        if lpips_available(NET):
+            some = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
+            perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in some]))
     psnr = holdout_psnr(images, photos, weights, min_gain)
     return CurvePoint(count, psnr, float(np.mean(similar)), perceptual)
 

@@ -1,4 +1,7 @@
-"""The core types: frozen dataclasses of tensors, and nothing but indexing and moving.
+"""The core types: frozen dataclasses of arrays, and nothing but indexing and moving.
+
+Arrays are NumPy's. Gaussians and cameras may hold torch tensors instead, of one device, for :func:`gsmerge.render`,
+networks and training; this module does not import torch unless it is asked for tensors.
 
 One convention in memory (docs/reference/conventions.md): linear scales, opacities in [0, 1], unit quaternions wxyz that
 rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres at +0.5, sRGB in [0, 1].
@@ -8,20 +11,56 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+Array = Any  # a NumPy array, or a torch tensor where a docstring allows one
 
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: rgb = 0.5 + SH_C0 * sh0
 
 
-def _expect(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:
-    ok = tensor.ndim == len(shape) and all(
-        isinstance(want, str) or want == have for want, have in zip(shape, tensor.shape, strict=True)
+def _expect(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
+    ok = array.ndim == len(shape) and all(
+        isinstance(want, str) or want == have for want, have in zip(shape, array.shape, strict=True)
     )
     if not ok:
-        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
+        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
+
+
+def as_array(values: Array) -> np.ndarray:
+    """A NumPy array of an array, or of a tensor of any device, without its gradient; without copying where possible."""
+    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+
+
+def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor:
+    """A tensor on a device of an array or a tensor; on the CPU it shares the array's memory."""
+    import torch
+
+    return torch.as_tensor(values, device=device)
+
+
+def to_float32(values: np.ndarray) -> np.ndarray:
+    """An array rounded to float32; what is beyond its range becomes infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def like(values: np.ndarray, given: Array) -> Array:
+    """An array as what was given: an array, or a tensor on the same device."""
+    return as_tensor(values, given.device) if hasattr(given, "detach") else values
+
+
+def concat_rows(parts: Sequence[Array]) -> Array:
+    """Rows of arrays, or of tensors, one part after the other."""
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts)
+    import torch
+
+    return torch.cat([torch.as_tensor(part) for part in parts])
 
 
 @dataclass(frozen=True)
@@ -40,12 +79,12 @@ class Gaussians:
         ValueError: If the shapes do not fit together.
     """
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh0: Array
+    shN: Array
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -62,7 +101,7 @@ class Gaussians:
         return self.means.shape[0]
 
     def __getitem__(self, index: Any) -> Gaussians:
-        """The rows that ``index`` (slice, mask or integer tensor) selects."""
+        """The rows that ``index`` (slice, mask or integer array) selects."""
         return Gaussians(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @property
@@ -70,14 +109,23 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 4."""
         return round((self.shN.shape[1] + 1) ** 0.5) - 1
 
+    @property
+    def device(self) -> torch.device | None:
+        """Where the tensors are; None of NumPy arrays."""
+        return None if isinstance(self.means, np.ndarray) else self.means.device
+
     def to(self, device: torch.device | str) -> Gaussians:
-        """The same Gaussians on another device."""
-        return Gaussians(*(getattr(self, f.name).to(device) for f in fields(self)))
+        """The same Gaussians as tensors on a device; gradients pass."""
+        return Gaussians(*(as_tensor(getattr(self, f.name), device) for f in fields(self)))
+
+    def numpy(self) -> Gaussians:
+        """The same Gaussians as NumPy arrays."""
+        return Gaussians(*(as_array(getattr(self, f.name)) for f in fields(self)))
 
     @staticmethod
     def concat(parts: Sequence[Gaussians]) -> Gaussians:
         """Rows of all parts, one part after the other; all must have the same SH degree."""
-        return Gaussians(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+        return Gaussians(*(concat_rows([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
 
 
 @dataclass(frozen=True)
@@ -94,8 +142,8 @@ class Cameras:
         ValueError: If the shapes do not fit together or the size is not positive.
     """
 
-    viewmats: Tensor
-    Ks: Tensor
+    viewmats: Array
+    Ks: Array
     width: int
     height: int
 
@@ -110,25 +158,36 @@ class Cameras:
         return self.viewmats.shape[0]
 
     def __getitem__(self, index: Any) -> Cameras:
-        """The cameras that ``index`` (slice, mask or integer tensor) selects."""
+        """The cameras that ``index`` (slice, mask or integer array) selects."""
         return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras on another device."""
-        return replace(self, viewmats=self.viewmats.to(device), Ks=self.Ks.to(device))
+        """The same cameras as tensors on a device; gradients pass."""
+        return replace(self, viewmats=as_tensor(self.viewmats, device), Ks=as_tensor(self.Ks, device))
+
+    def numpy(self) -> Cameras:
+        """The same cameras as NumPy arrays."""
+        return replace(self, viewmats=as_array(self.viewmats), Ks=as_array(self.Ks))
 
     @property
-    def centres(self) -> Tensor:
+    def centres(self) -> Array:
         """``[c,3]`` camera centres in the world."""
         rotation, shift = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
-        return -(rotation.transpose(1, 2) @ shift[:, :, None])[:, :, 0]
+        return -(rotation.swapaxes(1, 2) @ shift[:, :, None])[:, :, 0]
 
 
-def _expect_views(cameras: Cameras, images: Tensor | None, names: tuple[str, ...]) -> None:
+def _expect_views(cameras: Cameras, images: Array | None, names: tuple[str, ...]) -> None:
     if images is not None:
         _expect("images", images, (len(cameras), cameras.height, cameras.width, 3))
     if len(names) != len(cameras):
         raise ValueError(f"expected {len(cameras)} view names, got {len(names)}")
+
+
+def _arrays(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
+    """The fields of a scene that may hold tensors, as NumPy arrays."""
+    fields_of = {"gaussians": scene.gaussians.numpy(), "cameras": scene.cameras.numpy()}
+    names = [name for name in ("images", "valid", "missing") if getattr(scene, name, None) is not None]
+    return fields_of | {name: as_array(getattr(scene, name)) for name in names}
 
 
 @dataclass(frozen=True)
@@ -151,10 +210,10 @@ class PixelScene:
 
     gaussians: Gaussians
     cameras: Cameras
-    images: Tensor | None
-    valid: Tensor
+    images: np.ndarray | None
+    valid: np.ndarray
     names: tuple[str, ...]
-    missing: Tensor | None = None
+    missing: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
@@ -168,6 +227,10 @@ class PixelScene:
     def __len__(self) -> int:
         return len(self.cameras)
 
+    def numpy(self) -> PixelScene:
+        """The same scene with NumPy arrays in place of tensors."""
+        return replace(self, **_arrays(self))
+
     @property
     def num_missing(self) -> int:
         """Pixels that the file has no row for."""
@@ -179,7 +242,7 @@ class PixelScene:
         return len(self.gaussians) - self.num_missing
 
     @property
-    def stored(self) -> Tensor:
+    def stored(self) -> np.ndarray:
         """``[v,h,w]`` bool: pixels whose Gaussian is a finite one of the file."""
         return self.valid if self.missing is None else self.valid & ~self.missing
 
@@ -210,7 +273,7 @@ class UnalignedScene:
 
     gaussians: Gaussians
     cameras: Cameras
-    images: Tensor | None
+    images: np.ndarray | None
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -218,6 +281,10 @@ class UnalignedScene:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def numpy(self) -> UnalignedScene:
+        """The same scene with NumPy arrays in place of tensors."""
+        return replace(self, **_arrays(self))
 
     @property
     def num_gaussians(self) -> int:
@@ -239,7 +306,7 @@ class UnalignedScene:
 class Groups:
     """A partition of the pixels of every view into superpixels."""
 
-    labels: Tensor  # [v,h,w] int32, the superpixel of each pixel, 0 to `counts[v] - 1` within its view
+    labels: np.ndarray  # [v,h,w] int32, the superpixel of each pixel, 0 to `counts[v] - 1` within its view
     counts: tuple[int, ...]  # Superpixels of each view
 
     def __post_init__(self) -> None:
@@ -263,7 +330,7 @@ class Segmentation:
 class Matches:
     """Clusters of Feature Gaussians that show the same piece of surface."""
 
-    clusters: Tensor  # [g] int64, the cluster of each Feature Gaussian, dense from 0
+    clusters: np.ndarray  # [g] int64, the cluster of each Feature Gaussian, dense from 0
     count: int  # Number of clusters
 
 
@@ -276,21 +343,21 @@ class FeatureGaussians:
     ``1 - exp(-gain * extinction / disc area)`` (integrated optical depth is what blending conserves).
     """
 
-    means: Tensor  # [g,3] float32
-    covars: Tensor  # [g,3,3] float32: spread of the members' means plus their own covariances
-    weights: Tensor  # [g] sum of the members' opacities
-    masses: Tensor  # [g] opacity-weighted volume (paper eq. mass)
-    extinctions: Tensor  # [g] optical depth integrated over the members' discs, world units squared
-    gains: Tensor  # [g] factor on the optical depth: 1, or what the other views' photos say
-    spreads: Tensor  # [g] factor on the standard deviations at decoding
-    sh0: Tensor  # [g,1,3] base colour
-    shN: Tensor  # [g,k-1,3]
-    footprints: Tensor  # [g] size of one pixel at the group's depth, world units
-    views: Tensor  # [g] int64, the view of the group, -1 when it was merged from several
-    backing: Tensor  # [g] bool: belongs to the coarse layer behind the surfaces
-    starts: Tensor  # [g+1] int64 into `members`
-    members: Tensor  # [m] int64 rows of the scene's Gaussians, group by group
-    latents: Tensor  # [g,d] what the networks remember of the group (paper section 4.2); d = 0 without networks
+    means: np.ndarray  # [g,3] float32
+    covars: np.ndarray  # [g,3,3] float32: spread of the members' means plus their own covariances
+    weights: np.ndarray  # [g] sum of the members' opacities
+    masses: np.ndarray  # [g] opacity-weighted volume (paper eq. mass)
+    extinctions: np.ndarray  # [g] optical depth integrated over the members' discs, world units squared
+    gains: np.ndarray  # [g] factor on the optical depth: 1, or what the other views' photos say
+    spreads: np.ndarray  # [g] factor on the standard deviations at decoding
+    sh0: np.ndarray  # [g,1,3] base colour
+    shN: np.ndarray  # [g,k-1,3]
+    footprints: np.ndarray  # [g] size of one pixel at the group's depth, world units
+    views: np.ndarray  # [g] int64, the view of the group, -1 when it was merged from several
+    backing: np.ndarray  # [g] bool: belongs to the coarse layer behind the surfaces
+    starts: np.ndarray  # [g+1] int64 into `members`
+    members: np.ndarray  # [m] int64 rows of the scene's Gaussians, group by group
+    latents: Array  # [g,d] what the networks remember of the group (paper section 4.2), a tensor; without: d = 0
 
     def __post_init__(self) -> None:
         g = self.means.shape[0]
@@ -307,7 +374,7 @@ class FeatureGaussians:
     def concat(parts: Sequence[FeatureGaussians]) -> FeatureGaussians:
         """All groups, one part after the other."""
         names = [f.name for f in fields(FeatureGaussians) if f.name != "starts"]
-        columns = {name: torch.cat([getattr(p, name) for p in parts]) for name in names}
-        sizes = torch.cat([p.starts[1:] - p.starts[:-1] for p in parts])
-        starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
+        columns = {name: concat_rows([getattr(p, name) for p in parts]) for name in names}
+        sizes = np.concatenate([np.diff(p.starts) for p in parts])
+        starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
         return FeatureGaussians(starts=starts, **columns)

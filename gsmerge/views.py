@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 
 from gsmerge.runtime.estimate import MAX_SCORED_VIEWS
 from gsmerge.types import PixelScene, UnalignedScene
@@ -60,7 +59,7 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
 
 def distinct_views(scene: PixelScene | UnalignedScene) -> list[int]:
     """The views without those that repeat an earlier one: the same camera, the same photo, the same Gaussians."""
-    cameras = torch.cat([scene.cameras.viewmats.flatten(1), scene.cameras.Ks.flatten(1)], 1).numpy()
+    cameras = np.concatenate([scene.cameras.viewmats.reshape(-1, 16), scene.cameras.Ks.reshape(-1, 9)], 1)
     _, firsts = np.unique(cameras, axis=0, return_inverse=True)
     kept: list[int] = []
     for view, kind in enumerate(firsts.reshape(-1)):
@@ -71,13 +70,13 @@ def distinct_views(scene: PixelScene | UnalignedScene) -> list[int]:
 
 def _equal_views(scene: PixelScene | UnalignedScene, one: int, other: int) -> bool:
     """Whether two views of one camera have the same photo and the same Gaussians."""
-    if scene.images is not None and not torch.equal(scene.images[one], scene.images[other]):
+    if scene.images is not None and not np.array_equal(scene.images[one], scene.images[other]):
         return False
     if isinstance(scene, UnalignedScene):
         return True
     size = scene.pixels_per_view
     a, b = (vars(scene.gaussians[view * size : (view + 1) * size]) for view in (one, other))
-    return all(torch.equal(a[name], b[name]) for name in a)
+    return all(np.array_equal(a[name], b[name]) for name in a)
 
 
 def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> PixelScene | UnalignedScene:
@@ -91,7 +90,7 @@ def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> Pixel
     if isinstance(scene, UnalignedScene):
         return replace(scene, cameras=scene.cameras[ids], images=images, names=names)
     size = scene.pixels_per_view
-    rows = (torch.tensor(ids)[:, None] * size + torch.arange(size)).reshape(-1)
+    rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
     return replace(
         scene,
         gaussians=scene.gaussians[rows],

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import scenes
-import torch
 
 from gsmerge import Compactor, PixelScene
 from gsmerge.online.state import GroupSet, OnlineState
@@ -51,10 +50,10 @@ def same_state(one: OnlineState, other: OnlineState) -> None:
     assert (one.kept is None) == (other.kept is None)
     if one.kept is not None and other.kept is not None:
         assert scenes.identical(one.kept, other.kept)
-    assert torch.equal(one.frame.origin, other.frame.origin)
+    np.testing.assert_array_equal(one.frame.origin, other.frame.origin)
     assert one.frame.unit == other.frame.unit
     for name in ("viewmats", "Ks"):
-        assert torch.equal(getattr(one.cameras, name), getattr(other.cameras, name)), name
+        np.testing.assert_array_equal(getattr(one.cameras, name), getattr(other.cameras, name), name)
     assert (one.cameras.width, one.cameras.height) == (other.cameras.width, other.cameras.height)
     np.testing.assert_array_equal(one.replay.images, other.replay.images)
     np.testing.assert_array_equal(one.replay.views, other.replay.views)
@@ -67,15 +66,15 @@ def same_groups(one: GroupSet, other: GroupSet) -> None:
     for f in fields(one.features):
         a, b = getattr(one.features, f.name), getattr(other.features, f.name)
         assert a.dtype == b.dtype, f.name
-        assert torch.equal(a, b), f.name
+        np.testing.assert_array_equal(a, b, f.name)
     assert scenes.identical(one.children, other.children)
-    assert torch.equal(one.fitted_sh0, other.fitted_sh0)
-    assert torch.equal(one.color_precision, other.color_precision)
+    np.testing.assert_array_equal(one.fitted_sh0, other.fitted_sh0)
+    np.testing.assert_array_equal(one.color_precision, other.color_precision)
 
 
-def group(groups: GroupSet, row: int) -> tuple[dict[str, torch.Tensor], Gaussians]:
+def group(groups: GroupSet, row: int) -> tuple[dict[str, np.ndarray], Gaussians]:
     """One group's columns and its children."""
-    one = take(groups.features, torch.tensor([row]))
+    one = take(groups.features, np.array([row]))
     names = [f.name for f in fields(one) if f.name not in ("starts", "members")]
     columns = {name: getattr(one, name) for name in names}
     columns |= {"fitted_sh0": groups.fitted_sh0[row], "color_precision": groups.color_precision[row]}
@@ -85,7 +84,7 @@ def group(groups: GroupSet, row: int) -> tuple[dict[str, torch.Tensor], Gaussian
 def same_group(one: GroupSet, row: int, other: GroupSet, place: int) -> bool:
     """Whether a group of one is a group of the other, to the last bit."""
     (columns, children), (others, those) = group(one, row), group(other, place)
-    return scenes.identical(children, those) and all(torch.equal(columns[name], others[name]) for name in columns)
+    return scenes.identical(children, those) and all(np.array_equal(columns[name], others[name]) for name in columns)
 
 
 def random_gaussians(count: int, seed: int, *, size: tuple[float, float] = (0.01, 0.2), degree: int = 0) -> Gaussians:
@@ -94,22 +93,20 @@ def random_gaussians(count: int, seed: int, *, size: tuple[float, float] = (0.01
     turns = rng.normal(size=(count, 4))
     low, high = np.log(size)
 
-    def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(values.astype(np.float32))
-
-    return Gaussians(
-        means=tensor(rng.uniform([-4, -4, -2], [4, 4, 6], (count, 3))),
-        quats=tensor(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
-        scales=tensor(np.exp(rng.uniform(low, high, (count, 3)))),
-        opacities=tensor(rng.uniform(0.05, 0.99, count)),
-        sh0=tensor(rng.uniform(-1, 1, (count, 1, 3)) / SH_C0 / 2),
-        shN=tensor(rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)) / 9),
+    columns = (
+        rng.uniform([-4, -4, -2], [4, 4, 6], (count, 3)),
+        turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        np.exp(rng.uniform(low, high, (count, 3))),
+        rng.uniform(0.05, 0.99, count),
+        rng.uniform(-1, 1, (count, 1, 3)) / SH_C0 / 2,
+        rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)) / 9,
     )
+    return Gaussians(*(column.astype(np.float32) for column in columns))
 
 
-def repainted(scene: PixelScene, images: torch.Tensor) -> PixelScene:
+def repainted(scene: PixelScene, images: np.ndarray) -> PixelScene:
     """The scene with other photos."""
-    return replace(scene, images=images.float())
+    return replace(scene, images=images.astype(np.float32))
 
 
 def counts(reports: Sequence[Any], name: str) -> list[int]:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import torch
+import numpy as np
 
 from gsmerge import Gaussians
+from gsmerge.geometry import normalize
 
 
 def some(count: int, seed: int = 0, degree: int = 1) -> Gaussians:
     """Random ones about the origin, of any shape, opacity and colour."""
-    rng = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(count, 3, generator=rng),
-        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=rng), dim=1),
-        scales=torch.rand(count, 3, generator=rng) * 0.1 + 0.01,
-        opacities=torch.rand(count, generator=rng) * 0.9 + 0.05,
-        sh0=torch.randn(count, 1, 3, generator=rng),
-        shN=torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=rng),
+    rng = np.random.default_rng(seed)
+    columns = (
+        rng.normal(size=(count, 3)),
+        normalize(rng.normal(size=(count, 4))),
+        rng.uniform(0.01, 0.11, (count, 3)),
+        rng.uniform(0.05, 0.95, count),
+        rng.normal(size=(count, 1, 3)),
+        rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)),
     )
+    return Gaussians(*(column.astype(np.float32) for column in columns))

@@ -16,7 +16,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gsmerge import Gaussians
 
@@ -34,8 +33,8 @@ def nudged(gaussians: Gaussians) -> Gaussians:
     if seed == 0:
         return gaussians
     noise = np.random.default_rng(seed).normal(size=gaussians.means.shape) * NUDGE_SIZE
-    sizes = gaussians.scales.amax(1, keepdim=True)
-    return replace(gaussians, means=gaussians.means + sizes * torch.from_numpy(noise).to(gaussians.means.dtype))
+    means, sizes = gaussians.means, gaussians.scales.max(1, keepdims=True)
+    return replace(gaussians, means=means + sizes * noise.astype(means.dtype))
 
 
 def at_least_the_floor(test: str, value: float) -> None:

@@ -63,5 +63,5 @@ def made(num_views: int = 2) -> Made:
     edges = edges[edges < 24 * 18]
     labels = np.searchsorted(edges, np.arange(24 * 18), side="right").reshape(18, 24).astype(np.int32)
     count = len(edges) + 1
-    groups = Groups(torch.from_numpy(labels).expand(num_views, -1, -1).contiguous(), (count,) * num_views)
+    groups = Groups(np.stack([labels] * num_views), (count,) * num_views)
     return Made(scene, members, encode(scene, members, groups, EncodeOptions()))

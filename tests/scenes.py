@@ -7,17 +7,16 @@ Gaussian on the surface that it sees, the size of its footprint, flat along the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import torch
 from floors import nudged
-from torch import Tensor
 
 from gsmerge import Cameras, Gaussians, PixelScene, compact, render
-from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.geometry import covariances, normalize, quat_to_rotmat
 from gsmerge.pipeline import CompactReport, CompactResult
 from gsmerge.render.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, paths, photograph, shapes
@@ -98,17 +97,17 @@ def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8,
     for view in range(num_views):
         x = span * (start + (view / (num_views - 1) if num_views > 1 else 0.5))
         viewmats.append(look_at(np.array([x, 0.15 * x, 0.0]), np.array([0.0, 0.0, 3.0])))
-    return Cameras(torch.stack(viewmats), intrinsics(num_views, width, height), width, height)
+    return Cameras(np.stack(viewmats), intrinsics(num_views, width, height), width, height)
 
 
-def look_at(eye: np.ndarray, target: np.ndarray) -> Tensor:
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     """World to camera, OpenCV axes, y down."""
-    return torch.from_numpy(np.linalg.inv(paths.look_at(eye, target)))
+    return np.linalg.inv(paths.look_at(eye, target))
 
 
-def intrinsics(num_views: int, width: int, height: int) -> Tensor:
+def intrinsics(num_views: int, width: int, height: int) -> np.ndarray:
     """A lens whose focal length is the image's width."""
-    return torch.from_numpy(photograph.Lens(width, height, width).intrinsics).expand(num_views, 3, 3).clone()
+    return np.stack([photograph.Lens(width, height, width).intrinsics] * num_views)
 
 
 def views_of(
@@ -116,9 +115,9 @@ def views_of(
 ) -> tuple[photograph.Lens, list[tuple[np.ndarray, photograph.Hits, np.ndarray]]]:
     """The lens; for every view its camera to world, what its rays meet, and the colours ``[h,w,3]`` of that."""
     lens = photograph.Lens(cameras.width, cameras.height, float(cameras.Ks[0, 0, 0]))
-    assert np.allclose(cameras.Ks.numpy(), lens.intrinsics)
+    assert np.allclose(cameras.Ks, lens.intrinsics)
     packed, actual = shapes.pack([surface.shape for surface in surfaces]), []
-    for viewmat in cameras.viewmats.double().numpy():
+    for viewmat in cameras.viewmats.astype(np.float64):
         c2w = np.linalg.inv(viewmat)
         hits = photograph.trace(packed, c2w, lens, 1)
         assert (hits.ids >= 0).all(), "every ray must meet a surface"
@@ -177,15 +176,12 @@ def make_scene(
         for image, (c2w, hits, _) in zip(images, actual, strict=True)
     ]
     gaussians = Gaussians.concat(parts)
-    means = gaussians.means.double()
+    means = gaussians.means.astype(np.float64)
     if not noise:  # exactly on the surfaces, so that what is equal is so in float64
-        means = torch.from_numpy(
-            np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in actual])
-        )
+        means = np.concatenate([world_points(h.depth, c2w, lens).reshape(-1, 3) for c2w, h, _ in actual])
     gaussians = nudged(replace(gaussians, means=means))
-    valid = torch.ones((len(cameras), cameras.height, cameras.width), dtype=torch.bool)
-    pictures = torch.from_numpy(np.stack(images)) if photos else None
-    return PixelScene(gaussians, cameras, pictures, valid, names(len(cameras)))
+    valid = np.ones((len(cameras), cameras.height, cameras.width), bool)
+    return PixelScene(gaussians, cameras, np.stack(images) if photos else None, valid, names(len(cameras)))
 
 
 def names(count: int) -> tuple[str, ...]:
@@ -202,36 +198,35 @@ def take_views(scene: PixelScene, order: Sequence[int]) -> PixelScene:
 
 def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Gaussians:
     """Gaussians after x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
-    turn, offset = torch.from_numpy(rotation).double(), torch.from_numpy(shift).double()
+    turns = rotation @ quat_to_rotmat(gaussians.quats.astype(np.float64))
     return replace(
         gaussians,
-        means=factor * (gaussians.means.double() @ turn.T) + offset,
-        quats=rotmat_to_quat(turn @ quat_to_rotmat(gaussians.quats.double())).float(),
-        scales=gaussians.scales * factor,
+        means=factor * (gaussians.means.astype(np.float64) @ rotation.T) + shift,
+        quats=rotmat_to_quat(turns).astype(np.float32),
+        scales=gaussians.scales * float(factor),
     )
 
 
 def move(scene: PixelScene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> PixelScene:
     """The scene with its cameras after the same."""
-    turn, offset = torch.from_numpy(rotation).double(), torch.from_numpy(shift).double()
-    viewmats = scene.cameras.viewmats.clone()
-    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
-    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ offset
+    viewmats = scene.cameras.viewmats.copy()
+    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ rotation.T
+    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ shift
     gaussians = move_gaussians(scene.gaussians, rotation, factor, shift)
     return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
-def rotmat_to_quat(rotmats: Tensor) -> Tensor:
+def rotmat_to_quat(rotmats: np.ndarray) -> np.ndarray:
     """``[...,4]`` wxyz of rotations ``[...,3,3]``, through the eigenvector of the largest eigenvalue (Bar-Itzhack)."""
     r = rotmats
-    k = torch.zeros(*r.shape[:-2], 4, 4, dtype=r.dtype)
+    k = np.zeros((*r.shape[:-2], 4, 4), r.dtype)
     k[..., 0, 0] = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
     for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         k[..., 0, i + 1] = k[..., i + 1, 0] = r[..., m, j] - r[..., j, m]
         k[..., i + 1, i + 1] = r[..., i, i] - r[..., j, j] - r[..., m, m]
         k[..., i + 1, j + 1] = k[..., j + 1, i + 1] = r[..., i, j] + r[..., j, i]
-    quats = torch.linalg.eigh(k).eigenvectors[..., -1]
-    return torch.where(quats[..., :1] < 0, -quats, quats)
+    quats = np.linalg.eigh(k).eigenvectors[..., -1]
+    return np.where(quats[..., :1] < 0, -quats, quats)
 
 
 def random_rotation(seed: int) -> np.ndarray:
@@ -242,24 +237,23 @@ def random_rotation(seed: int) -> np.ndarray:
 def images_of(gaussians: Gaussians, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Images ``[c,h,w,3]`` and alphas ``[c,h,w]`` over black, float64."""
     drawn = render(gaussians, cameras)
-    return drawn.images.double().numpy(), drawn.alphas[..., 0].double().numpy()
+    return drawn.images.astype(np.float64), drawn.alphas[..., 0].astype(np.float64)
 
 
 def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
     """All parameters off by some of what a fit may move them."""
-    rng = torch.Generator().manual_seed(seed)
+    rng = np.random.default_rng(seed)
 
-    def noise(like: torch.Tensor, sigma: float) -> torch.Tensor:
-        return size * sigma * torch.randn(like.shape, generator=rng)
+    def noise(like: np.ndarray, sigma: float) -> np.ndarray:
+        return (size * sigma * rng.normal(size=like.shape)).astype(np.float32)
 
-    unit = gaussians.scales.amax(1, keepdim=True)
-    quats = gaussians.quats + noise(gaussians.quats, 0.1)
+    unit = gaussians.scales.max(1, keepdims=True)
     return replace(
         gaussians,
         means=gaussians.means + unit * noise(gaussians.means, 0.3),
-        quats=quats / quats.norm(dim=1, keepdim=True),
-        scales=gaussians.scales * noise(gaussians.scales, 0.3).exp(),
-        opacities=(gaussians.opacities + noise(gaussians.opacities, 0.1)).clamp(0.1, 0.95),
+        quats=normalize(gaussians.quats + noise(gaussians.quats, 0.1)),
+        scales=gaussians.scales * np.exp(noise(gaussians.scales, 0.3)),
+        opacities=(gaussians.opacities + noise(gaussians.opacities, 0.1)).clip(0.1, 0.95),
         sh0=gaussians.sh0 + noise(gaussians.sh0, 0.1) / SH_C0,
     )
 
@@ -268,9 +262,9 @@ def self_made(degree: int, views: int = 3) -> tuple[PixelScene, Gaussians]:
     """A scene whose photos show exactly these Gaussians."""
     scene = make_scene(room(), arc(views, 48, 36), degree=degree)
     gaussians = plain(scene, superpixels="8%")
-    gaussians = replace(gaussians, means=gaussians.means.float(), scales=1.2 * gaussians.scales)
+    gaussians = replace(gaussians, means=gaussians.means.astype(np.float32), scales=1.2 * gaussians.scales)
     images = images_of(gaussians, scene.cameras)[0].clip(0, 1)
-    return replace(scene, images=torch.from_numpy(images).float()), gaussians
+    return replace(scene, images=images.astype(np.float32)), gaussians
 
 
 def pair_of(scene: PixelScene) -> tuple[Photos, Photos]:
@@ -289,7 +283,7 @@ def psnr_of(gaussians: Gaussians, scene: PixelScene) -> float:
     """PSNR (dB) over all views of a scene with photos."""
     assert scene.images is not None
     image = np.clip(images_of(gaussians, scene.cameras)[0], 0, 1)
-    return float(-10 * np.log10(((image - scene.images.double().numpy()) ** 2).mean()))
+    return float(-10 * np.log10(((image - scene.images.astype(np.float64)) ** 2).mean()))
 
 
 def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
@@ -309,27 +303,26 @@ def plain(scene: PixelScene, **settings: Any) -> Gaussians:
 
 def identical(a: Gaussians, b: Gaussians) -> bool:
     """To the last bit."""
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
 
 
 def assert_invariants(gaussians: Gaussians, scene: PixelScene) -> None:
     """What must hold of the Gaussians of every compact scene."""
     for name in FIELDS:
-        assert torch.isfinite(getattr(gaussians, name)).all(), name
+        assert np.isfinite(getattr(gaussians, name)).all(), name
     assert (gaussians.opacities > 0).all()
     assert (gaussians.opacities < 1).all()
     assert (gaussians.scales > 0).all()
-    assert torch.allclose(gaussians.quats.norm(dim=1), torch.ones(len(gaussians)), atol=1e-5)
-    covars = covariances(gaussians.quats.double(), gaussians.scales.double())
-    smallest = torch.linalg.eigvalsh(covars)[:, 0] if len(gaussians) else torch.zeros(0)
-    assert (smallest >= -1e-9 * covars.diagonal(dim1=1, dim2=2).sum(1)).all()
+    np.testing.assert_allclose(np.linalg.norm(gaussians.quats, axis=1), 1, atol=1e-5)
+    covars = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
+    assert (np.linalg.eigvalsh(covars)[:, 0] >= -1e-9 * np.trace(covars, axis1=1, axis2=2)).all()
     assert len(gaussians) <= int(scene.valid.sum())
     if (scene.gaussians.opacities[scene.valid.reshape(-1)] > 1 / 255).all():
         assert len(gaussians) >= 1
     assert gaussians.sh_degree <= scene.gaussians.sh_degree
     drawn = render(gaussians, scene.cameras)
-    assert torch.isfinite(drawn.images).all()
-    assert torch.isfinite(drawn.alphas).all()
+    assert np.isfinite(drawn.images).all()
+    assert np.isfinite(drawn.alphas).all()
 
 
 def assert_consistent(report: CompactReport, scene: PixelScene, gaussians: Gaussians) -> None:
@@ -351,10 +344,9 @@ def assert_same_set(one: Gaussians, other: Gaussians, *, atol: float, unit: floa
 
 
 def _rows(gaussians: Gaussians, unit: float) -> np.ndarray:
-    covars = covariances(gaussians.quats.double(), gaussians.scales.double() / unit).flatten(1)
-    columns = [gaussians.means.double() / unit, covars, gaussians.opacities.double()[:, None]]
-    columns += [SH_C0 * gaussians.sh0.double().flatten(1), SH_C0 * gaussians.shN.double().flatten(1)]
-    return torch.cat(columns, 1).numpy()
+    means, quats, scales, opacities, sh0, shN = (getattr(gaussians, name).astype(np.float64) for name in FIELDS)
+    columns = (means / unit, covariances(quats, scales / unit), opacities, SH_C0 * sh0, SH_C0 * shN)
+    return np.concatenate([column.reshape(len(gaussians), math.prod(column.shape[1:])) for column in columns], 1)
 
 
 def make_features(
@@ -370,25 +362,28 @@ def make_features(
         opacities: ``[g]`` or one.
         degree: Of the harmonics, zero above degree 0.
     """
-    means = torch.as_tensor(np.asarray(means), dtype=torch.float32)
+    means = np.asarray(means, np.float32)
     g = len(means)
-    scales = torch.as_tensor(np.asarray(sizes), dtype=torch.float32)
-    scales = scales[:, None].expand(g, 3) if scales.shape == (g,) else scales.expand(g, 3)
-    opacity = torch.as_tensor(np.asarray(opacities), dtype=torch.float32).expand(g)
+
+    def full(values: Any, *shape: int) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, np.float32), shape).copy()
+
+    scales = full(np.asarray(sizes)[:, None] if np.shape(sizes) == (g,) else sizes, g, 3)
+    opacity = full(opacities, g)
     return FeatureGaussians(
         means=means,
-        covars=torch.diag_embed(scales**2),
-        weights=opacity.clone(),
-        masses=opacity * scales.prod(1) * (2 * np.pi) ** 1.5,
-        extinctions=-torch.log1p(-opacity) * scales.sort(1).values[:, 1:].prod(1),
-        gains=torch.ones(g),
-        spreads=torch.ones(g),
-        sh0=((torch.as_tensor(np.asarray(colors), dtype=torch.float32).expand(g, 3) - 0.5) / SH_C0)[:, None],
-        shN=torch.zeros(g, (degree + 1) ** 2 - 1, 3),
+        covars=scales[:, :, None] ** 2 * np.eye(3, dtype=np.float32),
+        weights=opacity,
+        masses=opacity * scales.prod(1) * (2 * math.pi) ** 1.5,
+        extinctions=-np.log1p(-opacity) * np.sort(scales, 1)[:, 1:].prod(1),
+        gains=np.ones(g, np.float32),
+        spreads=np.ones(g, np.float32),
+        sh0=(full(colors, g, 3)[:, None] - 0.5) / SH_C0,
+        shN=np.zeros((g, (degree + 1) ** 2 - 1, 3), np.float32),
         footprints=scales.mean(1),
-        views=torch.arange(g) if views is None else torch.as_tensor(np.asarray(views)),
-        backing=torch.zeros(g, dtype=torch.bool),
-        starts=torch.arange(g + 1),
-        members=torch.arange(g),
-        latents=torch.zeros(g, 0),
+        views=np.arange(g) if views is None else np.asarray(views),
+        backing=np.zeros(g, bool),
+        starts=np.arange(g + 1),
+        members=np.arange(g),
+        latents=np.zeros((g, 0), np.float32),
     )

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import load_file, save_file
-from torch import Tensor
+import numpy as np
+from safetensors.numpy import load_file, save_file
 
 Spoil = Callable[[Path], Any]
 
@@ -48,22 +48,22 @@ def without(name: str) -> Spoil:
     return spoil
 
 
-def with_tensor(name: str, change: Callable[[Tensor], Tensor] | None) -> Spoil:
+def with_array(name: str, change: Callable[[np.ndarray], np.ndarray] | None) -> Spoil:
     def spoil(path: Path) -> None:
-        (form, said), tensors = entry(path), load_file(path)
-        tensor = tensors.pop(name)
+        (form, said), arrays = entry(path), load_file(path)
+        array = arrays.pop(name)
         if change is not None:
-            tensors[name] = change(tensor)
-        save_file(tensors, path, {form: json.dumps(said)})
+            arrays[name] = np.ascontiguousarray(change(array))  # as safetensors takes it to be
+        save_file(arrays, path, {form: json.dumps(said)})
 
     return spoil
 
 
-def filled(value: float) -> Callable[[Tensor], Tensor]:
-    def change(tensor: Tensor) -> Tensor:
-        tensor = tensor.clone()
-        tensor.view(-1)[len(tensor.view(-1)) // 2] = value
-        return tensor
+def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(array: np.ndarray) -> np.ndarray:
+        array = array.copy()
+        array.flat[array.size // 2] = value
+        return array
 
     return change
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.assign import assign_members
@@ -52,15 +50,15 @@ def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
     return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
 
 
-def most_important(importance: Tensor | np.ndarray, count: int) -> Tensor:
+def most_important(importance: np.ndarray, count: int) -> np.ndarray:
     """Indices, rising, of the ``count`` most important Gaussians, or all; of equal ones the first are kept.
 
     ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
     """
     if count < 0:
         raise ValueError(f"count: expected at least 0, got {count}")
-    values = torch.as_tensor(importance).double().nan_to_num(nan=-torch.inf, neginf=-torch.inf)
-    return torch.sort(torch.argsort(values, descending=True, stable=True)[:count]).values
+    order = np.argsort(-np.nan_to_num(importance, nan=-np.inf, neginf=-np.inf), kind="stable")
+    return np.sort(order[:count])
 
 
 def merge_groups(

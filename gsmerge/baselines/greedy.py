@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsmerge.baselines.baseline import own_gaussians
@@ -64,25 +63,26 @@ def log_determinants(covars: Floats) -> Floats:
 
 def cloud_of(gaussians: Gaussians) -> Cloud:
     """Moments and masses of some Gaussians; flat ones get a little thickness."""
-    scales = gaussians.scales.double()
-    scales = torch.maximum(scales, MIN_FLATNESS * scales.amax(1, keepdim=True).clamp(min=1e-12))
-    full = covariances(gaussians.quats.double(), scales).numpy()
+    scales = gaussians.scales.astype(np.float64)
+    scales = np.maximum(scales, MIN_FLATNESS * scales.max(1, keepdims=True).clip(1e-12))
+    full = covariances(gaussians.quats.astype(np.float64), scales)
     covars = np.stack([full[:, i, j] for i, j in UPPER], 1)
-    opacities = gaussians.opacities.double().numpy().clip(MIN_OPACITY, 1)
-    sh = torch.cat([gaussians.sh0, gaussians.shN], 1).reshape(len(gaussians), -1).float().numpy()
-    means = gaussians.means.double().numpy()
-    return Cloud(means, covars, log_determinants(covars), opacities * area(scales.numpy()), sh)
+    opacities = gaussians.opacities.astype(np.float64).clip(MIN_OPACITY, 1)
+    sh = np.concatenate([gaussians.sh0, gaussians.shN], 1, dtype=np.float32)
+    sh = sh.reshape(len(sh), 3 * sh.shape[1])
+    means = gaussians.means.astype(np.float64)
+    return Cloud(means, covars, log_determinants(covars), opacities * area(scales), sh)
 
 
 def gaussians_of(cloud: Cloud) -> Gaussians:
     """Back again: opacity is mass over area, at most just below 1."""
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
-    sh = torch.from_numpy(cloud.sh.reshape(len(cloud), -1, 3))
+    sh = cloud.sh.reshape(len(cloud), -1, 3)
     return Gaussians(
-        means=torch.from_numpy(cloud.means).float(),
-        quats=torch.from_numpy(quats).float(),
-        scales=torch.from_numpy(scales).float(),
-        opacities=torch.from_numpy(np.minimum(cloud.masses / area(scales), MAX_OPACITY)).float(),
+        means=cloud.means.astype(np.float32),
+        quats=quats.astype(np.float32),
+        scales=scales.astype(np.float32),
+        opacities=np.minimum(cloud.masses / area(scales), MAX_OPACITY).astype(np.float32),
         sh0=sh[:, :1],
         shN=sh[:, 1:],
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from gsmerge.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
 from gsmerge.render import contributions, plan_view, prepare
@@ -66,7 +65,7 @@ def prune_by_contribution(prepared: PreparedScene, count: int, log: RunLog) -> G
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """``[n]`` float64 blending weights summed over the pixels of all views; the same on any number of threads."""
     splats = prepare(gaussians)
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> np.ndarray:
         sums, _ = contributions(plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
@@ -93,7 +92,7 @@ def merge_blocks(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     height, width = scene.cameras.height, scene.cameras.width
     with log.stage("segment"):
         counts = view_shares(count, len(scene), height * width)
-        labels = torch.from_numpy(np.stack([grid_labels(height, width, own) for own in counts]))
+        labels = np.stack([grid_labels(height, width, own) for own in counts])
     return merge_groups(prepared, Groups(labels, tuple(counts)), log)
 
 
@@ -109,4 +108,4 @@ def match_moments(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians
     with log.stage("segment"):
         views = range(len(scene))
         labels = parallel_map(lambda view: superpixels(prepared.pictures[view], counts[view], PAPER_SUPERPIXELS), views)
-    return merge_groups(prepared, Groups(torch.stack(labels), tuple(counts)), log, rule="paper")
+    return merge_groups(prepared, Groups(np.stack(labels), tuple(counts)), log, rule="paper")

@@ -8,9 +8,9 @@ voxels, so the count is met from below.
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
-import torch
 
 from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.runtime.run_log import RunLog
@@ -53,7 +53,9 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     Rotations are averaged whatever the sign of their quaternions (Markley et al. 2007).
     """
     _, cells = np.unique(keys, return_inverse=True)
-    opacities = gaussians.opacities.double().numpy()
+    means, quats, scales, opacities, sh0, shN = (
+        getattr(gaussians, f.name).astype(np.float64) for f in fields(Gaussians)
+    )
     weights = np.exp(opacities)
     count = int(cells.max(initial=-1)) + 1
     total = np.bincount(cells, weights, count)
@@ -64,24 +66,23 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
         return np.stack(columns, 1).reshape(count, *values.shape[1:]) if columns else values[:count]
 
     bounded = opacities.clip(MIN_OPACITY, 1 - MIN_OPACITY)
-    quats = gaussians.quats.double().numpy()
     _, axes = np.linalg.eigh(mean(quats[:, :, None] * quats[:, None]))
     arrays = (
-        mean(gaussians.means.double().numpy()),
+        mean(means),
         axes[:, :, -1],
-        np.exp(mean(np.log(gaussians.scales.double().numpy().clip(MIN_SCALE)))),
+        np.exp(mean(np.log(scales.clip(MIN_SCALE)))),
         1 / (1 + np.exp(-mean(np.log(bounded / (1 - bounded))))),
-        mean(gaussians.sh0.double().numpy()),
-        mean(gaussians.shN.double().numpy()),
+        mean(sh0),
+        mean(shN),
     )
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array)).float() for array in arrays))
+    return Gaussians(*(array.astype(np.float32) for array in arrays))
 
 
 def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
     """At most ``count`` voxels, and hardly fewer."""
     gaussians = own_gaussians(prepared.scene)
     with log.stage("reduce"):
-        means = gaussians.means.double().numpy()
+        means = gaussians.means.astype(np.float64)
         size = voxel_size(means, count)
         log.choices["voxel_size"] = size
         return fuse(gaussians, voxel_keys(means, size))

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from gsmerge.budget import AUTO, BudgetOptions, exact_count
 from gsmerge.encoded.divide import pick_children
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians, gaussian_members
-from gsmerge.networks import NetworkContext, decode_with_group_features, make_group_features
 from gsmerge.render.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import MAX_CHILDREN
@@ -72,7 +70,7 @@ def _group_budget(encoded: Encoded, budget: int | str) -> int:
 
 def _distribute(encoded: Encoded, total: int) -> DecodePlan:
     """A number of Gaussians, given to the groups where they help most."""
-    order, extra = encoded.division.growth_order.numpy(), max(0, total - len(encoded))
+    order, extra = encoded.division.growth_order, max(0, total - len(encoded))
     counts = 1 + np.bincount(order[:extra], minlength=len(encoded))
     if extra <= len(order):
         return DecodePlan(counts, 0.0)
@@ -97,7 +95,7 @@ def decode_scene(
         UsageError: If K is more than was encoded, the budget below the number of groups, or both are given.
     """
     plan, s = plan_decode(encoded, k=k, budget=budget), encoded.settings
-    with use_threads(threads), torch.no_grad():
+    with use_threads(threads):
         gaussians, _ = children_of(encoded, plan.counts)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
         if plan.min_contribution > 0:
@@ -111,10 +109,12 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
     """At most ``counts [g]`` canonical Gaussians of each group, however faint, and the group of each, rising."""
     features, heads = encoded.features, encoded.heads
     rows, parents = pick_children(encoded.division, counts)
-    gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[torch.from_numpy(rows)]
+    gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[rows]
     if heads is not None:
+        from gsmerge.networks import NetworkContext, decode_with_group_features, make_group_features
+
         group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))
-        networks = NetworkContext(heads.networks, nothing, encoded.cameras)
-        gaussians = decode_with_group_features(gaussians, parents, features, group_features, networks)
+        networks, children = NetworkContext(heads.networks, nothing, encoded.cameras), gaussians.to("cpu")
+        gaussians = decode_with_group_features(children, parents, features, group_features, networks).numpy()
     return gaussians, parents

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from gsmerge.encoded.encoded import Division
 from gsmerge.kernels.gaussians.bisect import gather_groups
@@ -15,8 +14,8 @@ from gsmerge.types import FeatureGaussians, Gaussians
 def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: Rule) -> Division:
     """All children of every group, up to ``max_k`` of each; the backing layer is never divided."""
     count = len(features)
-    rows = np.flatnonzero(~features.backing.numpy())
-    sizes = np.diff(features.starts.numpy())[rows][:, None]
+    rows = np.flatnonzero(~features.backing)
+    sizes = np.diff(features.starts)[rows][:, None]
     none = np.zeros(0, np.int64)
     parts = [pool_children(features, members, np.zeros(1, np.int64), none, none, rule)]
     owners, slots, uniform, uniform_children = [none], [none], none, parts[0]
@@ -40,13 +39,13 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: R
         slots.append(slot)
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")  # of one group, in the order of the splits
-    halves = Gaussians.concat(parts)[torch.from_numpy((2 * order[:, None] + np.arange(2)).ravel())]
+    halves = Gaussians.concat(parts)[(2 * order[:, None] + np.arange(2)).ravel()]
     return Division(
-        splits=torch.from_numpy(np.bincount(owner, minlength=count).astype(np.uint8)),
-        slots=torch.from_numpy(np.concatenate(slots)[order].astype(np.uint8)),
-        uniform=torch.from_numpy(uniform),
+        splits=np.bincount(owner, minlength=count).astype(np.uint8),
+        slots=np.concatenate(slots)[order].astype(np.uint8),
+        uniform=uniform,
         children=Gaussians.concat([halves, uniform_children]),
-        growth_order=torch.from_numpy(deal_order(features, members, max_k)),
+        growth_order=deal_order(features, members, max_k),
     )
 
 
@@ -56,8 +55,8 @@ def pick_children(division: Division, counts: np.ndarray) -> tuple[np.ndarray, n
     Returns:
         ``[n]`` rows of the g groups themselves (K = 1) followed by the division's children, and ``[n]`` groups.
     """
-    splits, slots = division.splits.numpy().astype(np.int64), division.slots.numpy().astype(np.int64)
-    count, uniform = len(splits), division.uniform.numpy()
+    splits, slots = division.splits.astype(np.int64), division.slots.astype(np.int64)
+    count, uniform = len(splits), division.uniform
     sizes, first = np.minimum(counts, splits + 1), np.cumsum(splits) - splits
     max_size = int(sizes.max(initial=1))
     table = np.zeros((count, max_size), np.int64)

@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from gsmerge import __version__
 from gsmerge.budget import AUTO
 from gsmerge.encoded.divide import divide_all
@@ -22,7 +20,7 @@ from gsmerge.stages.decode import MAX_CHILDREN, merged_count
 from gsmerge.stages.group import knee_count
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.prepare import PreparedScene, prepare, require_children
-from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.types import PixelScene, UnalignedScene, as_array
 
 DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for
 
@@ -42,7 +40,7 @@ def encode_scene(
     superpixels of either, or Gaussians that no view sees are kept: these are merged for one K.
 
     Args:
-        scene: As of :func:`gsmerge.compact`.
+        scene: As of :func:`gsmerge.compact`; of tensors, too, arrays are made.
         options: Settings of all stages; those of the fit do not matter. None: the defaults.
         max_k: Most Gaussians of a group that can be decoded, 1 to 8: more take more space. None: 4, or 8 where ``k``
             is larger or a number of Gaussians is asked for (budgets, unaligned scenes).
@@ -58,8 +56,8 @@ def encode_scene(
     if max_k is not None and max_k < options.decode.max_k:
         raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     log = RunLog(progress)
-    with use_threads(options.threads), torch.no_grad():
-        prepared = prepare(scene, options, log)
+    with use_threads(options.threads):
+        prepared = prepare(scene.numpy(), options, log)
         require_children("max k", max_k or 1, prepared.checkpoint)
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):
@@ -99,7 +97,7 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
     heads = None
     if networks is not None:
         group_features = networks.describe(features)
-        heads = StoredHeads(networks.networks, group_features.views, group_features.group)
+        heads = StoredHeads(networks.networks, as_array(group_features.views), as_array(group_features.group))
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, max_k, options.encode.rule),

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from gsmerge.networks import Networks
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+
+if TYPE_CHECKING:
+    from gsmerge.networks import Networks
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +23,12 @@ class Division:
     K - 1 with one of them replaced by its halves. A third of the members' bytes, and nothing to pool when decoding.
     """
 
-    splits: Tensor  # [g] uint8, times that each group is split
-    slots: Tensor  # [s] uint8, which child, counted in order from 0, each split replaces; group by group
+    splits: np.ndarray  # [g] uint8, times that each group is split
+    slots: np.ndarray  # [s] uint8, which child, counted in order from 0, each split replaces; group by group
     # [w] int64, rising: the groups whose members are all alike. Asked for more, they give one child.
-    uniform: Tensor
+    uniform: np.ndarray
     children: Gaussians  # 2s + w Gaussians, canonical: two for each split, then one for each of `uniform`
-    growth_order: Tensor  # [d] int64, the group that each further Gaussian goes to, where it helps most first
+    growth_order: np.ndarray  # [d] int64, the group that each further Gaussian goes to, where it helps most first
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +36,8 @@ class StoredHeads:
     """Networks whose decoder heads correct the children, and what they know of the groups."""
 
     networks: Networks  # All of a checkpoint's networks
-    views: Tensor  # [g] int64, the view that each group's frame belongs to
-    group: Tensor  # [g,n] the numbers that describe each group
+    views: np.ndarray  # [g] int64, the view that each group's frame belongs to
+    group: np.ndarray  # [g,n] the numbers that describe each group
 
 
 @dataclass(frozen=True)
@@ -113,5 +114,4 @@ class Encoded(StoredScene):
 
 def without_members(features: FeatureGaussians) -> FeatureGaussians:
     """The Feature Gaussians without their members."""
-    starts = torch.zeros(len(features) + 1, dtype=torch.int64)
-    return replace(features, starts=starts, members=torch.zeros(0, dtype=torch.int64))
+    return replace(features, starts=np.zeros(len(features) + 1, np.int64), members=np.zeros(0, np.int64))

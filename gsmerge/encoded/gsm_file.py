@@ -1,8 +1,8 @@
 """The ``.gsm`` container, of encoded scenes and of states, and the encoded scene in it.
 
 A safetensors file with one metadata entry, whose name says the kind of content and whose text is a header in JSON.
-Nothing in a file is ever executed; every tensor and every entry is checked before it is used. Within one major schema
-tensors and entries are only ever added, and unknown ones are ignored. Keys that differ from the names in the code are
+Nothing in a file is ever executed; every array and every entry is checked before it is used. Within one major schema
+arrays and entries are only ever added, and unknown ones are ignored. Keys that differ from the names in the code are
 in SETTING_KEYS, and these: division.whole (Division.uniform), division.deals (Division.growth_order), features.solved
 (GroupSet.fitted_sh0), features.held (GroupSet.color_precision), kept (Gaussians that no view sees).
 """
@@ -11,27 +11,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from safetensors.numpy import save
 
 from gsmerge import __version__
 from gsmerge.encoded.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_file
-from gsmerge.networks.checkpoint import build_networks
-from gsmerge.networks.tokens import GROUP
 from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, as_tensor
 
 SCHEMA, MINOR = 1, 0  # files of a larger schema cannot be read; minor: what was added since the schema's first files
 SUFFIX = ".gsm"
@@ -67,11 +63,11 @@ def write_gsm(
     features: FeatureGaussians,
     children: tuple[str, Gaussians],
     entries: Mapping[str, Any],
-    tensors: Mapping[str, Tensor],
+    arrays: Mapping[str, np.ndarray],
     *,
     overwrite: bool,
 ) -> None:
-    """Write a ``.gsm`` file: what both kinds have, and header ``entries`` and ``tensors`` by key of one kind.
+    """Write a ``.gsm`` file: what both kinds have, and header ``entries`` and ``arrays`` by key of one kind.
 
     ``children``: the prefix of the children's keys, and the children.
     """
@@ -87,16 +83,20 @@ def write_gsm(
         **entries,
     }
     kept = children[1][:0] if stored.kept is None else stored.kept
-    content = {f"features.{name}": getattr(features, name).float() for name in FEATURE_COLUMNS}
-    content |= {"features.views": features.views.int(), "features.backing": features.backing.to(torch.uint8)}
-    content |= {"cameras.viewmats": cameras.viewmats.double(), "cameras.Ks": cameras.Ks.double()}
-    content |= {"frame.origin": frame.origin.double()}
+    content = {f"features.{name}": _float32(getattr(features, name)) for name in FEATURE_COLUMNS}
+    content |= {"features.views": features.views.astype(np.int32)}
+    content |= {"features.backing": features.backing.astype(np.uint8)}
+    content |= {"cameras.viewmats": cameras.viewmats.astype(np.float64), "cameras.Ks": cameras.Ks.astype(np.float64)}
+    content |= {"frame.origin": frame.origin.astype(np.float64)}
     for prefix, gaussians in (children, ("kept", kept)):
-        content |= {f"{prefix}.{f.name}": getattr(gaussians, f.name).float() for f in fields(Gaussians)}
-    # Cloned, as safetensors refuses shared memory; one entry, as the order of several is not fixed.
-    data = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in (content | dict(tensors)).items()}
+        content |= {f"{prefix}.{f.name}": _float32(getattr(gaussians, f.name)) for f in fields(Gaussians)}
+    data = {name: np.ascontiguousarray(array) for name, array in (content | dict(arrays)).items()}
     with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(save(data, {kind: json.dumps(header)}))
+        temporary.write_bytes(save(data, {kind: json.dumps(header)}))  # one entry: the order of several is not fixed
+
+
+def _float32(values: Array) -> np.ndarray:
+    return as_array(values).astype(np.float32, copy=False)
 
 
 def save_encoded(
@@ -119,17 +119,17 @@ def save_encoded(
         "about": {**encoded.about, **({} if source is None else {"source": dict(source)})},
         "precision": "float32",  # of the networks' arithmetic: earlier versions had others and expect the key
     }
-    tensors = {
+    arrays = {
         "division.splits": division.splits,
         "division.slots": division.slots,
-        "division.whole": division.uniform.int(),
-        "division.deals": division.growth_order.int(),
+        "division.whole": division.uniform.astype(np.int32),
+        "division.deals": division.growth_order.astype(np.int32),
     }
     if heads is not None:
-        tensors |= {"heads.views": heads.views.int(), "heads.group": heads.group.float()}
-        tensors |= {f"networks.{name}": tensor for name, tensor in heads.networks.state_dict().items()}
+        arrays |= {"heads.views": heads.views.astype(np.int32), "heads.group": _float32(heads.group)}
+        arrays |= {f"networks.{name}": as_array(tensor) for name, tensor in heads.networks.state_dict().items()}
     children = "division", division.children
-    write_gsm(path, ENCODED, encoded, encoded.features, children, entries, tensors, overwrite=overwrite)
+    write_gsm(path, ENCODED, encoded, encoded.features, children, entries, arrays, overwrite=overwrite)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,57 +139,54 @@ class GsmFile:
     path: Path
     kind: str  # `ENCODED` or `STATE`
     header: Mapping[str, Any]  # Its header, each entry of its type
-    tensors: Mapping[str, Tensor]
+    arrays: Mapping[str, np.ndarray]
 
     def error(self, problem: str) -> SceneError:
         """That the file is damaged, and what to do."""
         return SceneError(self.path, problem, REMEDY)
 
-    def tensor(self, key: str, dtype: torch.dtype, *shape: int | None) -> Tensor:
-        """A tensor of a type and shape (None: any size), finite."""
-        tensor = self.tensors.get(key)
-        expected = f"{key}: expected {str(dtype).removeprefix('torch.')} {['n' if n is None else n for n in shape]}"
-        if tensor is None:
+    def array(self, key: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
+        """An array of a type and shape (None: any size), finite."""
+        array = self.arrays.get(key)
+        expected = f"{key}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
+        if array is None:
             raise self.error(f"{expected}, found none")
-        same_rank = tensor.dtype == dtype and tensor.ndim == len(shape)
-        if not same_rank or any(n is not None and n != size for n, size in zip(shape, tensor.shape, strict=True)):
-            raise self.error(f"{expected}, found {str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}")
-        if dtype.is_floating_point and not bool(torch.isfinite(tensor).all()):
+        same_rank = array.dtype == dtype and array.ndim == len(shape)
+        if not same_rank or any(n is not None and n != size for n, size in zip(shape, array.shape, strict=True)):
+            raise self.error(f"{expected}, found {array.dtype} {list(array.shape)}")
+        if not np.isfinite(array).all():
             raise self.error(f"{key}: expected finite numbers, found others")
-        return tensor
+        return array
 
     def features(self) -> FeatureGaussians:
         """Feature Gaussians without their members."""
-        g = len(self.tensor("features.means", torch.float32, None, 3))
+        g = len(self.array("features.means", np.float32, None, 3))
         shapes: dict[str, tuple[int | None, ...]] = {
             "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (None, 3), "latents": (None,),
         }  # fmt: skip
         return FeatureGaussians(
-            **{
-                name: self.tensor(f"features.{name}", torch.float32, g, *shapes.get(name, ()))
-                for name in FEATURE_COLUMNS
-            },
-            views=self.tensor("features.views", torch.int32, g).long(),
-            backing=self.tensor("features.backing", torch.uint8, g).bool(),
-            starts=torch.zeros(g + 1, dtype=torch.int64),
-            members=torch.zeros(0, dtype=torch.int64),
+            **{name: self.array(f"features.{name}", np.float32, g, *shapes.get(name, ())) for name in FEATURE_COLUMNS},
+            views=self.array("features.views", np.int32, g).astype(np.int64),
+            backing=self.array("features.backing", np.uint8, g).astype(bool),
+            starts=np.zeros(g + 1, np.int64),
+            members=np.zeros(0, np.int64),
         )
 
     def gaussians(self, prefix: str, count: int | None, num_higher: int) -> Gaussians:
         """``count`` Gaussians (None: any number) with ``num_higher`` bases of higher harmonics."""
-        n = len(self.tensor(f"{prefix}.means", torch.float32, count, 3))
+        n = len(self.array(f"{prefix}.means", np.float32, count, 3))
         shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
-        return Gaussians(*(self.tensor(f"{prefix}.{name}", torch.float32, n, *shape) for name, shape in shapes.items()))
+        return Gaussians(*(self.array(f"{prefix}.{name}", np.float32, n, *shape) for name, shape in shapes.items()))
 
     def common(self, num_higher: int) -> dict[str, Any]:
         """Fields that encoded scenes and states share: kept, frame, cameras."""
         kept = self.gaussians("kept", None, num_higher)
         unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
-        origin = self.tensor("frame.origin", torch.float64, 3)
+        origin = self.array("frame.origin", np.float64, 3)
         if not 0 < unit < float("inf"):
             raise self.error(f"unit: expected a length above 0, found {unit}")
-        viewmats = self.tensor("cameras.viewmats", torch.float64, None, 4, 4)
-        Ks = self.tensor("cameras.Ks", torch.float64, len(viewmats), 3, 3)
+        viewmats = self.array("cameras.viewmats", np.float64, None, 4, 4)
+        Ks = self.array("cameras.Ks", np.float64, len(viewmats), 3, 3)
         if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
             raise self.error(f"expected the size of the views, found {width} x {height}")
         cameras = Cameras(viewmats, Ks, width, height)
@@ -216,17 +213,17 @@ def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
     path = Path(path)
     check_file(path)
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(path, "np") as file:
             known = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
-            metadata, tensors = file.metadata() or {}, {name: file.get_tensor(name) for name in known}
-    except (SafetensorError, OSError, ValueError) as error:
+            metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in known}
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
         reason = str(error).splitlines()[0]
         remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode or extend"
         raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({reason})", remedy) from error
     kind = next((kind for kind in kinds if kind in metadata), None)
     if kind is None:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
-    return GsmFile(path, kind, _read_header(path, metadata[kind], ENTRIES[kind]), tensors)
+    return GsmFile(path, kind, _read_header(path, metadata[kind], ENTRIES[kind]), arrays)
 
 
 def _read_header(path: Path, text: str, entries: Mapping[str, Any]) -> dict[str, Any]:
@@ -251,7 +248,7 @@ def load_encoded(path: str | PathLike[str]) -> Encoded:
     """An encoded scene from a file; nothing in it is ever executed.
 
     Raises:
-        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks a tensor, or holds
+        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
             numbers out of range.
     """
     return read_encoded(read_gsm(path, ENCODED))
@@ -261,11 +258,12 @@ def read_encoded(file: GsmFile) -> Encoded:
     """The encoded scene of a file of that kind."""
     features, settings = file.features(), file.settings()
     common = file.common(features.shN.shape[1])
+    heads = _read_heads(file, features, len(common["cameras"]))
     return Encoded(
-        features=features,
+        features=features if heads is None else replace(features, latents=as_tensor(features.latents)),
         division=_read_division(file, features),
         settings=settings,
-        heads=_read_heads(file, features, len(common["cameras"])),
+        heads=heads,
         about=file.header["about"],
         **common,
     )
@@ -274,22 +272,22 @@ def read_encoded(file: GsmFile) -> Encoded:
 def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
     """The children, with every index within its range."""
     g = len(features)
-    splits, slots = file.tensor("division.splits", torch.uint8, g), file.tensor("division.slots", torch.uint8, None)
-    uniform = file.tensor("division.whole", torch.int32, None)
-    order = file.tensor("division.deals", torch.int32, None)
-    counts, rows = splits.numpy().astype(np.int64), uniform.numpy()
+    splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
+    uniform = file.array("division.whole", np.int32, None)
+    order = file.array("division.deals", np.int32, None)
+    counts = splits.astype(np.int64)
     ok = counts.max(initial=0) < MAX_CHILDREN and counts.sum() == len(slots)
     if ok:
         steps = np.arange(len(slots)) - np.repeat(np.cumsum(counts) - counts, counts)
-        in_order = len(rows) == 0 or bool(rows[0] >= 0 and rows[-1] < g and (np.diff(rows) > 0).all())
-        ok = bool((slots.numpy() <= steps).all()) and in_order and not counts[rows].any()
+        in_order = len(uniform) == 0 or bool(uniform[0] >= 0 and uniform[-1] < g and (np.diff(uniform) > 0).all())
+        ok = bool((slots <= steps).all()) and in_order and not counts[uniform].any()
     if ok and len(order):
         ok = int(order.min()) >= 0 and int(order.max()) < g
-        ok = ok and bool((np.bincount(order.numpy(), minlength=g) <= counts).all())
+        ok = ok and bool((np.bincount(order, minlength=g) <= counts).all())
     if not ok:
         raise file.error("division: expected children that belong to their groups, found others")
     children = file.gaussians("division", 2 * len(slots) + len(uniform), features.shN.shape[1])
-    return Division(splits, slots, uniform.long(), children, order.long())
+    return Division(splits, slots, uniform.astype(np.int64), children, order.astype(np.int64))
 
 
 def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> StoredHeads | None:
@@ -297,13 +295,17 @@ def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> St
     header, prefix = file.header, "networks."
     if header["networks"] is None:
         return None
-    weights = {name.removeprefix(prefix): t for name, t in file.tensors.items() if name.startswith(prefix)}
+    from gsmerge.networks.checkpoint import build_networks
+    from gsmerge.networks.tokens import GROUP
+
+    arrays = {name.removeprefix(prefix): array for name, array in file.arrays.items() if name.startswith(prefix)}
+    weights = {name: as_tensor(array) for name, array in arrays.items()}
     networks = build_networks(file.path, header["networks"], weights, REMEDY)
-    views = file.tensor("heads.views", torch.int32, len(features)).long()
+    views = file.array("heads.views", np.int32, len(features)).astype(np.int64)
     if len(views) and not 0 <= int(views.min()) <= int(views.max()) < num_views:
         raise file.error("heads.views: expected views of the scene, found others")
     latent, expected = features.latents.shape[1], networks.options.latent
     if latent != expected:
         raise file.error(f"features.latents: expected {expected} numbers, as of its networks, found {latent}")
-    group = file.tensor("heads.group", torch.float32, len(features), GROUP)
+    group = file.array("heads.group", np.float32, len(features), GROUP)
     return StoredHeads(networks, views, group)

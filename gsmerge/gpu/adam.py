@@ -91,7 +91,7 @@ def adam_step(state: FitState, gradients: Gradients, options: FitOptions, rates:
 
         launch(state, gradients, options, rates, step)
     else:
-        _step_in_torch(state, gradients, options, rates, step)
+        step_in_torch(state, gradients, options, rates, step)
 
 
 @cache
@@ -100,7 +100,8 @@ def has_triton() -> bool:
     return find_spec("triton") is not None
 
 
-def _step_in_torch(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
+def step_in_torch(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
+    """:func:`adam_step` without Triton."""
     gradient, limits = parameter_gradient(state, gradients, options), options.rates
     energy = gradient * gradient
     for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene

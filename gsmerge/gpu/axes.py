@@ -52,9 +52,8 @@ def _rotate_pair(a: list[list[Tensor]], u: list[list[Tensor]], p: int, q: int) -
 def right_handed_quats(axes: Tensor) -> Tensor:
     """``[g,4]`` unit quaternions wxyz, w at least 0, of orthogonal matrices ``[g,3,3]``.
 
-    In left-handed ones the first axis is turned round.
-
-    Of the four ways to write it (Shepperd 1978), the one that divides by the largest component.
+    In left-handed ones the first axis is turned round. Of the four ways to write it (Shepperd 1978), the one that
+    divides by the largest component.
     """
     signs = torch.ones_like(axes[:, :1])
     signs[:, 0, 0] = torch.where(determinants(axes) < 0, -1.0, 1.0)

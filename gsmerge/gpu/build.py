@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,10 +88,10 @@ class DeviceScene:
             met, and another start that the fit may beat instead.
     """
 
-    def __init__(self, prepared: PreparedScene, device: torch.device, begin: Begin):
-        self.prepared, self.device, self.begin = prepared, device, begin
-        if device.type == "cuda":
-            start_cuda(device)
+    def __init__(self, prepared: PreparedScene, device: torch.device | str, begin: Begin):
+        self.prepared, self.device, self.begin = prepared, torch.device(device), begin
+        if self.device.type == "cuda":
+            start_cuda(self.device)
 
     @cached_property
     def members(self) -> DeviceMembers:
@@ -171,17 +170,14 @@ class DeviceScene:
         return shapes, cut.count, cut.exact
 
     def _segment(self, prepared: PreparedScene, count: int | None, reasons: dict[str, str]) -> Superpixels:
-        options, limits, covered = prepared.options.segment, prepared.limits, False
-        if count is not None:
-            reasons["segment"] = "a number is cut from the region tree"
-        elif not on_device_segment.covers(options):
-            reasons["segment"] = f"segmentation {options.segmentation}"
-        else:
-            covered = True
-        if covered:
+        """Superpixels of every view, by the stage where :mod:`gsmerge.gpu.segment` does not cut them."""
+        options, limits = prepared.options.segment, prepared.limits
+        if count is None and on_device_segment.covers(options):
             each = max(1, int(limits.per_view * limits.share))
             labels = on_device_segment.segment(self.pictures, options, each)
             return Superpixels(labels, (each,) * len(labels), limits.default, exact=False)
+        method = f"segmentation {options.segmentation}"
+        reasons["segment"] = method if count is None else "a number is cut from the region tree"
         made = segment_scene(prepared, count)
         labels = to_device(made.groups.labels, self.device, torch.int64)
         return Superpixels(labels, made.groups.counts, made.count, made.exact)
@@ -196,6 +192,7 @@ class DeviceScene:
         return encode(self.members, rows, torch.searchsorted(first, rows.groups, right=True) - 1)
 
     def _decode_on_cpu(self, prepared: PreparedScene, merged: Features, cut: Superpixels) -> Shapes:
+        """Gaussians by the stage, for what :func:`gsmerge.gpu.decode.covers` leaves out."""
         assert prepared.members is not None
         options = prepared.options
         segmentation = Segmentation(download_groups(cut.labels, cut.counts), None, cut.count, cut.exact)
@@ -211,15 +208,15 @@ class DeviceScene:
         """
         given, scene = prepared.given, prepared.scene
         if gaussians is given.gaussians and len(gaussians) == len(scene.gaussians) and prepared.members is not None:
-            m = self.members
-            shapes = Shapes(m.means, m.quats, m.scales, m.opacities, m.sh0, m.shN)
+            shapes: Shapes = self.members
         else:
             shapes = upload_gaussians(prepared.frame.enter(gaussians), self.device)
         if given.images is scene.images:
             photos = self.photos[0]
         else:
             cameras = prepared.frame.enter_cameras(given.cameras)
-            photos = upload_photos(photos_of(np.asarray(given.images), cameras), self.device)
+            assert given.images is not None
+            photos = upload_photos(photos_of(given.images, cameras), self.device)
         quarter = prepared.options.budget.target_psnr is None
         return photo_psnr(shapes, photos, scored_views(len(photos)), near=NEAR, quarter=quarter)
 

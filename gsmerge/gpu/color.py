@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.gpu.holdout import exposure_gains, holdout_psnr
-from gsmerge.gpu.raster import draw, draw_all, draw_and_transpose, shape_of
+from gsmerge.gpu.raster import draw_all, draw_and_transpose, draw_black, shape_of
 from gsmerge.gpu.scene import DevicePhotos, Shapes
 from gsmerge.stages.fit.color import HOLDOUT, MAX_RETRIES
 from gsmerge.stages.fit.holdout import training_weights
@@ -42,8 +42,7 @@ class _System:
 
     def spread(self, view: int, colors: Tensor) -> Tensor:
         """The matrix of a view times colours ``[n,3]``: an image ``[h,w,3]``."""
-        black = torch.zeros(3, device=colors.device)
-        return draw(shape_of(self.shapes), colors.float(), self.photos, view, black)[0]
+        return draw_black(shape_of(self.shapes), colors.float(), self.photos, view)
 
     def fitted(self, offsets: Tensor) -> Tensor:
         """``[v,h,w,3]`` renders with offsets ``[n,3]`` on the base colours."""

@@ -33,9 +33,10 @@ def fit_gaussians(
     baseline_start: Gaussians | None = None,
     *,
     exact: bool = False,
-    device: torch.device,
+    device: torch.device | str,
 ) -> tuple[Gaussians, FitReport | None]:
     """:func:`gsmerge.stages.fit.fit` on a device: the border of :func:`fit` for callers with core types."""
+    device = torch.device(device)
     pair = upload_photos(photos[0], device), upload_photos(photos[1], device)
     other = None if baseline_start is None else upload_gaussians(baseline_start, device)
     shapes = upload_gaussians(gaussians, device)

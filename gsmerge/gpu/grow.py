@@ -7,12 +7,12 @@ import math
 import torch
 from torch import Tensor
 
-from gsmerge.geometry import quat_to_rotmat
 from gsmerge.gpu.adam import FitState, state_of
 from gsmerge.gpu.holdout import state_colors, state_shape
 from gsmerge.gpu.raster import draw_and_transpose
 from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
+from gsmerge.networks.residuals import quat_to_rotmat
 from gsmerge.stages.fit.grow import DEPTH, OFFSET
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.gpu.adam import FitState
-from gsmerge.gpu.raster import draw, draw_and_transpose, harmonic_colors
+from gsmerge.gpu.raster import draw_and_transpose, draw_black, harmonic_colors
 from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.render.colored import Shape
 from gsmerge.types import SH_C0
@@ -28,8 +28,7 @@ def state_colors(state: FitState, photos: DevicePhotos, view: int) -> Tensor:
 
 def draw_state(state: FitState, photos: DevicePhotos, view: int) -> Tensor:
     """``[h,w,3]`` render of a photo over black."""
-    colors = state_colors(state, photos, view)
-    return draw(state_shape(state), colors, photos, view, torch.zeros(3, device=colors.device))[0]
+    return draw_black(state_shape(state), state_colors(state, photos, view), photos, view)
 
 
 def holdout_score(state: FitState, photos: DevicePhotos, weights: Tensor, min_gain: float) -> float:
@@ -45,7 +44,7 @@ def initial_scores(
 
     See :func:`gsmerge.stages.fit.full.initial_scores`.
     """
-    images, shape = [], (state.means, state.quats, state.scales, state.opacities)
+    images, shape = [], state_shape(state)
     sums, squares = (torch.zeros(len(state), dtype=torch.float64, device=state.x.device) for _ in range(2))
     for view in range(len(photos)):
         image, transpose = draw_and_transpose(shape, state_colors(state, photos, view), photos, view)

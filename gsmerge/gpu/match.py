@@ -33,14 +33,15 @@ def match(features: Features, options: MatchOptions) -> tuple[Tensor, int]:
     if options.method != "none" and len(views) > 1:
         rows = torch.nonzero(features.extinctions > 0)[:, 0]
         if len(rows) > 1:
-            of_rows, num_clusters = _clusters(features, rows, options, len(torch.unique(features.views[rows])))
+            of_rows, num_clusters = _cluster_rows(features, rows, options, len(torch.unique(features.views[rows])))
             clusters[rows] = of_rows
     alone = clusters < 0
     clusters = torch.where(alone, num_clusters + alone.cumsum(0) - 1, clusters)
     return clusters, num_clusters + int(alone.sum())
 
 
-def _clusters(features: Features, rows: Tensor, options: MatchOptions, num_views: int) -> tuple[Tensor, int]:
+def _cluster_rows(features: Features, rows: Tensor, options: MatchOptions, num_views: int) -> tuple[Tensor, int]:
+    """Clusters of some Feature Gaussians by overlap, and their number."""
     means, views = features.means[rows].double(), features.views[rows]
     neighbors = nearest_of_other_views(means, views, options.neighbors)
     scores = overlaps(features, rows, neighbors, options.max_color)
@@ -145,10 +146,10 @@ def leader_clusters(
 def _take(heads: Tensor, own: Tensor, leaders: Tensor, views: Tensor, max_size: int) -> None:
     """Give leaders ``[h]`` and what they take of the free ``own [h,k]``, best first, their leader, in place."""
     leaders[heads] = heads
-    free, of = own >= 0, views[own.clamp_min(0)]
+    free, own_views = own >= 0, views[own.clamp_min(0)]
     # the first free one of a view is taken, or the cluster is full; either way no later one of the view is
     before = torch.ones(own.shape[1], own.shape[1], dtype=torch.bool, device=own.device).tril(-1)
-    repeats = ((of[:, :, None] == of[:, None]) & free[:, None] & before).any(2)
+    repeats = ((own_views[:, :, None] == own_views[:, None]) & free[:, None] & before).any(2)
     takes = free & ~repeats
     takes &= takes.cumsum(1) < max_size
     leaders[own[takes]] = heads[:, None].expand_as(own)[takes]
@@ -186,6 +187,7 @@ def _gather(features: Features, index: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _concat(first: Features, second: Features) -> Features:
+    """The Feature Gaussians of both, one after the other."""
     names = [f.name for f in fields(Features) if f.name != "starts"]
     columns = {name: torch.cat([getattr(part, name) for part in (first, second)]) for name in names}
     return Features(starts=torch.cat([first.starts, first.starts[-1] + second.starts[1:]]), **columns)

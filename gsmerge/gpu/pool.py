@@ -9,10 +9,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from gsmerge.geometry import quat_to_rotmat
 from gsmerge.gpu.runs import Rows, middle_of_runs, owners_of, sum_runs
 from gsmerge.gpu.scene import DeviceMembers, Features
 from gsmerge.kernels.gaussians.pool import CAP, FLOOR, MAX_OPACITY
+from gsmerge.networks.residuals import quat_to_rotmat
 
 ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 AT_ONCE = 1 << 21  # members that are pooled at once: about 1 GB of float64 columns

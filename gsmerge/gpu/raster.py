@@ -46,17 +46,20 @@ def _cameras(photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor, int, int]
     return photos.viewmats[view : view + 1], photos.Ks[view : view + 1], photos.width, photos.height
 
 
-def draw_all(shapes: Shapes, photos: DevicePhotos, colors: Tensor | None = None, *, near: float = NEAR) -> list[Tensor]:
-    """``[h,w,3]`` render of every photo over black, not clipped; with ``colors [n,3]`` in place of the harmonics."""
-    return [draw_shapes(shapes, photos, view, colors, near=near) for view in range(len(photos))]
+def draw_all(shapes: Shapes, photos: DevicePhotos) -> list[Tensor]:
+    """``[h,w,3]`` render of every photo over black, not clipped."""
+    return [draw_shapes(shapes, photos, view) for view in range(len(photos))]
 
 
-def draw_shapes(
-    shapes: Shapes, photos: DevicePhotos, view: int, colors: Tensor | None = None, *, near: float = NEAR
-) -> Tensor:
-    """``[h,w,3]`` render of one photo over black, see :func:`draw_all`."""
-    seen = shown_colors(shapes, photos, view) if colors is None else colors
-    return draw(shape_of(shapes), seen, photos, view, torch.zeros(3, device=seen.device), near=near)[0]
+def draw_shapes(shapes: Shapes, photos: DevicePhotos, view: int, *, near: float = NEAR) -> Tensor:
+    """``[h,w,3]`` render of one photo over black, not clipped."""
+    colors = shown_colors(shapes, photos, view)
+    return draw_black(shape_of(shapes), colors, photos, view, near=near)
+
+
+def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int, *, near: float = NEAR) -> Tensor:
+    """:func:`draw` over black, the image alone."""
+    return draw(shape, colors, photos, view, torch.zeros(3, device=colors.device), near=near)[0]
 
 
 def shape_of(shapes: Shapes) -> Shape:
@@ -85,7 +88,7 @@ def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view:
     """The image of a view over black, and the function that takes images back to the Gaussians that show there."""
     with torch.enable_grad():
         leaf = colors.detach().requires_grad_()
-        image, _ = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
+        image = draw_black(shape, leaf, photos, view)
     return image.detach(), Transpose(image, leaf)
 
 

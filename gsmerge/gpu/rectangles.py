@@ -62,7 +62,7 @@ def split_rectangles(images: Tensor, count: int, block: int, compactness: float)
     """
     views, height, width, _ = images.shape
     integral = _integral_images(images)
-    corners = _blocks(height, width, block, images.device)
+    corners = _divide_evenly(height, width, block, images.device)
     num_blocks = len(corners)
     wanted = max(0, count - num_blocks)
     view = torch.arange(views, device=images.device).repeat_interleave(num_blocks)
@@ -75,7 +75,7 @@ def split_rectangles(images: Tensor, count: int, block: int, compactness: float)
         chosen = torch.nonzero((level.gain >= 0) & (level.gain >= worst[level.view]))[:, 0]
         if len(chosen) == 0:
             break
-        level = _halves(level, chosen, first, integral, compactness)
+        level = _cut_in_two(level, chosen, first, integral, compactness)
         first = len(known)
         known = Rectangles(*(torch.cat([getattr(k, f.name) for k in (known, level)]) for f in fields(Rectangles)))
     divided = (known.gain >= 0) & (ranks_by_part(-known.gain, known.view, views) < wanted)
@@ -92,7 +92,7 @@ def _integral_images(images: Tensor) -> Tensor:
     return sums
 
 
-def _blocks(height: int, width: int, block: int, device: torch.device) -> Tensor:
+def _divide_evenly(height: int, width: int, block: int, device: torch.device) -> Tensor:
     """``[b,4]`` corners of about square blocks."""
     lines, columns = max(1, height // block), max(1, width // block)
     y = torch.arange(lines + 1, device=device) * height // lines
@@ -148,7 +148,7 @@ def _best_cuts(view: Tensor, corners: Tensor, integral: Tensor, compactness: flo
     return torch.where(side > 1, gain.gather(1, best)[:, 0] / pixels, -1.0), near + 1 + best[:, 0]
 
 
-def _halves(level: Rectangles, chosen: Tensor, first: int, integral: Tensor, compactness: float) -> Rectangles:
+def _cut_in_two(level: Rectangles, chosen: Tensor, first: int, integral: Tensor, compactness: float) -> Rectangles:
     """The two parts of every chosen rectangle of a level, which begins at ``first`` among all."""
     corners, cut, across = level.corners[chosen], level.cut[chosen], level.across[chosen]
     upper, lower = corners.clone(), corners.clone()

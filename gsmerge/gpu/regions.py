@@ -39,10 +39,15 @@ def sum_regions(labels: Tensor, features: Tensor, count: int) -> Tensor:
     return sums.index_add_(0, labels.reshape(-1), features)
 
 
+def scale_features(features: Tensor, spread: float) -> Tensor:
+    """``[...,5]`` float64 colour, and y and x times ``spread``, of :func:`pixel_features` or their sums ``[...,6]``."""
+    scale = torch.tensor([1 / ONE] * 3 + [spread] * 2, dtype=torch.float64, device=features.device)
+    return features[..., :5].double() * scale
+
+
 def mean_features(sums: Tensor, spread: float) -> Tensor:
     """``[r,5]`` float64 mean colour, and mean y and x times ``spread``, of sums ``[r,6]``."""
-    scale = torch.tensor([1 / ONE] * 3 + [spread] * 2, dtype=torch.float64, device=sums.device)
-    return sums[:, :5].double() * scale / sums[:, 5:].double()
+    return scale_features(sums, spread) / sums[:, 5:].double()
 
 
 def adjacent_pairs(labels: Tensor) -> Tensor:
@@ -96,7 +101,7 @@ def merge_regions(labels: Tensor, features: Tensor, each: int, count: int, sprea
     views, merges = len(labels), each - count
     if merges == 0:
         return labels
-    tree = _leaves(sum_regions(labels, features, views * each), each, spread)
+    tree = _plant(sum_regions(labels, features, views * each), each, spread)
     pairs = adjacent_pairs(labels)
     ceilings = _first_ceilings(pairs, tree, views, merges / each)
     done = torch.zeros(views, dtype=torch.int64, device=labels.device)
@@ -112,7 +117,8 @@ def merge_regions(labels: Tensor, features: Tensor, each: int, count: int, sprea
     return _cut(tree, views, each, merges, rounds)[labels]
 
 
-def _leaves(sums: Tensor, each: int, spread: float) -> _Tree:
+def _plant(sums: Tensor, each: int, spread: float) -> _Tree:
+    """A tree of leaves alone, with room for what they merge into."""
     num = len(sums)
 
     def room(tensor: Tensor) -> Tensor:
@@ -227,8 +233,7 @@ def _move_quarter(
     bits = sum(((label == own) << bit for bit, label in enumerate(around)), torch.zeros_like(own))
     means, sizes = mean_features(sums, spread).float(), sums[:, 5].float()
     leaving, joining = sizes / (sizes - 1).clamp_min(1), sizes / (sizes + 1)
-    scale = torch.tensor([1 / ONE] * 3 + [spread] * 2, dtype=torch.float64, device=own.device)
-    points = (features[..., :5].double() * scale).float()
+    points = scale_features(features, spread).float()
 
     def cost(label: Tensor, factor: Tensor) -> Tensor:
         known = label.clamp_min(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from gsmerge.moments import Members
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.types import FeatureGaussians, Gaussians, Groups, PixelScene, UnalignedScene
+from gsmerge.types import Array, FeatureGaussians, Gaussians, Groups, PixelScene, UnalignedScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +46,6 @@ class DevicePhotos:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceMembers:
-    """The scene's Gaussians on a device, float32; shapes as of :class:`gsmerge.moments.Members`."""
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
-    footprints: Tensor
-
-
-@dataclass(frozen=True, eq=False)
 class Shapes:
     """n Gaussians on a device, float32; fields and shapes as of :class:`gsmerge.types.Gaussians`."""
 
@@ -75,7 +61,14 @@ class Shapes:
 
     def __getitem__(self, index: Tensor) -> Shapes:
         """The rows that a mask or an integer tensor selects."""
-        return Shapes(*(getattr(self, f.name)[index] for f in fields(self)))
+        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceMembers(Shapes):
+    """The scene's Gaussians on a device, float32; shapes as of :class:`gsmerge.moments.Members`."""
+
+    footprints: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,16 +94,17 @@ class Features:
         return len(self.means)
 
 
-def to_device(array: Any, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
-    """A tensor or an array of a core type on a device."""
+def to_device(array: Array, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+    """An array of a core type, or a tensor, on a device."""
     if isinstance(array, np.ndarray) and not array.flags.writeable:  # torch warns of those, though none is written to
         array = array.copy()
     return torch.as_tensor(array).to(device, dtype)
 
 
-def to_core(tensor: Tensor) -> Any:
-    """A tensor as the core types hold it. What they hold is decided here, and nowhere else in this package."""
-    return tensor.cpu()
+def to_core(tensor: Tensor) -> np.ndarray:
+    """A tensor as the core types hold it: the only place of this package that makes their arrays."""
+    array: np.ndarray = tensor.cpu().numpy()
+    return array
 
 
 def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
@@ -137,11 +131,6 @@ def upload_gaussians(gaussians: Gaussians, device: torch.device) -> Shapes:
     return Shapes(*(to_device(getattr(gaussians, f.name), device, torch.float32) for f in fields(Shapes)))
 
 
-def upload_features(features: FeatureGaussians, device: torch.device) -> Features:
-    """Feature Gaussians that a stage on the CPU made, on a device; latents stay behind."""
-    return Features(*(to_device(getattr(features, f.name), device) for f in fields(Features)))
-
-
 def download_gaussians(shapes: Shapes) -> Gaussians:
     """The core type of Gaussians on a device."""
     return Gaussians(*(to_core(getattr(shapes, f.name).float()) for f in fields(Shapes)))
@@ -150,7 +139,7 @@ def download_gaussians(shapes: Shapes) -> Gaussians:
 def download_features(features: Features) -> FeatureGaussians:
     """The core type of Feature Gaussians on a device, without latents."""
     columns = {f.name: to_core(getattr(features, f.name)) for f in fields(Features)}
-    return FeatureGaussians(**columns, latents=to_core(torch.zeros(len(features), 0)))
+    return FeatureGaussians(**columns, latents=np.zeros((len(features), 0), np.float32))
 
 
 def download_groups(labels: Tensor, counts: tuple[int, ...]) -> Groups:

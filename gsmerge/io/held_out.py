@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.similarity import IDENTITY, Similarity
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_convention, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.lens import as_pinholes
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.hints import AUTO
-from gsmerge.io.photos import as_tensor, find_image, photo_size
+from gsmerge.io.photos import as_floats, find_image, photo_size
 from gsmerge.io.scene import SceneLoad
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles
 from gsmerge.io.views import limit_photo_size, stored_photos
@@ -32,7 +31,7 @@ class HeldOutViews:
     """t views that were no input, in the frame of the scene's Gaussians."""
 
     cameras: Cameras
-    images: Tensor  # ``[t,h,w,3]`` photos, sRGB in [0, 1], float32
+    images: np.ndarray  # ``[t,h,w,3]`` photos, sRGB in [0, 1], float32
     names: tuple[str, ...]  # as their camera file has them
     places: tuple[int, ...]  # of each along the trajectory: its index in the camera file
     context_places: tuple[int, ...] | None  # the same of the scene's views; None where they are not all in the file
@@ -62,7 +61,7 @@ def read_held_out(
     readings = _readings(read_cameras(path, scene=load.files.ply.stem), load)
     worlds = [(one, *_find_world(one, _shared_views(one, load.scene.names), load)) for one in readings]
     camera_file, world, shared = next((one for one in worlds if one[2]), worlds[0])
-    moved = world.move_viewmats(camera_file.viewmats.numpy())
+    moved = world.move_viewmats(camera_file.viewmats)
     shared |= _repeated(moved, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
@@ -77,8 +76,8 @@ def read_held_out(
     inverse = {view: place for place, view in shared.items()}
     complete = 0 < len(inverse) == len(load.scene)
     return HeldOutViews(
-        cameras=with_poses(to_cameras(pinholes, photo_size(photos)), moved[places]),
-        images=as_tensor(photos),
+        cameras=replace(to_cameras(pinholes, photo_size(photos)), viewmats=moved[places]),
+        images=as_floats(photos),
         names=chosen.names,
         places=tuple(places),
         context_places=tuple(inverse[view] for view in range(len(load.scene))) if complete else None,
@@ -129,8 +128,8 @@ def _find_world(camera_file: CameraFile, named: dict[int, int], load: SceneLoad)
     stored = IDENTITY if load.recovery is None else load.recovery.best.frame
     if not named:
         return stored, {}
-    theirs = camera_file.viewmats.numpy()[list(named)]
-    ours = load.scene.cameras.viewmats.double().numpy()[list(named.values())]
+    theirs = camera_file.viewmats[list(named)]
+    ours = load.scene.cameras.viewmats[list(named.values())]
     frames = [stored] + [fit_similarity(theirs, ours, stored.scale)] * (len(named) >= _MIN_SHARED)
     for frame in frames:
         angle, shift = _disagreement(frame.move_viewmats(theirs), ours)
@@ -171,7 +170,7 @@ def _repeated(moved: np.ndarray, scene: PixelScene | UnalignedScene) -> dict[int
     """Views that stand where one of the scene's does and look the same way, and which one that is."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
-    ours, middle = scene.cameras.viewmats.double().numpy(), scene.gaussians.means.double().median(0).values.numpy()
+    ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
     # what is seen lies as far away as the views may be apart, or farther; one view has nothing else to measure by
     limit = _SAME_POSE * float(np.linalg.norm(_centres(ours) - middle, axis=1).max())
     near = np.linalg.norm(_centres(moved)[:, None] - _centres(ours), axis=2) <= limit

@@ -15,9 +15,7 @@ from typing import BinaryIO
 
 import cv2
 import numpy as np
-import torch
 from PIL import Image
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels
@@ -37,7 +35,7 @@ Photos = Sequence[np.ndarray] | np.ndarray  # c of [h,w,3], uint8 sRGB
 Size = tuple[int, int]  # width, height, pixels
 
 
-def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
+def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     """Read the image of every view: ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
 
     Args:
@@ -49,7 +47,7 @@ def read_images(source: ImageSource, names: Sequence[str]) -> Tensor:
     Raises:
         SceneError: If an image is missing or cannot be read, or two differ in size.
     """
-    return as_tensor(decode_images(source, names))
+    return as_floats(decode_images(source, names))
 
 
 def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]:
@@ -70,11 +68,11 @@ def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]
     return parallel_map(read, paths)
 
 
-def as_tensor(images: Photos) -> Tensor:
+def as_floats(images: Photos) -> np.ndarray:
     """``[c,h,w,3]`` float32 in [0, 1] from c uint8 images of one size."""
     out = np.empty((len(images), *images[0].shape), np.float32)
     parallel_map(lambda i: np.multiply(images[i], np.float32(1 / 255), out=out[i]), range(len(images)))
-    return torch.from_numpy(out)
+    return out
 
 
 def photo_size(photos: Photos | None) -> Size | None:
@@ -267,8 +265,7 @@ class PhotoTransform:
     def cameras(self, cameras: Cameras) -> Cameras:
         """The cameras of the results; intrinsics in float64."""
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
-        Ks = torch.tensor(matrix, dtype=torch.float64) @ cameras.Ks.double()
-        return replace(cameras, Ks=Ks, width=self.width, height=self.height)
+        return replace(cameras, Ks=np.array(matrix) @ cameras.Ks, width=self.width, height=self.height)
 
     def photos(self, images: Photos) -> list[np.ndarray]:
         """The results for c uint8 photos ``[h,w,3]``."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.estimate_cameras import SOURCE as ESTIMATED
@@ -19,12 +18,12 @@ from gsmerge.io.alignment.recover import Recovery
 from gsmerge.io.alignment.rotations import choose_rotations, read_rotations
 from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment
 from gsmerge.io.alignment.similarity import IDENTITY
-from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
 from gsmerge.io.cameras.lens import as_pinholes
 from gsmerge.io.exporters import Exporter, choose_exporters, find_exporter
 from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
 from gsmerge.io.hints import AUTO, ReadHints, make_hints
-from gsmerge.io.photos import as_tensor, photo_size
+from gsmerge.io.photos import as_floats, photo_size
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
 from gsmerge.io.views import limit_photo_size, read_scene_cameras, stored_photos
@@ -33,7 +32,7 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
-_NO_CAMERAS = Cameras(torch.empty(0, 4, 4, dtype=torch.float64), torch.empty(0, 3, 3, dtype=torch.float64), 1, 1)
+_NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Views:
     """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
 
     cameras: Cameras
-    images: Tensor | None  # ``[c,h,w,3]`` photos
+    images: np.ndarray | None  # ``[c,h,w,3]`` photos
     names: tuple[str, ...]
     used: tuple[int, ...]  # which of them the scene has, each once, in its order
 
@@ -119,7 +118,7 @@ def load_scene(
 
 def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneLoad:
     """:func:`load_scene` of given files."""
-    with use_threads():  # torch's own threads wait for one another, on a busy machine for longer than they work
+    with use_threads():
         return align_scene(read_ply_with_hints(files.ply, opacity=opacity, hints=hints), files, hints=hints)
 
 
@@ -168,7 +167,7 @@ def _aligned(
     layout, frame, cameras = recovery.best.layout, recovery.best.frame, inputs.cameras
     exporters = choose_exporters(hints.exporter, ply.info, layout, frame, camera_file.source)
     if frame is not IDENTITY:
-        cameras = with_poses(cameras, frame.move_viewmats(inputs.viewmats))
+        cameras = replace(cameras, viewmats=frame.move_viewmats(inputs.cameras.viewmats))
     views = Views(cameras, inputs.images, camera_file.names, tuple(dict.fromkeys(layout.views)))
     scene = to_grid(ply.gaussians, ply.valid, layout, cameras, inputs.images, camera_file.names)
     scene, filled = _fill(scene, recovery, inputs)
@@ -248,11 +247,11 @@ def _color_notes(scene: PixelScene) -> list[str]:
     return [f"{len(odd)} of {len(scene)} images do not look like their Gaussians, for example {odd[0]}"] if odd else []
 
 
-def _correlation(a: Tensor, b: Tensor) -> float:
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Pearson's correlation, 1 where one of the two hardly varies."""
-    if len(a) < 16 or min(float(a.std()), float(b.std())) < 0.01:
+    if len(a) < 16 or min(a.std(ddof=1), b.std(ddof=1)) < 0.01:
         return 1.0
-    return float(torch.corrcoef(torch.stack([a, b]))[0, 1])
+    return float(np.corrcoef(a, b)[0, 1])
 
 
 @dataclass(frozen=True)
@@ -284,7 +283,7 @@ def place_cameras_in_scene(
         notes = load.notes if aligned else load.notes[:-1]  # except the one that there are no pixels
         return CamerasInScene(load.scene.file_gaussians, load.views, notes)
     pictures = stored_photos(files, camera_file) if photos else None
-    images = None if pictures is None else as_tensor(pictures)
+    images = None if pictures is None else as_floats(pictures)
     cameras = to_cameras(camera_file, photo_size(pictures))
     views = Views(cameras, images, camera_file.names, tuple(range(len(cameras))))
     note = "the cameras do not fit the Gaussians and stay as their file has them"

@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.fit_cameras import CameraFit
@@ -17,7 +15,7 @@ from gsmerge.io.alignment.recover import recover
 from gsmerge.io.alignment.rotations import from_xyzw
 from gsmerge.io.alignment.score import Alignment, AlignmentInput, check_alignment, check_pairs, sample_pixels
 from gsmerge.io.alignment.similarity import IDENTITY, candidate_similarities, pixel_errors, scale_by, solve_pose
-from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.nerfstudio import find_dataparser, read_dataparser
 from gsmerge.io.formats.ply import PlyInfo, PlyScene
@@ -48,7 +46,7 @@ def make_unaligned(
         if _lacks_cameras(inputs):
             raise SceneError(ply.info.path, problem, remedy)
     if inputs.scale is not None:
-        cameras = with_poses(cameras, scale_by(inputs.scale).move_viewmats(inputs.viewmats))
+        cameras = replace(cameras, viewmats=scale_by(inputs.scale).move_viewmats(cameras.viewmats))
     inputs = replace(inputs, cameras=cameras)
     cameras, camera_file, notes = _choose_cameras(files, camera_file, inputs, SceneError(files.ply, problem, remedy))
     cameras, images, smaller = limit_view_size(cameras, inputs.images, hints.max_side)
@@ -87,7 +85,7 @@ def _choose_cameras(
     if poses is None:
         return cameras, camera_file, [note] if note else []
     notes = [f"{poses.describe(camera_file.convention)}: read so"]
-    return with_poses(cameras, poses.viewmats), with_convention(camera_file, poses.convention), notes
+    return replace(cameras, viewmats=poses.viewmats), with_convention(camera_file, poses.convention), notes
 
 
 def _move_by_dataparser(files: SceneFiles, inputs: AlignmentInput) -> Cameras | None:
@@ -96,7 +94,7 @@ def _move_by_dataparser(files: SceneFiles, inputs: AlignmentInput) -> Cameras | 
     if path is None:
         return None
     frames = [IDENTITY, *read_dataparser(path, files.cameras)]
-    moved = [with_poses(inputs.cameras, frame.move_viewmats(inputs.viewmats)) for frame in frames]
+    moved = [replace(inputs.cameras, viewmats=frame.move_viewmats(inputs.cameras.viewmats)) for frame in frames]
     stay, *checks = (check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images) for cameras in moved)
     best = max(checks, key=lambda check: check.score)
     return moved[1 + checks.index(best)] if best.ok and best.score > stay.score else None
@@ -112,14 +110,15 @@ def usable_rows(ply: PlyScene, hints: ReadHints) -> tuple[Gaussians, list[str]]:
     return gaussians, [f"{count:,} rows that only fill the file up are left out"] if count else []
 
 
-def is_padding(gaussians: Gaussians) -> Tensor:
+def is_padding(gaussians: Gaussians) -> np.ndarray:
     """``[n]`` bool: rows at the very origin that are all alike, with which VolSplat fills up its files."""
-    rows = torch.nonzero((gaussians.means == 0).all(1))[:, 0]
-    padding = torch.zeros(len(gaussians), dtype=torch.bool)
+    rows = np.flatnonzero((gaussians.means == 0).all(1))
+    padding = np.zeros(len(gaussians), bool)
     if len(rows) < MIN_PADDING:
         return padding
-    shape = torch.cat([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
-    padding[rows[(shape == shape.median(0).values).all(1)]] = True
+    shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
+    middle = (len(rows) - 1) // 2
+    padding[rows[(shape == np.partition(shape, middle, 0)[middle]).all(1)]] = True
     return padding
 
 
@@ -164,18 +163,20 @@ def misalignment_error(camera_file: CameraFile, alignment: Alignment, reason: st
     return SceneError(camera_file.path, problem, f"{reason}: convert one to the other" if reason else unknown)
 
 
-def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor, convention: Convention) -> str | None:
+def explain_misalignment(
+    gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
+) -> str | None:
     """The other reading of the cameras or of the row order under which the scene would fit, in words; None without any.
 
     Gaussians, cameras (read under ``convention``) and ``valid`` are as for :func:`check_alignment`.
     """
     pairs = sample_pixels(gaussians, cameras, valid)
-    given = cameras.viewmats.double().numpy()
-    frames = candidate_similarities(pairs, given, cameras.Ks.double().numpy(), effort=1)
+    given = cameras.viewmats
+    frames = candidate_similarities(pairs, given, cameras.Ks, effort=1)
     scaled = [f for f in frames if f.kind == "scaled"]
     others = [(f"the cameras fit with their {f.description}", f.move_viewmats(given)) for f in scaled]
     for reason, viewmats in [*_other_viewmats(cameras, convention), *others]:
-        if check_pairs(pairs, with_poses(cameras, viewmats)).ok:
+        if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason
     for reason, order in _other_orders(len(cameras), cameras.height, cameras.width):
         if check_alignment(gaussians[order], cameras, valid.reshape(-1)[order]).ok:
@@ -186,24 +187,24 @@ def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor, 
     return None
 
 
-def looks_like_a_grid(gaussians: Gaussians, valid: Tensor, cameras: Cameras, limit: float) -> bool:
+def looks_like_a_grid(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, limit: float) -> bool:
     """Whether the first view's rows are pixels of some camera, if not of the given one: wrong cameras, then.
 
     The intrinsics may be what is wrong: a pose that takes most of it up, to a median of ``limit`` pixels, is enough.
     """
-    pairs, K = sample_pixels(gaussians, cameras, valid), cameras.Ks.double().numpy()[:1]
+    pairs, K = sample_pixels(gaussians, cameras, valid), cameras.Ks[:1]
     pairs = pairs.select(pairs.views == 0)
     pose = solve_pose(pairs, 0, K[0])
     return pose is not None and bool(np.median(pixel_errors(pairs, pose[None], K)) < limit)
 
 
 def _other_viewmats(cameras: Cameras, convention: Convention) -> Iterator[tuple[str, np.ndarray]]:
-    given = cameras.viewmats.double().numpy()
+    given = cameras.viewmats
     for poses in other_conventions(given, convention):
         yield poses.describe(convention), poses.viewmats
     transposed = given.copy()
     transposed[:, :3, :3] = given[:, :3, :3].transpose(0, 2, 1)
-    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres.double().numpy())
+    transposed[:, :3, 3] = -np.einsum("vij,vj->vi", transposed[:, :3, :3], cameras.centres)
     yield "the cameras fit with their rotations transposed", transposed
     for axis, words in ((1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")):
         mirrored = given.copy()
@@ -211,10 +212,10 @@ def _other_viewmats(cameras: Cameras, convention: Convention) -> Iterator[tuple[
         yield f"the cameras fit with the {words}", mirrored
 
 
-def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, Tensor]]:
+def _other_orders(views: int, height: int, width: int) -> Iterator[tuple[str, np.ndarray]]:
     """Permutations that bring rows of another order into view-major, row-major order."""
-    rows = torch.arange(views * height * width)
+    rows = np.arange(views * height * width)
     by_pixel, by_column = rows.reshape(height, width, views), rows.reshape(views, width, height)
-    yield "the rows fit in the order row, column, view (view fastest)", by_pixel.permute(2, 0, 1).reshape(-1)
-    yield "the rows fit in the order view, column, row (column-major)", by_column.permute(0, 2, 1).reshape(-1)
-    yield "the rows fit with the views in reverse order", rows.reshape(views, -1).flip(0).reshape(-1)
+    yield "the rows fit in the order row, column, view (view fastest)", by_pixel.transpose(2, 0, 1).reshape(-1)
+    yield "the rows fit in the order view, column, row (column-major)", by_column.transpose(0, 2, 1).reshape(-1)
+    yield "the rows fit with the views in reverse order", rows.reshape(views, -1)[::-1].reshape(-1)

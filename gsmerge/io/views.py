@@ -6,8 +6,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.estimate_cameras import estimate_cameras
@@ -102,12 +100,14 @@ def limit_photo_size(
     return photos if transform is None else transform.photos(photos), notes
 
 
-def limit_view_size(cameras: Cameras, images: Tensor | None, max_side: int) -> tuple[Cameras, Tensor | None, list[str]]:
+def limit_view_size(
+    cameras: Cameras, images: np.ndarray | None, max_side: int
+) -> tuple[Cameras, np.ndarray | None, list[str]]:
     """Cameras and photos ``[c,h,w,3]`` of unaligned Gaussians, no side longer than ``max_side`` pixels; and a note."""
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras = transform.cameras(cameras)
-        images = None if images is None else torch.from_numpy(np.stack(transform.photos(images.numpy())))
+        images = None if images is None else np.stack(transform.photos(images))
     return cameras, images, notes
 
 

@@ -11,12 +11,30 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
+OURS = "GSMERGE_COMMAND"  # set in processes that run nothing but the command line
+
+
+def _import_numba() -> Any:
+    """Import numba; in processes of our own without SciPy's BLAS, which no kernel needs and which takes 0.2 s."""
+    hidden = "scipy.linalg" if OURS in os.environ and "scipy.linalg" not in sys.modules else None
+    if hidden:
+        sys.modules[hidden] = None  # type: ignore[assignment]
+    try:
+        import numba.np.arraymath
+
+        return numba
+    finally:
+        if hidden:
+            del sys.modules[hidden]
+
+
+numba = _import_numba()
 
 # Reassociation lets sums vectorise; NaN and inf keep their meaning, so that bad input is not optimised away.
 FAST = frozenset({"contract", "nsz", "arcp", "reassoc"})

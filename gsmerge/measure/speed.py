@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from gsmerge.render import plan_view, prepare, render
-from gsmerge.render.cuda import cuda_problem
 from gsmerge.render.weights import view_weights
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
@@ -35,7 +33,7 @@ def resized(cameras: Cameras, long_side: int) -> Cameras:
     """The same cameras with images whose longer side has ``long_side`` pixels."""
     factor = long_side / max(cameras.width, cameras.height)
     size = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
-    scale = torch.tensor([size[0] / cameras.width, size[1] / cameras.height, 1.0], dtype=cameras.Ks.dtype)
+    scale = np.array([size[0] / cameras.width, size[1] / cameras.height, 1.0], cameras.Ks.dtype)
     return replace(cameras, Ks=cameras.Ks * scale[:, None], width=size[0], height=size[1])
 
 
@@ -52,15 +50,18 @@ def measure_speeds(
     The scenes take turns, so that a machine that slows down slows all of them. ``long_sides`` are pixels along the
     longer side, ``near`` is in world units.
     """
+    from gsmerge.render.cuda import cuda_problem  # loads torch
+
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     speeds: dict[str, list[Speed]] = {name: [] for name in scenes}
     with use_threads(threads) as used:
         for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
-            placed = {name: gaussians.to(device) for name, gaussians in scenes.items()}
+            on_cpu = device == "cpu"
+            placed = scenes if on_cpu else {name: gaussians.to(device) for name, gaussians in scenes.items()}
             for side in long_sides:
                 views = resized(few, side)
-                for name, seconds in _time_in_turns(placed, views.to(device), near).items():
-                    count = used if device == "cpu" else 0
+                for name, seconds in _time_in_turns(placed, views if on_cpu else views.to(device), near).items():
+                    count = used if on_cpu else 0
                     speeds[name].append(Speed(device, views.width, views.height, count, seconds))
     return {name: tuple(measured) for name, measured in speeds.items()}
 
@@ -83,7 +84,9 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
     """Seconds to render a view."""
     start = time.perf_counter()
     image = render(gaussians, view, near=near).images
-    if image.is_cuda:
+    if not isinstance(image, np.ndarray) and image.is_cuda:
+        import torch
+
         torch.cuda.synchronize()
     return time.perf_counter() - start
 
@@ -91,7 +94,7 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
     """Gaussians blended into a pixel, on average over some of the views: what render time depends on."""
     splats, entries, pixels = prepare(gaussians), 0, 0
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     for view in pick_views(len(cameras), NUM_VIEWS):
         plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
         entries += len(view_weights(plan).lanes)

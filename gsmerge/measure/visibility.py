@@ -22,17 +22,17 @@ def context_points(scene: PixelScene | UnalignedScene, near: float) -> Points:
     Of a scene with pixels the Gaussians are the samples; otherwise depth beyond ``near``, world units, is rendered.
     """
     if isinstance(scene, PixelScene):
-        return np.asarray(scene.gaussians.means[scene.valid.reshape(-1)].double().numpy())
+        return scene.gaussians.means[scene.valid.reshape(-1)].astype(np.float64)
     return np.concatenate([_rendered_points(scene.gaussians, scene.cameras[[i]], near) for i in range(len(scene))])
 
 
 def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
-    depth, solid = drawn.depths[0].double().numpy(), drawn.alphas[0].numpy() > _OPAQUE
+    depth, solid = drawn.depths[0].astype(np.float64), drawn.alphas[0] > _OPAQUE
     y, x = np.nonzero(solid.reshape(depth.shape[:2]))
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.Ks[0].double().numpy()).T
-    pose = np.linalg.inv(camera.viewmats[0].double().numpy())
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.Ks[0].astype(np.float64)).T
+    pose = np.linalg.inv(camera.viewmats[0].astype(np.float64))
     return np.asarray((rays * depth.reshape(solid.shape[0], -1)[y, x, None]) @ pose[:3, :3].T + pose[:3, 3])
 
 
@@ -42,7 +42,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
     Points nearer than ``near``, world units, do not count. Where the views have smaller pixels than those that the
     points come from (``sources``), a point marks proportionally more of them, as there would be gaps otherwise.
     """
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     size = np.array([cameras.width, cameras.height])
 
     def one_view(view: int) -> NDArray[np.bool_]:
@@ -64,5 +64,5 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
     """Pixels per side, an odd number, of the square that a sample marks in a view with the intrinsics ``K [3,3]``."""
     if sources is None:
         return _DILATION
-    focals = [np.sqrt(one[..., 0, 0] * one[..., 1, 1]) for one in (K, sources.Ks.double().numpy())]  # pixels
+    focals = [np.sqrt(one[..., 0, 0] * one[..., 1, 1]) for one in (K, sources.Ks.astype(np.float64))]  # pixels
     return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)

@@ -24,7 +24,7 @@ from gsmerge.networks.residuals import (
 from gsmerge.networks.tables import group_rows, point_seeds, sample_members, split_tables
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, member_tokens, part_tokens
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, as_array, as_tensor
 
 RunTable = Callable[[np.ndarray, int], Tensor]  # rows and width of a table -> [rows, columns]
 
@@ -38,6 +38,11 @@ class NetworkContext:
     cameras: Cameras  # its views
     seed: int = 0  # chooses the members of groups that are too large to read whole
 
+    @property
+    def trains(self) -> bool:
+        """Whether gradients of the networks are wanted."""
+        return torch.is_grad_enabled() and any(p.requires_grad for p in self.networks.parameters())
+
     def describe(self, features: FeatureGaussians) -> GroupFeatures:
         """The inputs of the networks for Feature Gaussians."""
         return compute_group_features(features, self.members, self.cameras)
@@ -49,10 +54,10 @@ class NetworkContext:
         return (torch.cat(outputs, 1) if isinstance(outputs, tuple) else outputs).cpu()
 
 
-def run_tables(sizes: np.ndarray, max_width: int, columns: int, run: RunTable) -> Tensor:
+def run_tables(sizes: np.ndarray, max_width: int, columns: int, run: RunTable, *, trains: bool) -> Tensor:
     """``[g,columns]`` outputs of all groups; in parallel, but one table after the other where gradients are needed."""
     tables = list(split_tables(sizes, max_width))
-    if torch.is_grad_enabled():
+    if trains:
         outputs = [run(rows, width) for rows, width in tables]
     else:
 
@@ -78,11 +83,11 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
 
 def run_encoder(features: FeatureGaussians, group_features: GroupFeatures, context: NetworkContext) -> Tensor:
     """``[g,latent+3]`` raw latents and shifts; zero without an encoder."""
-    starts, ids = features.starts.numpy(), features.members.numpy()
+    starts, ids = features.starts, features.members
     sizes, options, encoder = np.diff(starts), context.networks.options, context.networks.encoder
     if encoder is None:
         return torch.zeros(len(features), options.latent + 3)
-    seeds, axes = point_seeds(features.means.numpy(), context.seed), _longest_axes(group_features.base)
+    seeds, axes = point_seeds(features.means, context.seed), _longest_axes(group_features.base)
 
     def run(rows: np.ndarray, width: int) -> Tensor:
         positions, owners = group_rows(starts[rows], sizes[rows])
@@ -94,7 +99,7 @@ def run_encoder(features: FeatureGaussians, group_features: GroupFeatures, conte
         group = group_features.group[torch.from_numpy(rows)]
         return context.run(encoder, tokens.unflatten(0, mask.shape), torch.from_numpy(mask), group)
 
-    return run_tables(sizes, options.members, options.latent + 3, run)
+    return run_tables(sizes, options.members, options.latent + 3, run, trains=context.trains)
 
 
 def _longest_axes(base: Gaussians) -> np.ndarray:
@@ -111,7 +116,7 @@ def apply_encoding(
     Gradients flow through the latents and the corrections, never through the geometry.
     """
     shift = networks.options.bounds.mean * HALF * tanh_bounded(encoded[:, -3:])
-    shift = torch.where(features.backing[:, None], 0, shift)
+    shift = torch.where(as_tensor(features.backing)[:, None], 0, shift)
     residuals = torch.cat([shift, torch.zeros(len(features), RESIDUAL - 3)], 1)
     moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
     return replace(moved, latents=tanh_bounded(encoded[:, :-3])), residuals
@@ -124,6 +129,7 @@ def match_geometry(features: FeatureGaussians, context: NetworkContext) -> Featu
         residuals = run_heads(group_features.base, own, features, group_features, context)
         return move_features(features, group_features.base, residuals, group_features.frames)
     decoded = decode_with_group_features(group_features.base, own, features, group_features, context)
+    decoded = decoded.numpy()
     return replace(features, means=decoded.means, covars=covariances(decoded.quats, decoded.scales))
 
 
@@ -155,15 +161,15 @@ def run_merger(
     context: NetworkContext,
 ) -> Tensor:
     """``[c,13+latent]`` raw corrections of clusters, see :func:`merge_features`; zero without a merger."""
-    base, columns = feature_to_gaussians(parts), RESIDUAL + context.networks.options.latent
+    base, columns = feature_to_gaussians(parts).to("cpu"), RESIDUAL + context.networks.options.latent
     sizes, merger = np.diff(np.append(cuts, len(order))), context.networks.merger
     if merger is None:
         return torch.zeros(len(pooled), columns)
-    seeds = point_seeds(pooled.means.numpy(), context.seed)
+    seeds = point_seeds(pooled.means, context.seed)
 
     def run(rows: np.ndarray, width: int) -> Tensor:
         positions, owners = group_rows(cuts[rows], sizes[rows])
-        keys = ((base.means.numpy()[order[positions]] - pooled.means.numpy()[rows[owners]]) ** 2).sum(1)
+        keys = ((parts.means[order[positions]] - pooled.means[rows[owners]]) ** 2).sum(1)
         sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
         ids = torch.from_numpy(order[positions][sample.reshape(-1)])
         relative = part_tokens(base[ids], group_features, torch.from_numpy(np.repeat(rows, width)))
@@ -171,7 +177,7 @@ def run_merger(
         group = group_features.group[torch.from_numpy(rows)]
         return context.run(merger, tokens, torch.from_numpy(mask), group)
 
-    return run_tables(sizes, context.networks.options.members, columns, run)
+    return run_tables(sizes, context.networks.options.members, columns, run, trains=context.trains)
 
 
 def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
@@ -193,7 +199,7 @@ def run_refiner(
     if refiner is None:
         return torch.zeros(count, columns)
     table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
-    views = features.views
+    views = as_tensor(features.views)
 
     def run(rows: np.ndarray, _: int) -> Tensor:
         ids, own = torch.from_numpy(table[rows].reshape(-1)), torch.from_numpy(np.repeat(rows, width))
@@ -205,17 +211,17 @@ def run_refiner(
         group = group_features.group[torch.from_numpy(rows)]
         return context.run(refiner, tokens, mask.unflatten(0, (len(rows), width)), group)
 
-    return run_tables(np.full(count, width), 1 << (width - 1).bit_length(), columns, run)
+    return run_tables(np.full(count, width), 1 << (width - 1).bit_length(), columns, run, trains=context.trains)
 
 
 def find_neighbors(features: FeatureGaussians, count: int) -> np.ndarray:
     """``[g,k]`` int64 nearest other Feature Gaussians of the same layer in 3D; -1 where there are fewer."""
-    means, neighbors = features.means.double().numpy(), np.full((len(features), count), -1, np.int64)
+    means, neighbors = features.means.astype(np.float64), np.full((len(features), count), -1, np.int64)
     finite = np.isfinite(means).all(1)
-    for layer in (features.backing.numpy(), ~features.backing.numpy()):
+    for layer in (features.backing, ~features.backing):
         rows = np.flatnonzero(layer & finite)
         near = nearest_points(means[rows], count)
-        neighbors[rows] = np.where(near < 0, -1, rows[near]) if len(rows) else -1
+        neighbors[rows] = np.where(near < 0, -1, rows[near])
     return neighbors
 
 
@@ -226,7 +232,7 @@ def apply_corrections(
 
     The backing layer stays as it is. Gradients flow through the latents and the corrections alone.
     """
-    own = torch.where(features.backing[:, None], 0, raw)
+    own = torch.where(as_tensor(features.backing)[:, None], 0, raw)
     residuals = bound_residuals(own[:, :RESIDUAL], networks.options.bounds, HALF)
     moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
     return replace(moved, latents=features.latents + tanh_bounded(own[:, RESIDUAL:])), residuals
@@ -246,7 +252,8 @@ def decode_gaussians(
         features: The Feature Gaussians.
         context: The networks and the scene.
     """
-    return decode_with_group_features(children, parents, features, context.describe(features), context)
+    group_features = context.describe(features)
+    return decode_with_group_features(children.to("cpu"), parents, features, group_features, context).numpy()
 
 
 def decode_with_group_features(
@@ -256,7 +263,7 @@ def decode_with_group_features(
     group_features: GroupFeatures,
     context: NetworkContext,
 ) -> Gaussians:
-    """:func:`decode_gaussians` with group features that are known already, without the scene's members."""
+    """:func:`decode_gaussians` of tensors, with group features that are known, without the scene's members."""
     children = prepare_children(children, parents, features, group_features, context.networks)
     residuals = run_heads(children, parents, features, group_features, context)
     return move_gaussians(children, residuals, group_features.frames[torch.from_numpy(parents)])
@@ -278,10 +285,10 @@ def prepare_children(
     if networks.options.outputs == "residual":
         return children
     sizes = np.bincount(parents, minlength=len(features))[parents]
-    replaced = torch.from_numpy((sizes <= networks.max_children) & ~features.backing.numpy()[parents])
+    replaced = torch.from_numpy((sizes <= networks.max_children) & ~features.backing[parents])
     own = torch.from_numpy(parents)
     means, scales = group_features.base.means[own], group_features.sizes[own, None].expand(-1, 3)
-    quats = rotmat_to_quat(group_features.frames.double())[own].to(children.quats)
+    quats = as_tensor(rotmat_to_quat(as_array(group_features.frames.double())))[own].to(children.quats)
     return replace(
         children,
         means=torch.where(replaced[:, None], means, children.means),
@@ -304,7 +311,7 @@ def run_heads(
     first, sizes, owners = _families(parents, len(features), halves=networks.max_children > SLOTS[-1])
     residuals = torch.zeros(len(children), RESIDUAL)
     for slots, fewest in zip(SLOTS, (1, 2, 3), strict=True):
-        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots) & ~features.backing.numpy()[owners])
+        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots) & ~features.backing[owners])
         if len(rows) == 0:
             continue
         places = np.arange(slots)[None]
@@ -347,4 +354,5 @@ def _run_head(
         inputs = features.latents[own], group_features.group[own], tokens, torch.from_numpy(mask[rows])
         return context.run(head, *inputs).flatten(1)
 
-    return run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run).reshape(-1, RESIDUAL)
+    raw = run_tables(np.full(len(parents), slots), slots, slots * RESIDUAL, run, trains=context.trains)
+    return raw.reshape(-1, RESIDUAL)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.moments import Members
@@ -18,7 +16,9 @@ MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
 ROWS = 8192  # points per task
 
 
-def cross_view_stats(means: Tensor, sh0: Tensor, views: Tensor, members: Members, cameras: Cameras) -> Tensor:
+def cross_view_stats(
+    means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
+) -> np.ndarray:
     """Agreement with the Gaussian of the pixel that each point projects to in every other view.
 
     Args:
@@ -29,28 +29,27 @@ def cross_view_stats(means: Tensor, sh0: Tensor, views: Tensor, members: Members
         cameras: All views.
 
     Returns:
-        ``[g,7]``: logarithm of the number of views that see the point; the shares of these views whose surface is at
-        the point, behind it and in front of it; the mean difference of colours and of relative depths; the logarithm
-        of the number of views.
+        ``[g,7]`` float32: logarithm of the number of views that see the point; the shares of these views whose surface
+        is at the point, behind it and in front of it; the mean difference of colours and of relative depths; the
+        logarithm of the number of views.
     """
-    stats = torch.zeros(len(means), NUM_STATS)
-    stats[:, 6] = float(np.log(len(cameras))) / 4
+    stats = np.zeros((len(means), NUM_STATS), np.float32)
+    stats[:, 6] = np.log(len(cameras)) / 4
     if members.pixels is not None or len(means) == 0:
         return stats
-    points, colors = means.double().contiguous().numpy(), (SH_C0 * sh0[:, 0]).contiguous().numpy()
-    viewmats, Ks = (tensor.double().contiguous().numpy() for tensor in (cameras.viewmats, cameras.Ks))
+    points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
+    viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     size, limits = (cameras.width, cameras.height), (SH_C0, NEAR, FAR, MIN_OPACITY)
     sums, m = np.zeros((len(points), COLUMNS)), members
 
     def add(first: int) -> None:
         last = min(first + ROWS, len(points))
         sum_cross_view(
-            points, colors, views.numpy(), viewmats, Ks, *size, m.means, m.opacities, m.sh0, *limits, first, last, sums
+            points, colors, views, viewmats, Ks, *size, m.means, m.opacities, m.sh0, *limits, first, last, sums
         )  # fmt: skip
 
     parallel_map(add, range(0, len(points), ROWS))
     num_seen, num_same = np.maximum(sums[:, 0], 1), np.maximum(sums[:, 1], 1)
     shares = [sums[:, 1] / num_seen, sums[:, 2] / num_seen, sums[:, 3] / num_seen, sums[:, 4] / num_same]
-    columns = np.stack([np.log1p(sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
-    stats[:, :6] = torch.from_numpy(columns).float()
+    stats[:, :6] = np.stack([np.log1p(sums[:, 0]) / 3, *shares, sums[:, 5] / num_seen / FAR], 1)
     return stats

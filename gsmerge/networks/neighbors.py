@@ -23,7 +23,7 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
         count: Neighbours of each.
     """
     num = len(means)
-    num_nodes = 4 << max(0, (num // LEAF).bit_length())
+    num_nodes = 4 << (num // LEAF).bit_length()
     order, neighbors = np.arange(num), np.empty((num, count), np.int64)
     axes, splits = np.empty(num_nodes, np.int8), np.empty(num_nodes)
     means = np.ascontiguousarray(means)

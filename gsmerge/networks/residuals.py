@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from gsmerge.geometry import quat_to_rotmat
 from gsmerge.networks.options import Bounds
-from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_array, as_tensor
 
 MEAN, SIZE, ROTATION, LOGIT, COLOR = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 RESIDUAL = 13
@@ -40,6 +40,17 @@ def gaussian_sizes(scales: Tensor) -> Tensor:
     """``[n]`` sizes of Gaussians: geometric mean of the two largest of ``scales [n,3]``."""
     top = scales.sort(-1).values
     return (top[..., 1] * top[..., 2]).sqrt()
+
+
+def quat_to_rotmat(quats: Tensor) -> Tensor:
+    """:func:`gsmerge.geometry.quat_to_rotmat` for tensors, differentiable."""
+    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def rotation_matrices(vectors: Tensor) -> Tensor:
@@ -71,7 +82,7 @@ def move_gaussians(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> G
     """Gaussians with corrections applied.
 
     Args:
-        gaussians: n Gaussians.
+        gaussians: n Gaussians, tensors.
         residuals: ``[n,13]``.
         frames: ``[n,3,3]`` axes of each Gaussian's group as columns, world.
     """
@@ -92,25 +103,26 @@ def move_features(features: FeatureGaussians, base: Gaussians, residuals: Tensor
 
     Args:
         features: g Feature Gaussians.
-        base: The Gaussian of each, see :func:`gsmerge.moments.feature_to_gaussians`.
-        residuals: ``[g,13]``; the tenth is added to the logarithm of the optical depth.
+        base: The Gaussian of each as tensors, see :func:`gsmerge.moments.feature_to_gaussians`.
+        residuals: ``[g,13]``, whose gradients end here; the tenth is added to the logarithm of the optical depth.
         frames: ``[g,3,3]`` axes of each group as columns, world.
     """
+    f = {name: as_tensor(getattr(features, name)) for name in ("means", "covars", "masses", "extinctions", "sh0")}
     wide, frames = residuals.double(), frames.double()
     axes = quat_to_rotmat(base.quats.double())
     stretch = torch.eye(3).double() + axes @ (torch.expm1(wide[:, SIZE])[:, :, None] * axes.transpose(1, 2))
     change = rotation_matrices(rotate_vectors(frames, wide[:, ROTATION])) @ stretch
-    covars = change @ features.covars.double() @ change.transpose(1, 2)
+    covars = change @ f["covars"].double() @ change.transpose(1, 2)
     depth = wide[:, LOGIT]
     disc = wide[:, SIZE][:, 1:].sum(1)  # of the two larger axes: principal axes are in ascending order
-    sizes = gaussian_sizes(base.scales / features.spreads[:, None]).double()
+    sizes = gaussian_sizes(base.scales / as_tensor(features.spreads)[:, None]).double()
     shift = rotate_vectors(frames, wide[:, MEAN] * sizes[:, None])
     shift = torch.where(shift.isfinite(), shift, 0)  # for means as far away as float32 allows
-    return replace(
-        features,
-        means=(features.means + shift).float(),
-        covars=((covars + covars.transpose(1, 2)) / 2).float(),
-        masses=(features.masses * torch.exp(depth + wide[:, SIZE].sum(1))).float(),
-        extinctions=(features.extinctions * torch.exp(depth + disc)).float(),
-        sh0=features.sh0 + residuals[:, None, COLOR] / SH_C0,
-    )
+    moved = {
+        "means": f["means"] + shift,
+        "covars": (covars + covars.transpose(1, 2)) / 2,
+        "masses": f["masses"] * torch.exp(depth + wide[:, SIZE].sum(1)),
+        "extinctions": f["extinctions"] * torch.exp(depth + disc),
+        "sh0": f["sh0"] + residuals[:, None, COLOR] / SH_C0,
+    }
+    return replace(features, **{name: as_array(values.float()) for name, values in moved.items()})

@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.geometry import quat_to_rotmat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
-from gsmerge.networks.residuals import gaussian_sizes
+from gsmerge.networks.residuals import gaussian_sizes, quat_to_rotmat
 from gsmerge.networks.tables import group_rows
-from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
+from gsmerge.types import SH_C0, Array, Cameras, FeatureGaussians, Gaussians, as_tensor
 
 PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
 MEMBER = PART + 6  # and its position in footprints and its colour
@@ -28,7 +27,7 @@ TINY = 1e-12  # world units; lengths are clamped to it before a division or loga
 
 @dataclass(frozen=True, eq=False)
 class GroupFeatures:
-    """Feature Gaussians as the networks read them."""
+    """Feature Gaussians as the networks read them: tensors."""
 
     base: Gaussians  # g Gaussians without corrections
     frames: Tensor  # [g,3,3] axes (right, down, away) as columns, world
@@ -41,33 +40,37 @@ class GroupFeatures:
 def compute_group_features(features: FeatureGaussians, members: Members, cameras: Cameras) -> GroupFeatures:
     """Inputs of the networks for Feature Gaussians."""
     views = _choose_views(features, members, cameras)
-    bare = make_group_features(features, views, torch.zeros(len(features), 0), cameras)
-    tangents = _image_tangents(features.means, views, cameras)
-    stats = cross_view_stats(features.means, features.sh0, views, members, cameras)
+    bare = make_group_features(features, views, np.zeros((len(features), 0), np.float32), cameras)
+    tangents = _image_tangents(bare.base.means, bare.views, cameras.to("cpu"))
+    stats = as_tensor(cross_view_stats(features.means, features.sh0, views, members, cameras))
     return replace(bare, group=torch.cat([_group_numbers(features, bare), tangents, stats], 1).nan_to_num())
 
 
-def make_group_features(features: FeatureGaussians, views: Tensor, group: Tensor, cameras: Cameras) -> GroupFeatures:
+def make_group_features(features: FeatureGaussians, views: Array, group: Array, cameras: Cameras) -> GroupFeatures:
     """Inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the scene's members."""
-    base = feature_to_gaussians(features)
-    sizes = gaussian_sizes(base.scales / features.spreads[:, None]).clamp_min(TINY)
-    frames = _ray_frames(features.means, views, cameras)
-    return GroupFeatures(base, frames, sizes, features.footprints.clamp_min(TINY), views, group)
+    base, views = feature_to_gaussians(features).to("cpu"), as_tensor(views)
+    sizes = gaussian_sizes(base.scales / as_tensor(features.spreads)[:, None]).clamp_min(TINY)
+    footprints = as_tensor(features.footprints).clamp_min(TINY)
+    return GroupFeatures(
+        base, _ray_frames(base.means, views, cameras.to("cpu")), sizes, footprints, views, as_tensor(group)
+    )
 
 
 def _group_numbers(features: FeatureGaussians, bare: GroupFeatures) -> Tensor:
     """``[g,17]``: scales, opacity, mass, optical depth, members, colour, covariance."""
     base, frames, sizes, footprints = bare.base, bare.frames, bare.sizes, bare.footprints
-    num_members = (features.starts[1:] - features.starts[:-1]).float()
-    local = frames.transpose(1, 2) @ (features.covars / sizes[:, None, None] ** 2) @ frames
+    names = ("covars", "masses", "extinctions", "weights")
+    covars, masses, extinctions, weights = (as_tensor(getattr(features, name)) for name in names)
+    num_members = as_tensor(np.diff(features.starts)).float()
+    local = frames.transpose(1, 2) @ (covars / sizes[:, None, None] ** 2) @ frames
     columns = [
         torch.log(base.scales.clamp_min(TINY) / footprints[:, None]).clamp(-12, 12) / 4,
         _logits(base.opacities)[:, None],
-        torch.log(features.masses.clamp_min(1e-30) / footprints**3)[:, None].clamp(-30, 30) / 10,
-        torch.log(features.extinctions.clamp_min(1e-30) / footprints**2)[:, None].clamp(-30, 30) / 10,
+        torch.log(masses.clamp_min(1e-30) / footprints**3)[:, None].clamp(-30, 30) / 10,
+        torch.log(extinctions.clamp_min(1e-30) / footprints**2)[:, None].clamp(-30, 30) / 10,
         torch.log(num_members)[:, None] / 4,
-        (features.weights / num_members)[:, None],
-        SH_C0 * features.sh0[:, 0],
+        (weights / num_members)[:, None],
+        SH_C0 * base.sh0[:, 0],
         torch.asinh(local.flatten(1)[:, [0, 1, 2, 4, 5, 8]]),
     ]
     return torch.cat(columns, 1)
@@ -78,19 +81,18 @@ def _logits(opacities: Tensor) -> Tensor:
     return torch.logit(opacities.clamp(1e-4, 1 - 1e-4)) / 3
 
 
-def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> Tensor:
+def _choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
     """``[g]`` int64 view of each Feature Gaussian: its own; of merged ones, the view that gave it most opacity."""
-    views = features.views.clone()
-    merged = torch.nonzero(views < 0)[:, 0].numpy()
+    views = features.views.copy()
+    merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
         return views
-    starts, sizes = features.starts.numpy()[merged], np.diff(features.starts.numpy())[merged]
-    positions, owners = group_rows(starts, sizes)
-    ids = features.members.numpy()[positions]
+    positions, owners = group_rows(features.starts[merged], np.diff(features.starts)[merged])
+    ids = features.members[positions]
     pixels = ids if members.pixels is None else members.pixels[ids]
     seen = pixels // (cameras.width * cameras.height)
     sums = np.bincount(owners * len(cameras) + seen, members.opacities[ids], len(merged) * len(cameras))
-    views[torch.from_numpy(merged)] = torch.from_numpy(sums.reshape(len(merged), -1).argmax(1))
+    views[merged] = sums.reshape(len(merged), -1).argmax(1)
     return views
 
 

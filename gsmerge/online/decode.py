@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from gsmerge.encoded.decode import decode_scene, plan_decode
 from gsmerge.encoded.encoded import Encoded
@@ -78,11 +77,11 @@ def decode_stored(
     log = RunLog(progress)
     max_count = int(plan.counts.sum())
     start_count = max(len(encoded), int(start_share(options) * max_count)) + encoded.num_kept
-    canonical = replace(encoded, frame=Frame(torch.zeros(3, dtype=torch.float64), 1.0))
-    with use_threads(threads), torch.no_grad():
+    canonical = replace(encoded, frame=Frame(np.zeros(3), 1.0))
+    with use_threads(threads):
         gaussians = decode_scene(canonical, budget=start_count, threads=threads)
         images = stored.replay.images.astype(np.float32) / np.float32(255)
-        replay = BatchPhotos(images, stored.cameras[torch.from_numpy(stored.replay.views)])
+        replay = BatchPhotos(images, stored.cameras[stored.replay.views])
         photos = replay.photos(), replay.photos(2)
         with log.stage("fit"):
             gaussians, report = fit(gaussians, photos, options, max_count, seed, log.fit_progress)

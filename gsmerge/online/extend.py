@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge import __version__
 from gsmerge.budget import AUTO
@@ -79,7 +77,7 @@ def extend(
 
     Args:
         state: What earlier batches left; None: this is the first one.
-        scene: The new views, in the same world as the earlier ones.
+        scene: The new views, in the same world as the earlier ones; of tensors, too, the state has arrays.
         options: Settings of all stages; None: the defaults, with the fit of the colours.
         online: What of the batch enters the state, and how; None: the defaults.
         progress: As of :func:`gsmerge.compact`.
@@ -92,17 +90,18 @@ def extend(
             is not that of the state.
     """
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
-    _check(state, scene, options, online.max_k if state is None else state.settings.max_k)
+    max_k = online.max_k if state is None else state.settings.max_k
+    _check(state, scene, options, max_k)
     log = RunLog(progress)
-    with use_threads(options.threads), torch.no_grad():
-        prepared = prepare(scene, options, log, None if state is None else state.frame)
-        require_children("max k", online.max_k if state is None else state.settings.max_k, prepared.checkpoint)
+    with use_threads(options.threads):
+        prepared = prepare(scene.numpy(), options, log, None if state is None else state.frame)
+        require_children("max k", max_k, prepared.checkpoint)
         prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
         merged = merge_views(prepared, count, log)
-        state, counts = _add_batch(state, prepared, merged, online, log)
+        state, counts = _add_batch(state, prepared, merged, online, max_k, log)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = to_schema(options.to_dict()) | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
@@ -114,15 +113,19 @@ def extend(
 
 
 def _add_batch(
-    state: OnlineState | None, prepared: PreparedScene, merged: MergedViews, online: OnlineOptions, log: RunLog
+    state: OnlineState | None,
+    prepared: PreparedScene,
+    merged: MergedViews,
+    online: OnlineOptions,
+    max_k: int,
+    log: RunLog,
 ) -> tuple[OnlineState, dict[str, int]]:
     """The state with a batch in it, and what became of the batch's groups by key of the report."""
     scene, options = prepared.scene, prepared.options
-    max_k = online.max_k if state is None else state.settings.max_k
     size = scene.cameras if state is None else state.cameras
     photos = resize_photos(scene_pictures(scene), scene.cameras, size.width, size.height)
     counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
-    features, rows = merged.features, torch.zeros(0, dtype=torch.int64)
+    features, rows = merged.features, np.zeros(0, np.int64)
     if state is not None:
         with log.stage("cover"):
             rows = rows_in_view(state.groups.features, photos.cameras)
@@ -138,8 +141,7 @@ def _add_batch(
             state = _first_state(new, prepared, max_k)
         else:
             groups, entered = _enter(state.groups, new, prepared, photos, rows, max_k)
-            new_views = torch.from_numpy(ids >= len(state.cameras))
-            state = _grown_state(state, groups, prepared, photos.cameras[new_views])
+            state = _grown_state(state, groups, prepared, photos.cameras[ids >= len(state.cameras)])
             counts |= entered
     if prepared.given.images is None:
         return state, counts
@@ -169,7 +171,7 @@ def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, option
 
 
 def _enter(
-    groups: GroupSet, new: GroupSet, prepared: PreparedScene, photos: BatchPhotos, rows: Tensor, max_k: int
+    groups: GroupSet, new: GroupSet, prepared: PreparedScene, photos: BatchPhotos, rows: np.ndarray, max_k: int
 ) -> tuple[GroupSet, dict[str, int]]:
     """The state's groups with new ones among them, and how many were merged and how many no view shows.
 
@@ -178,43 +180,43 @@ def _enter(
     options = prepared.options
     partners = find_partners(take(groups.features, rows), new.features, options.match)
     has_partner = partners >= 0
-    joining = select_groups(new, torch.nonzero(has_partner)[:, 0])
+    joining = select_groups(new, np.flatnonzero(has_partner))
     groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
-    alone = select_groups(new, torch.nonzero(~has_partner)[:, 0])
+    alone = select_groups(new, np.flatnonzero(~has_partner))
     counts = {"num_joined": int(has_partner.sum())}
     if options.fit.min_contribution > 0 and prepared.scene.images is not None:
         in_view = feature_to_gaussians(take(groups.features, rows))
         both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
         visible = visible_mask(both, photos.photos(2), options.fit.min_contribution)[len(in_view) :]
         counts["num_hidden"] = int((~visible).sum())
-        alone = select_groups(alone, torch.nonzero(visible)[:, 0])
+        alone = select_groups(alone, np.flatnonzero(visible))
     return concat_groups([groups, alone]), counts
 
 
-def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> Tensor:
+def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
     """``[n]`` int64: the state's group that shows the same surface as each new one, -1 for none; no group gets two.
 
     Matched as across the views of one batch, the state being one view and the batch another.
     """
     both = FeatureGaussians.concat([features, new])
-    sides = (torch.arange(len(both)) >= len(features)).long()
+    sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
     matches = match(replace(both, views=sides), replace(options, cluster_size=2))
-    owner = torch.full((matches.count,), -1)
-    owner[matches.clusters[: len(features)]] = torch.arange(len(features))
+    owner = np.full(matches.count, -1)
+    owner[matches.clusters[: len(features)]] = np.arange(len(features))
     return owner[matches.clusters[len(features) :]]
 
 
-def merge_into(groups: GroupSet, new: GroupSet, rows: Tensor, max_k: int) -> GroupSet:
+def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) -> GroupSet:
     """Merge n new groups into those of the state at ``rows [n]`` int64, all different: moments add up, in place."""
     if len(rows) == 0:
         return groups
     old = select_groups(groups, rows)
     both = concat_groups([old, new])
-    pairs = torch.arange(len(rows)).repeat(2)
+    pairs = np.tile(np.arange(len(rows)), 2)
     features = merge(both.features, Matches(pairs, len(rows)))
     children = both.children[features.members]
-    fitted_sh0 = torch.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
-    merged = GroupSet(replace(features, members=torch.arange(len(children))), children, fitted_sh0, old.color_precision)
+    fitted_sh0 = np.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
+    merged = GroupSet(replace(features, members=np.arange(len(children))), children, fitted_sh0, old.color_precision)
     return replace_groups(groups, rows, limit_children(merged, max_k))
 
 

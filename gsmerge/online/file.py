@@ -11,7 +11,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import torch
 
 from gsmerge.compact_file import read_input
 from gsmerge.encoded.encoded import Encoded
@@ -31,22 +30,22 @@ from gsmerge.types import Cameras
 def save_state(path: str | PathLike[str], state: OnlineState, *, overwrite: bool = False) -> None:
     """Write a state, bit for bit as it is in memory."""
     groups, replay = state.groups, state.replay
-    tensors = {
-        "children.counts": groups.features.starts.diff().to(torch.uint8),
-        "features.solved": groups.fitted_sh0.float(),
-        "features.held": groups.color_precision.float(),
-        "replay.images": torch.from_numpy(replay.images),
-        "replay.views": torch.from_numpy(replay.views).int(),
+    arrays = {
+        "children.counts": np.diff(groups.features.starts).astype(np.uint8),
+        "features.solved": groups.fitted_sh0,
+        "features.held": groups.color_precision,
+        "replay.images": replay.images,
+        "replay.views": replay.views.astype(np.int32),
     }
     entries, children = {"about": dict(state.about)}, ("children", groups.children)
-    write_gsm(path, STATE, state, groups.features, children, entries, tensors, overwrite=overwrite)
+    write_gsm(path, STATE, state, groups.features, children, entries, arrays, overwrite=overwrite)
 
 
 def load_state(path: str | PathLike[str]) -> OnlineState:
     """A state from a file, or an encoded scene (:func:`gsmerge.save_encoded`) as a state.
 
     Raises:
-        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks a tensor, or holds
+        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
             numbers out of range.
     """
     stored = load_stored(path)
@@ -71,21 +70,21 @@ def _read_groups(file: GsmFile, max_k: int) -> GroupSet:
     """The groups, each with at least one child and no more than ``max_k``."""
     features = file.features()
     g = len(features)
-    counts = file.tensor("children.counts", torch.uint8, g).long()
+    counts = file.array("children.counts", np.uint8, g).astype(np.int64)
     if g and not 1 <= int(counts.min()) <= int(counts.max()) <= max_k:
         raise file.error(f"children.counts: expected 1 to {max_k}, found others")
     return GroupSet(
-        features=with_child_rows(features, torch.arange(g).repeat_interleave(counts).numpy()),
+        features=with_child_rows(features, np.arange(g).repeat(counts)),
         children=file.gaussians("children", int(counts.sum()), features.shN.shape[1]),
-        fitted_sh0=file.tensor("features.solved", torch.float32, g, 1, 3),
-        color_precision=file.tensor("features.held", torch.float32, g),
+        fitted_sh0=file.array("features.solved", np.float32, g, 1, 3),
+        color_precision=file.array("features.held", np.float32, g),
     )
 
 
 def _read_replay(file: GsmFile, cameras: Cameras) -> Replay:
     """The stored photos, of views that are there."""
-    views = file.tensor("replay.views", torch.int32, None).long().numpy()
-    images = file.tensor("replay.images", torch.uint8, len(views), cameras.height, cameras.width, 3).numpy()
+    views = file.array("replay.views", np.int32, None).astype(np.int64)
+    images = file.array("replay.images", np.uint8, len(views), cameras.height, cameras.width, 3)
     if len(views) and not (views[0] >= 0 and views[-1] < len(cameras) and (np.diff(views) > 0).all()):
         raise file.error("replay.views: expected views of the state, each once and in order, found others")
     return Replay(images, views)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.online.options import OnlineOptions
@@ -22,9 +20,9 @@ def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
 
     The only step that goes through all groups: the time of those after it depends on what the views see.
     """
-    means = features.means.double().numpy()
-    radii = REACH * np.sqrt(features.covars.double().diagonal(dim1=1, dim2=2).sum(1).numpy())
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    means = features.means.astype(np.float64)
+    radii = REACH * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> np.ndarray:
         viewmat, K = viewmats[view], Ks[view]
@@ -40,9 +38,9 @@ def groups_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
     return np.stack(parallel_map(one_view, range(len(cameras))))
 
 
-def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> Tensor:
+def rows_in_view(features: FeatureGaussians, cameras: Cameras) -> np.ndarray:
     """Rows, rising, of the groups that may show in some view."""
-    return torch.from_numpy(np.flatnonzero(groups_in_view(features, cameras).any(0)))
+    return np.flatnonzero(groups_in_view(features, cameras).any(0))
 
 
 def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
@@ -60,10 +58,9 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
     """``[g]`` mean of the pixels' errors ``[v,h,w]`` over each group's members; one without a pixel counts as 1."""
-    rows = features.members.numpy()
+    starts, rows = features.starts, features.members
     pixels = rows if members.pixels is None else members.pixels[rows]
     each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)
-    starts = features.starts.numpy()
     return np.add.reduceat(each, starts[:-1]) / np.diff(starts)
 
 
@@ -74,15 +71,15 @@ def novel_rows(
     photos: Photos,
     cameras: Cameras,
     options: OnlineOptions,
-) -> Tensor:
+) -> np.ndarray:
     """Rows of a batch's groups that show something which the state does not show as well.
 
     ``there``: the state's Gaussians in view; ``photos``: the batch's, at half the state's size.
     """
     if options.tolerance == 0:
-        return torch.arange(len(features))
+        return np.arange(len(features))
     size = cameras.height, cameras.width
     errors = group_errors(features, members, pixel_errors(there, photos, *size))
     own_errors = group_errors(features, members, pixel_errors(feature_to_gaussians(features), photos, *size))
     limit = np.maximum(options.tolerance**2, options.margin**2 * own_errors)
-    return torch.from_numpy(np.flatnonzero(errors > limit))
+    return np.flatnonzero(errors > limit)

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.online.novelty import rows_in_view
@@ -36,25 +34,25 @@ class BatchPhotos:
         return photos_of(self.images, self.cameras, level)
 
 
-def resize_photos(images: Tensor, cameras: Cameras, width: int, height: int) -> BatchPhotos:
+def resize_photos(images: np.ndarray, cameras: Cameras, width: int, height: int) -> BatchPhotos:
     """Photos brought to another size (area averages)."""
-    arrays, size = images.numpy(), (width, height)
+    size = width, height
     if size == (cameras.width, cameras.height):
-        return BatchPhotos(arrays, cameras)
-    small = parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), arrays)
+        return BatchPhotos(images, cameras)
+    small = parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images)
     return BatchPhotos(np.stack(small), resize_cameras(cameras, width, height))
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     """The same views in pictures of another size."""
-    shape = torch.tensor([[width / cameras.width], [height / cameras.height], [1.0]], dtype=torch.float64)
-    return Cameras(cameras.viewmats.double(), cameras.Ks.double() * shape, width, height)
+    shape = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
+    return Cameras(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64) * shape, width, height)
 
 
 def concat_cameras(first: Cameras, second: Cameras) -> Cameras:
     """Cameras of one size, one after the other."""
-    viewmats = torch.cat([first.viewmats.double(), second.viewmats.double()])
-    return Cameras(viewmats, torch.cat([first.Ks.double(), second.Ks.double()]), first.width, first.height)
+    viewmats = np.concatenate([first.viewmats, second.viewmats], dtype=np.float64)
+    return Cameras(viewmats, np.concatenate([first.Ks, second.Ks], dtype=np.float64), first.width, first.height)
 
 
 def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
@@ -67,8 +65,8 @@ def view_ids(known: Cameras, cameras: Cameras) -> np.ndarray:
 
 def _rows(cameras: Cameras) -> list[bytes]:
     """Every camera as bytes."""
-    flat = torch.cat([cameras.viewmats.double().flatten(1), cameras.Ks.double().flatten(1)], 1)
-    return [row.tobytes() for row in flat.numpy()]
+    both = zip(cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64), strict=True)
+    return [viewmat.tobytes() + K.tobytes() for viewmat, K in both]
 
 
 def update_replay(
@@ -105,10 +103,10 @@ def fit_batch_colors(
     in_view, photos = select_groups(groups, rows), batch_photos.photos(2)
     before = replace(feature_to_gaussians(in_view.features), sh0=in_view.fitted_sh0)
     drawn = draw(before, photos)
-    after, report = fit_colors(before, drawn, photos, options, seed, in_view.color_precision.numpy())
+    after, report = fit_colors(before, drawn, photos, options, seed, in_view.color_precision)
     all_pixels = np.ones((photos.height, photos.width, 1), np.float32)
-    precision = in_view.color_precision.double().numpy()
+    precision = in_view.color_precision.astype(np.float64)
     for view in drawn.views:
         precision[view.ids] += apply_transposed(replace(view, weights=view.weights**2), all_pixels)[:, 0]
-    refitted = replace(in_view, fitted_sh0=after.sh0, color_precision=torch.from_numpy(precision).float())
+    refitted = replace(in_view, fitted_sh0=after.sh0, color_precision=precision.astype(np.float32))
     return replace_groups(groups, rows, refitted), report

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge import __version__
 from gsmerge.encoded.decode import children_of
@@ -14,10 +13,12 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredScene, without_members
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, Members, Rule, feature_to_gaussians, gaussian_members
-from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
+
+if TYPE_CHECKING:
+    from gsmerge.networks import NetworkContext
 
 CHILD_RULE: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
@@ -49,10 +50,10 @@ class GroupSet:
     children: Gaussians  # The Gaussians of the finest division, group by group
     # [g,1,3] base colours (sh0) that fit the photos so far. `features.sh0` stays as exported, for the full fit to
     # start from.
-    fitted_sh0: Tensor
+    fitted_sh0: np.ndarray
     # [g] how much earlier photos say about each fitted colour: the diagonal of their normal equations, which is the
     # sum of the squares of the group's blending weights over their half-size pixels
-    color_precision: Tensor
+    color_precision: np.ndarray
 
     def __len__(self) -> int:
         return len(self.features)
@@ -87,6 +88,8 @@ def bake(
     if max_k > 1:
         children, parents = divide(features, members, np.full(len(features), max_k), rule)
     if networks is not None:
+        from gsmerge.networks import decode_gaussians
+
         ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
         children = decode_gaussians(children, parents, features, networks)
     return _group_set(features, ones, children, parents)
@@ -94,9 +97,10 @@ def bake(
 
 def _group_set(features: FeatureGaussians, ones: Gaussians, children: Gaussians, parents: np.ndarray) -> GroupSet:
     """Groups with the moments of what they decode to (``ones``); ``parents``: the rising group of each child."""
-    neutral, no_latents = torch.ones(len(features)), torch.zeros(len(features), 0)
+    count = len(features)
+    neutral, no_latents = np.ones(count, np.float32), np.zeros((count, 0), np.float32)
     same = replace(features, gains=neutral, spreads=neutral, latents=no_latents, **moments_of(ones))
-    return GroupSet(with_child_rows(same, parents), children, ones.sh0, torch.zeros(len(features)))
+    return GroupSet(with_child_rows(same, parents), children, ones.sh0, np.zeros(count, np.float32))
 
 
 def from_encoded(encoded: Encoded) -> OnlineState:
@@ -122,14 +126,15 @@ def from_encoded(encoded: Encoded) -> OnlineState:
     )
 
 
-def moments_of(gaussians: Gaussians) -> dict[str, Tensor]:
+def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """The fields of Feature Gaussians that decode to given Gaussians, at gains and spreads of one."""
-    scales = gaussians.scales.double().sort(-1).values
-    opacities = gaussians.opacities.double().clamp(0, MAX_OPACITY)
+    scales = gaussians.scales.astype(np.float64)
+    _, middle, largest = np.sort(scales, -1).T
+    opacities = gaussians.opacities.astype(np.float64).clip(0, MAX_OPACITY)
     return {
         "means": gaussians.means,
-        "covars": covariances(gaussians.quats.double(), gaussians.scales.double()).float(),
-        "extinctions": (-torch.log1p(-opacities) * scales[:, 1] * scales[:, 2]).float(),
+        "covars": to_float32(covariances(gaussians.quats.astype(np.float64), scales)),
+        "extinctions": to_float32(-np.log1p(-opacities) * middle * largest),
         "sh0": gaussians.sh0,
         "shN": gaussians.shN,
     }
@@ -137,23 +142,21 @@ def moments_of(gaussians: Gaussians) -> dict[str, Tensor]:
 
 def with_child_rows(features: FeatureGaussians, parents: np.ndarray) -> FeatureGaussians:
     """Feature Gaussians whose members are the rows 0, 1, ... of their children; ``parents`` rising."""
-    sizes = torch.bincount(torch.from_numpy(parents), minlength=len(features))
-    starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
-    return replace(features, starts=starts, members=torch.arange(int(starts[-1])))
+    starts = np.concatenate([[0], np.bincount(parents, minlength=len(features)).cumsum()])
+    return replace(features, starts=starts, members=np.arange(len(parents)))
 
 
 def child_members(groups: GroupSet) -> Members:
     """The children as members of their groups."""
-    sizes = groups.features.starts.diff()
-    footprints = CHILD_FOOTPRINT * groups.features.footprints.repeat_interleave(sizes)
-    return gaussian_members(groups.children, footprints.numpy())
+    footprints = CHILD_FOOTPRINT * groups.features.footprints.repeat(np.diff(groups.features.starts))
+    return gaussian_members(groups.children, footprints)
 
 
-def select_groups(groups: GroupSet, rows: Tensor) -> GroupSet:
+def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
     """Some of the groups, with their children."""
     features = take(groups.features, rows)
     children = groups.children[features.members]
-    members = torch.arange(len(children))
+    members = np.arange(len(children))
     return GroupSet(replace(features, members=members), children, groups.fitted_sh0[rows], groups.color_precision[rows])
 
 
@@ -162,16 +165,16 @@ def concat_groups(sets: list[GroupSet]) -> GroupSet:
     features = FeatureGaussians.concat([groups.features for groups in sets])
     children = Gaussians.concat([groups.children for groups in sets])
     return GroupSet(
-        replace(features, members=torch.arange(len(children))),
+        replace(features, members=np.arange(len(children))),
         children,
-        torch.cat([groups.fitted_sh0 for groups in sets]),
-        torch.cat([groups.color_precision for groups in sets]),
+        np.concatenate([groups.fitted_sh0 for groups in sets]),
+        np.concatenate([groups.color_precision for groups in sets]),
     )
 
 
 def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
     """Groups with at most ``max_k`` children each, those of larger ones pooled."""
-    rows = torch.nonzero(groups.features.starts.diff() > max_k)[:, 0]
+    rows = np.flatnonzero(np.diff(groups.features.starts) > max_k)
     if len(rows) == 0:
         return groups
     large = select_groups(groups, rows)
@@ -180,19 +183,19 @@ def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
     return replace_groups(groups, rows, pooled)
 
 
-def replace_groups(groups: GroupSet, rows: Tensor, others: GroupSet) -> GroupSet:
+def replace_groups(groups: GroupSet, rows: np.ndarray, others: GroupSet) -> GroupSet:
     """The groups with some replaced by others, one for one and in place."""
-    index = torch.arange(len(groups))
-    index[rows] = len(groups) + torch.arange(len(rows))
+    index = np.arange(len(groups))
+    index[rows] = len(groups) + np.arange(len(rows))
     return select_groups(concat_groups([groups, others]), index)
 
 
 def with_fitted_colors(groups: GroupSet) -> GroupSet:
     """Groups and children in the colours that fit the photos."""
     offsets = groups.fitted_sh0 - groups.features.sh0
-    sizes = groups.features.starts.diff()
+    sizes = np.diff(groups.features.starts)
     features = replace(groups.features, sh0=groups.fitted_sh0)
-    children = replace(groups.children, sh0=groups.children.sh0 + offsets.repeat_interleave(sizes, 0))
+    children = replace(groups.children, sh0=groups.children.sh0 + offsets.repeat(sizes, 0))
     return replace(groups, features=features, children=children)
 
 

@@ -1,4 +1,4 @@
-"""Rendering that autograd can differentiate."""
+"""Rendering of tensors, which autograd can differentiate."""
 
 from __future__ import annotations
 
@@ -58,12 +58,14 @@ class _Render(torch.autograd.Function):
 
         drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
         ctx.plans = plans
+        images, alphas = torch.from_numpy(drawn.images), torch.from_numpy(drawn.alphas)
         # kept through autograd, so that it notices when one of them was overwritten in the meantime
-        ctx.save_for_backward(*tensors, drawn.images, drawn.alphas)
+        ctx.save_for_backward(*tensors, images, alphas)
         if drawn.depths is None:
-            return drawn.images, drawn.alphas
-        ctx.mark_non_differentiable(drawn.depths)
-        return drawn.images, drawn.alphas, drawn.depths
+            return images, alphas
+        depths = torch.from_numpy(drawn.depths)
+        ctx.mark_non_differentiable(depths)
+        return images, alphas, depths
 
     @staticmethod
     @once_differentiable
@@ -92,10 +94,13 @@ class _Render(torch.autograd.Function):
         return None, None, None, None, *gradients
 
 
-def render_differentiable(
+def render_tensors(
     gaussians: Gaussians, cameras: Cameras, background: Array, *, with_depths: bool, **options: Any
 ) -> Rendering:
-    """:func:`gsmerge.render` with a backward pass; same arguments, except for the checked ``[3]`` background."""
+    """:func:`gsmerge.render` of tensors on the CPU, with a backward pass.
+
+    Same arguments, except for the checked ``[3]`` background.
+    """
     tensors = (*vars(gaussians).values(), cameras.viewmats)
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)

@@ -64,7 +64,7 @@ def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike
         return blend(plan, view_colors(plan), background_color(background))
     if colors.shape != (len(plan.splats), 3):
         raise ValueError(f"colors: expected shape {[len(plan.splats), 3]}, got {list(colors.shape)}")
-    return blend(plan, np.ascontiguousarray(colors[plan.ids], np.float32), background_color(background))
+    return blend(plan, np.ascontiguousarray(colors.take(plan.ids, 0), np.float32), background_color(background))
 
 
 def splat_adjoint(plan: ViewPlan, image: Array) -> Array:

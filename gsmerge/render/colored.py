@@ -1,4 +1,4 @@
-"""One view of Gaussians with colours of their own, differentiable, on the CPU or on a GPU.
+"""One view of Gaussians with colours of their own, as tensors on the CPU, differentiable.
 
 What a training loop in torch needs: :func:`gsmerge.render` takes colours from spherical harmonics and cuts them at 0,
 these colours are taken as they are.
@@ -53,7 +53,7 @@ class _Draw(torch.autograd.Function):
 
 
 def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Image of one view, by the kernels or, where the tensors are not on the CPU, by gsplat.
+    """Image of one view, by the kernels; on a GPU there is :func:`gsmerge.render.cuda.rasterize`.
 
     Args:
         shape: Means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``, float32.
@@ -61,27 +61,14 @@ def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], backgroun
         camera: As :meth:`gsmerge.render.photos.Photos.camera` gives it.
 
     Returns:
-        ``[h,w,3]`` on the tensors' device, differentiable in all of them, and ``[n]`` bool: which Gaussians have a
-        footprint in the view.
+        ``[h,w,3]``, differentiable in all tensors, and ``[n]`` bool: which Gaussians have a footprint in the view.
     """
-    if colors.device.type == "cpu":
-        return _Draw.apply(camera, background, *shape, colors)
-    from gsmerge.render.cuda import rasterize
-
-    matrices = (torch.from_numpy(camera[name])[None].to(colors) for name in ("viewmat", "K"))
-    cameras = (*matrices, camera["width"], camera["height"])
-    drawn, reached = rasterize(shape, colors, cameras, torch.from_numpy(background), eps2d=camera["eps2d"])
-    return drawn.images[0], reached[0]
+    return _Draw.apply(camera, background, *shape, colors)
 
 
 def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:
     """``[n,3]`` colours that harmonics ``[n,1,3]`` and ``[n,k-1,3]`` show a view, not below 0, without gradient."""
     eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
-    if means.device.type != "cpu":
-        from gsmerge.render.cuda import harmonic_colors
-
-        with torch.no_grad():
-            return harmonic_colors(means, torch.cat([sh0, shN], 1), torch.from_numpy(eye).to(means))
     count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
     colors = np.empty((count, 3), np.float32)
     harmonics.view_colors(*arrays, np.arange(count, dtype=np.int32), eye, 0, count, colors)

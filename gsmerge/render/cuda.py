@@ -140,9 +140,13 @@ def rasterize(
         render_mode="RGB+ED" if with_depths else "RGB",
         rasterize_mode="antialiased" if antialiased else "classic",
     )
+    return Rendering(images[..., :3], alphas, images[..., 3:].detach() if with_depths else None), _reached(details)
+
+
+def _reached(details: dict[str, Any]) -> Tensor:
+    """``[c,n]`` bool of what gsplat says of a call: which Gaussians have a footprint in which view."""
     radii = details["radii"]  # one per axis from gsplat 1.5 on
-    reached = (radii > 0).all(-1) if radii.ndim == 3 else radii > 0
-    return Rendering(images[..., :3], alphas, images[..., 3:].detach() if with_depths else None), reached
+    return (radii > 0).all(-1) if radii.ndim == 3 else radii > 0
 
 
 def _no_zero(quats: Tensor) -> Tensor:
@@ -196,9 +200,7 @@ def peak_weights(
     first[1:] = pixels[1:] != pixels[:-1]
     starts = torch.nonzero(first)[:, 0]
     weights = alphas * (before - before[starts][first.cumsum(0) - 1]).exp().float()
-    radii = drawn["radii"]
-    reached = (radii > 0).all(-1) if radii.ndim == 3 else radii > 0
-    return peaks.scatter_reduce_(0, ids, weights, "amax"), reached[0]
+    return peaks.scatter_reduce_(0, ids, weights, "amax"), _reached(drawn)[0]
 
 
 def _empty(tensors: tuple[Tensor, ...], backgrounds: Tensor, size: tuple[int, int], with_depths: bool) -> Rendering:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.render.blend import background_color, blend, view_colors
-from gsmerge.render.plan import Array, Splats, ViewPlan, plan_view, prepare
+from gsmerge.render.plan import Splats, ViewPlan, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Array, Cameras, Gaussians, as_tensor
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +27,9 @@ class Rendering:
         depths: ``[c,h,w,1]`` float32 mean camera z of what was blended, 0 where nothing was; None if not asked for.
     """
 
-    images: Tensor
-    alphas: Tensor
-    depths: Tensor | None
+    images: Array
+    alphas: Array
+    depths: Array | None
 
 
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
@@ -36,9 +37,9 @@ def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array
 
     The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
     """
-    origin = cameras.centres.detach().double().mean(0).cpu().numpy() if len(cameras) else np.zeros(3)
-    viewmats, Ks = (matrices.detach().double().cpu().numpy() for matrices in (cameras.viewmats, cameras.Ks))
-    return prepare(gaussians, origin), viewmats, Ks
+    cameras = cameras.numpy()
+    origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)
+    return prepare(gaussians, origin), cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
 
 def draw_views(
@@ -58,24 +59,29 @@ def draw_views(
             np.divide(weighted, alphas[view], out=depths[view], where=alphas[view] > 0)
 
     parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
-    return Rendering(
-        torch.from_numpy(images), torch.from_numpy(alphas), None if depths is None else torch.from_numpy(depths)
-    )
+    return Rendering(images, alphas, depths)
 
 
-def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device:
-    """The device of all tensors."""
-    devices = {tensor.device for tensor in (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)}
+def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device | None:
+    """The device that all tensors are on; None where there are none."""
+    values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
+    devices = {value.device for value in values if not isinstance(value, np.ndarray)}
     if len(devices) > 1:
         named = " and ".join(sorted(map(str, devices)))
         raise ValueError(f"expected Gaussians and cameras on one device, got {named}; move them with .to(device)")
-    return devices.pop()
+    return devices.pop() if devices else None
+
+
+def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
+    import torch
+
+    return torch.is_grad_enabled() and any(t.requires_grad for t in (*vars(gaussians).values(), cameras.viewmats))
 
 
 def render(
     gaussians: Gaussians,
     cameras: Cameras,
-    background: float | Sequence[float] | Tensor = 0.0,
+    background: float | Sequence[float] | Array = 0.0,
     *,
     antialiased: bool = False,
     near: float = 0.01,
@@ -84,12 +90,12 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    CUDA tensors are rendered by gsplat (``pip install "gsmerge[cuda]"``), and the results are on their device; all
-    others on the CPU. How the two differ: :mod:`gsmerge.render.cuda`.
+    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install "gsmerge[cuda]"``), and
+    the results are on their device; all others on the CPU. How the two differ: :mod:`gsmerge.render.cuda`.
 
-    Images and alphas are differentiable with respect to every tensor of the Gaussians and the view matrices, where
-    autograd is on and one of them asks for it; depths and intrinsics are not. No gradient passes where alpha is
-    clamped at 0.99 or a colour at 0.
+    Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians and the view
+    matrices, where autograd is on and one of them asks for it; depths and intrinsics are not. No gradient passes where
+    alpha is clamped at 0.99 or a colour at 0.
 
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.
@@ -107,20 +113,25 @@ def render(
         ValueError: If the background or the depth range makes no sense, or the tensors are on several devices.
         GsmergeError: If CUDA tensors are given and gsplat is not installed.
     """
-    under = background_color(background.detach().cpu() if isinstance(background, Tensor) else background)
+    under = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
-    if one_device(gaussians, cameras).type == "cuda":
-        from gsmerge.render.cuda import render_cuda
+    device = one_device(gaussians, cameras)
+    if device is not None:  # torch is imported only for those who have tensors
+        gaussians, cameras = gaussians.to(device), cameras.to(device)
+        if device.type == "cuda":
+            from gsmerge.render.cuda import render_cuda
 
-        return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
-    inputs = (*vars(gaussians).values(), cameras.viewmats)
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
-        from gsmerge.render.autograd import render_differentiable  # compiled only for those who train
+            return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
+        if _needs_gradient(gaussians, cameras):
+            from gsmerge.render.autograd import render_tensors  # compiled only for those who train
 
-        return render_differentiable(gaussians, cameras, under, with_depths=with_depths, **options)
+            return render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
     def plan_one(view: int) -> ViewPlan:
         return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
 
-    return draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+    drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+    if device is None:
+        return drawn
+    return Rendering(*(None if part is None else as_tensor(part) for part in vars(drawn).values()))

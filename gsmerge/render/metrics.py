@@ -1,35 +1,27 @@
-"""Image metrics on sRGB values in [0, 1]."""
+"""Image metrics on sRGB values in [0, 1], of arrays or tensors."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
-Array = NDArray[Any]
+from gsmerge.types import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
 
 
-def _as_array(image: Array | Tensor) -> Array:
-    return image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
-
-
-def image_pair(image: Array | Tensor, reference: Array | Tensor) -> tuple[Array, Array]:
+def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
     """Two images ``[h,w,c]`` of one shape as arrays; a ValueError otherwise."""
-    first, second = _as_array(image), _as_array(reference)
+    first, second = as_array(image), as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
     return first, second
 
 
-def pixel_mask(mask: Array | Tensor, image: Array) -> Array:
+def pixel_mask(mask: Array, image: Array) -> Array:
     """``[h,w]`` bool of an image ``[h,w,c]``, at least one pixel; a ValueError otherwise."""
-    chosen = _as_array(mask).astype(bool)
+    chosen = as_array(mask).astype(bool)
     if chosen.ndim == 3 and chosen.shape[2] == 1:
         chosen = chosen[..., 0]
     if chosen.shape != image.shape[:2]:
@@ -39,7 +31,7 @@ def pixel_mask(mask: Array | Tensor, image: Array) -> Array:
     return chosen
 
 
-def psnr(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor | None = None) -> float:
+def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Peak signal-to-noise ratio.
 
     Args:
@@ -59,7 +51,7 @@ def psnr(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor 
     return -10 * float(np.log10(error)) if error > 0 else float("inf")
 
 
-def ssim(image: Array | Tensor, reference: Array | Tensor, mask: Array | Tensor | None = None) -> float:
+def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     """Structural similarity as in the literature (Wang et al. 2004): Gaussian windows of 11 x 11 pixels.
 
     The mean over channels and over the windows that lie wholly inside the image, as scikit-image's

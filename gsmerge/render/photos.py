@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-from torch import Tensor
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
@@ -61,7 +60,7 @@ class Photos:
         }
 
 
-def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
+def scene_pictures(scene: PixelScene | UnalignedScene) -> np.ndarray:
     """``[v,h,w,3]`` photos, or pictures made of the Gaussians' base colours where there are none.
 
     Raises:
@@ -72,14 +71,14 @@ def scene_pictures(scene: PixelScene | UnalignedScene) -> Tensor:
     if isinstance(scene, UnalignedScene):
         raise ValueError("expected a scene with images")
     shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
-    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clamp(0, 1).reshape(shape)
+    return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).reshape(shape)
 
 
 def scene_photos(scene: PixelScene | UnalignedScene, level: float = 1) -> Photos:
     """The scene's photos, each side divided by ``level`` (area averages)."""
     if scene.images is None:
         raise ValueError("expected a scene with images")
-    return photos_of(scene.images.numpy(), scene.cameras, level)
+    return photos_of(scene.images, scene.cameras, level)
 
 
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
@@ -94,7 +93,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
     """Black photos, which take no memory, for what only needs the cameras; each side divided by ``level``."""
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
     black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))
@@ -136,29 +135,25 @@ def photo_errors(
     return parallel_map(one_view, chosen)
 
 
-def photo_psnr(gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], **settings: Any) -> float:
-    """Mean over some views of the PSNR (dB) of their photos; ``settings`` as of :func:`photo_errors`."""
+def photo_psnr(
+    gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, quarter: bool = False, **settings: Any
+) -> float:
+    """Mean over some views of the PSNR (dB) of their photos.
 
-    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
-        return psnr(np.clip(image, 0, 1), photos.images[view])
-
-    return float(np.mean(photo_errors(gaussians, photos, score, views, **settings)))
-
-
-def quarter_psnr(gaussians: Gaussians | Splats, photos: Photos, views: Iterable[int], *, near: float) -> float:
-    """:func:`photo_psnr` of the :func:`scored_tiles` alone, for a quarter to a half of the time."""
+    Args:
+        quarter: Of the :func:`scored_tiles` alone, for a quarter to a half of the time.
+        settings: As of :func:`photo_errors`.
+    """
 
     def tiles(view: int) -> np.ndarray | None:
-        return scored_tiles(view, photos.width, photos.height)
+        return scored_tiles(view, photos.width, photos.height) if quarter else None
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
-        chosen, photo = tiles(view), photos.images[view]
-        if chosen is None:
-            return psnr(np.clip(image, 0, 1), photo)
-        pixels = chosen.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
-        return psnr(np.clip(image[pixels], 0, 1)[None], photo[pixels][None])
+        chosen = tiles(view)
+        mask = None if chosen is None else chosen.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
+        return psnr(np.clip(image, 0, 1), photos.images[view], mask)
 
-    return float(np.mean(photo_errors(gaussians, photos, score, views, near=near, tiles=tiles)))
+    return float(np.mean(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings)))
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:

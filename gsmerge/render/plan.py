@@ -7,9 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from gsmerge.kernels.raster import binning
 from gsmerge.kernels.raster import project as projection
@@ -67,19 +65,19 @@ class ViewPlan:
         return -(-self.height // projection.TILE)
 
 
-def _float32(tensor: Tensor) -> Array:
-    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+def _float32(array: Array) -> Array:
+    return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def _spread_origin(means: Tensor) -> Array:
+def _spread_origin(means: Array) -> Array:
     """Zero, or where the Gaussians are when they are so far from zero that float32 would blur them."""
-    sample = means[:: max(1, len(means) // 4096)].detach().double()
-    sample = sample[torch.isfinite(sample).all(1)]
+    sample = means[:: max(1, len(means) // 4096)].astype(np.float64)
+    sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
         return np.zeros(3)
-    centre = sample.median(0).values
-    spread = (sample - centre).abs().median(0).values.max()
-    return centre.cpu().numpy() if centre.abs().max() > 16 * spread else np.zeros(3)
+    centre = np.median(sample, axis=0)
+    spread = np.median(np.abs(sample - centre), axis=0).max()
+    return centre if np.abs(centre).max() > 16 * spread else np.zeros(3)
 
 
 def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
@@ -90,10 +88,9 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
         origin: ``[3]`` world point that becomes the arrays' zero. None: the world's zero, unless the scene is far
             away from it compared with its size.
     """
+    gaussians = gaussians.numpy()
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    means = gaussians.means
-    if start.any():
-        means = means.double() - torch.from_numpy(start).to(means.device)
+    means = gaussians.means - start if start.any() else gaussians.means
     return Splats(
         means=_float32(means),
         quats=_float32(gaussians.quats),

@@ -10,7 +10,7 @@ from gsmerge.runtime.memory import machine_memory
 MAX_SCORED_VIEWS = 24  # views that whole scenes are scored by
 
 # Time. Only right within a factor of two: measured on 12 and on 84 views of 480 pixels, with compiled kernels.
-IMPORT_SECONDS = 1.5
+IMPORT_SECONDS = 0.8
 # Processor seconds per million pixels of all views together, or per million Gaussians, which is the same number:
 COST_READ = 0.7
 COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "bass-adaptive": 6.0, "slic": 4.5, "grid": 0.0}
@@ -27,7 +27,7 @@ COST_UNMERGED_STEP = 0.15  # for each step of the full fit of an input that was 
 COST_FULL_FIT = 0.2
 
 # Memory, in bytes.
-BYTES_FIXED = 450_000_000  # interpreter, torch and numba
+BYTES_FIXED = 250_000_000  # interpreter, numba and kernels
 BYTES_PER_GAUSSIAN = 150
 BYTES_PER_VALUE = 4.5  # of higher harmonics, per Gaussian: those of the scene, and of some of its groups
 BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering hold of it

@@ -3,13 +3,15 @@
 Numba kernels are compiled single-threaded and release the GIL; parallelism is over views (or bands of an image)
 and lives here. So there is one barrier per pass over the views instead of one per loop, nothing spins, and a
 result cannot depend on the number of threads: every item is computed alone, and results come back in order.
-OpenCV and torch are held to one thread each while a pool is in use, so that the three do not fight for the cores.
+OpenCV and torch are held to one thread each while a pool is in use, so that the three do not fight for the cores;
+torch only where somebody else imports it.
 """
 
 from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -17,7 +19,6 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import cv2
-import torch
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -30,6 +31,7 @@ class _Local(threading.local):
     pool: ThreadPoolExecutor | None = None
     count = 1
     inside = False  # True on the pool's own threads: they must not wait for a pool
+    holds_torch = False  # whether torch was held to one thread for this thread's pool
 
 
 class _Libraries:
@@ -37,7 +39,8 @@ class _Libraries:
 
     lock = threading.Lock()
     pools = 0
-    before = (1, 1)  # torch's and OpenCV's threads before the first pool
+    opencv = 1  # its threads before the first pool
+    torch: int | None = None  # the same; None where torch is not held
 
 
 _local, _libraries = _Local(), _Libraries()
@@ -65,11 +68,13 @@ def use_threads(count: int | None = None) -> Iterator[int]:
     if count < 1:
         raise ValueError(f"expected at least 1 thread, got {count}")
     if _local.pool is not None or _local.inside:
+        hold_torch()
         yield _local.count
         return
-    _hold_libraries()
+    _hold_opencv()
     _local.pool = ThreadPoolExecutor(max(1, count - 1), thread_name_prefix="gsmerge", initializer=_enter_pool)
     _local.count = count
+    hold_torch()
     try:
         yield count
     finally:
@@ -78,23 +83,40 @@ def use_threads(count: int | None = None) -> Iterator[int]:
         _release_libraries()
 
 
-def _hold_libraries() -> None:
-    """One thread each for torch and OpenCV."""
+def _hold_opencv() -> None:
     with _libraries.lock:
         if _libraries.pools == 0:
-            _libraries.before = torch.get_num_threads(), cv2.getNumThreads()
+            _libraries.opencv = cv2.getNumThreads()
         _libraries.pools += 1
-        torch.set_num_threads(1)
         cv2.setNumThreads(1)
+
+
+def hold_torch() -> None:
+    """Hold torch to one thread until the calling thread's pool goes, if there is one and torch is imported.
+
+    :func:`use_threads` and :func:`parallel_map` do so; who imports torch while a pool is in use does it before the
+    first computation.
+    """
+    torch = sys.modules.get("torch")
+    if _local.pool is None or _local.holds_torch or torch is None or not hasattr(torch, "set_num_threads"):
+        return
+    with _libraries.lock:
+        if _libraries.torch is None:
+            _libraries.torch = torch.get_num_threads()
+        torch.set_num_threads(1)
+        _local.holds_torch = True
 
 
 def _release_libraries() -> None:
     """Give torch its threads back on this thread, and OpenCV when no caller is left."""
     with _libraries.lock:
         _libraries.pools -= 1
-        torch.set_num_threads(_libraries.before[0])
+        if _local.holds_torch:
+            sys.modules["torch"].set_num_threads(_libraries.torch)
+            _local.holds_torch = False
         if _libraries.pools == 0:
-            cv2.setNumThreads(_libraries.before[1])
+            cv2.setNumThreads(_libraries.opencv)
+            _libraries.torch = None
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:

@@ -12,8 +12,6 @@ from threading import Lock
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
@@ -94,7 +92,7 @@ def split_unseen(
     if options.contribution.unseen != "keep":
         return scene, options, None
     weights = seen_weights(scene)
-    seen = torch.from_numpy((weights > 0) & (weights >= options.contribution.min_owner_weight))
+    seen = (weights > 0) & (weights >= options.contribution.min_owner_weight)
     num_unseen = int((~seen).sum())
     log.notes.append(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
     if num_unseen in (0, len(seen)):
@@ -111,7 +109,7 @@ def split_unseen(
 
 def merge_neighbors(gaussians: Gaussians, scene: UnalignedScene, count: int, options: CompactOptions) -> Gaussians:
     """At most ``count`` Gaussians in place of n >= count: runs along a space-filling curve (Morton's) are merged."""
-    order = np.argsort(morton_codes(gaussians.means.double().numpy()), kind="stable")
+    order = np.argsort(morton_codes(gaussians.means.astype(np.float64)), kind="stable")
     members = unaligned_members(replace(scene, gaussians=gaussians), np.full(len(gaussians), -1, np.int64))
     starts = np.linspace(0, len(order), count + 1).astype(np.int64)
     moments = pool_members(members, starts, order, options.encode.rule)
@@ -146,13 +144,13 @@ def find_owners(scene: UnalignedScene, groups: Groups, near: float = 0.01) -> Ow
         near: Nearest depth that is seen.
     """
     splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     count, lock = len(splats), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
     def one_view(view: int) -> None:
         plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
-        values, labels = view_owners(plan, groups.labels[view].numpy(), groups.counts[view])
+        values, labels = view_owners(plan, groups.labels[view], groups.counts[view])
         with lock:
             old, first = best.values[plan.ids], best.views[plan.ids]
             better = (values > old) | ((values == old) & (labels >= 0) & (view < first))
@@ -171,7 +169,7 @@ def seen_weights(scene: UnalignedScene, near: float = 0.01) -> np.ndarray:
         near: Nearest depth that is seen.
     """
     splats, cameras = prepare(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     most, lock = np.zeros(len(splats), np.float32), Lock()
 
     def one_view(view: int) -> None:
@@ -184,7 +182,7 @@ def seen_weights(scene: UnalignedScene, near: float = 0.01) -> np.ndarray:
     return most
 
 
-def seen_depths(scene: UnalignedScene, near: float = 0.01) -> tuple[Tensor, Tensor]:
+def seen_depths(scene: UnalignedScene, near: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
     """``[v,h,w]`` mean depth of what each pixel shows, and ``[v,h,w]`` whether it mostly shows something.
 
     Args:
@@ -240,10 +238,10 @@ def owner_pixels(owners: Owners, groups: Groups, min_owner_weight: float = 0.0) 
         min_owner_weight: Those with less are taken for unseen, too.
     """
     counts = np.asarray(groups.counts)
-    size, first = groups.labels[0].numel(), np.cumsum(counts) - counts
+    size, first = groups.labels[0].size, np.cumsum(counts) - counts
 
     def one_view(view: int) -> np.ndarray:
-        return middle_pixels(groups.labels[view].numpy(), groups.counts[view]) + view * size
+        return middle_pixels(groups.labels[view], groups.counts[view]) + view * size
 
     middles = np.concatenate(parallel_map(one_view, range(len(counts))))
     seen = (owners.labels >= 0) & (owners.values >= min_owner_weight)

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 
 from gsmerge.kernels.gaussians.backing import draw_in, image_extinctions
 from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.encode import from_moments, member_rows
-from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene
+from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene, to_float32
 
 
 @dataclass(frozen=True)
@@ -67,15 +66,15 @@ def encode_backing(
     drawn = _draw_in_members(scene, members, starts, ids, views)
     layer = from_moments(pool_members(drawn, starts, ids), starts, ids, views)
     optical_depths = _image_optical_depths(scene, drawn, layer)
-    scales, _ = principal_axes(layer.covars.double().numpy())
-    centres, grow = scene.cameras.centres.float()[layer.views], 1 + options.push
+    scales, _ = principal_axes(layer.covars)
+    centres, grow = scene.cameras.centres.astype(np.float32)[layer.views], 1 + options.push
     return replace(
         layer,
         means=centres + (layer.means - centres) * grow,
-        extinctions=torch.from_numpy(optical_depths * scales[:, 1] * scales[:, 2]).float(),
+        extinctions=to_float32(optical_depths * scales[:, 1] * scales[:, 2]),
         spreads=layer.spreads * options.backing_spread * grow,
-        backing=torch.ones(len(layer), dtype=torch.bool),
-        latents=torch.zeros(len(layer), features.latents.shape[1]),
+        backing=np.ones(len(layer), bool),
+        latents=np.zeros((len(layer), features.latents.shape[1]), np.float32),
     )
 
 
@@ -86,8 +85,8 @@ def _view_slices(views: np.ndarray, num_views: int) -> list[slice]:
 
 
 def _camera(scene: PixelScene | UnalignedScene, view: int) -> tuple[np.ndarray, float, float]:
-    K = scene.cameras.Ks[view].double()
-    return scene.cameras.viewmats[view].double().numpy(), float(K[0, 0]), float(K[1, 1])
+    K = scene.cameras.Ks[view]
+    return scene.cameras.viewmats[view].astype(np.float64), float(K[0, 0]), float(K[1, 1])
 
 
 def _draw_in_members(
@@ -117,7 +116,7 @@ def _draw_in_members(
 
 def _image_optical_depths(scene: PixelScene | UnalignedScene, members: Members, layer: FeatureGaussians) -> np.ndarray:
     """Optical depth ``[g]`` that covers as much of the source image as the members did."""
-    starts, ids, views = layer.starts.numpy(), layer.members.numpy(), layer.views.numpy()
+    starts, ids, views = layer.starts, layer.members, layer.views
     sums = np.zeros(len(layer))
 
     def one_view(item: tuple[int, slice]) -> None:
@@ -128,14 +127,14 @@ def _image_optical_depths(scene: PixelScene | UnalignedScene, members: Members, 
         image_extinctions(
             own, ids, m.means, m.quats, m.scales, m.opacities, m.footprints, viewmat, fx, fy, sums[groups]
         )
-        camera = layer.means[groups].double().numpy() @ viewmat[:3, :3].T + viewmat[:3, 3]
+        camera = layer.means[groups].astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
         x, y, z = camera.T
         z = np.maximum(z, 1e-9)
         jacobian = np.zeros((len(z), 2, 3))
         jacobian[:, 0, 0], jacobian[:, 0, 2] = fx / z, -fx * x / z**2
         jacobian[:, 1, 1], jacobian[:, 1, 2] = fy / z, -fy * y / z**2
         half = jacobian @ viewmat[:3, :3]
-        image = half @ layer.covars[groups].double().numpy() @ half.transpose(0, 2, 1)
+        image = half @ layer.covars[groups].astype(np.float64) @ half.transpose(0, 2, 1)
         sums[groups] /= np.sqrt(np.maximum(np.linalg.det(image), 1e-12))
 
     parallel_map(one_view, enumerate(_view_slices(views, len(scene))))

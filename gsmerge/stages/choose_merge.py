@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.moments import Rule, feature_to_gaussians
@@ -174,21 +173,20 @@ def _spreads(features: FeatureGaussians, options: RobustOptions) -> Iterator[tup
 
 def merge_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) -> float:
     """Mean PSNR (dB) of the photos, of many some, rendered from all Gaussians, or those of the other views only."""
-    views = features.views.numpy()
-    keep = (lambda view: views != view) if left_out else None
+    keep = (lambda view: features.views != view) if left_out else None
     return photo_psnr(feature_to_gaussians(features), photos, scored_views(len(photos)), keep=keep)
 
 
-def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) -> torch.Tensor:
+def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) -> np.ndarray:
     """Gains ``[g]`` from what the other views' photos show where a Gaussian appears in them.
 
     Optical depth times ``boost / (1 + (colour error / tolerance)^2)``; the error is measured in renders without
     the Gaussian's own view. Gaussians that no other view sees keep the boosted depth.
     """
-    gaussians, views = feature_to_gaussians(features), features.views.numpy()
+    gaussians, views = feature_to_gaussians(features), features.views
     splats = prepare(gaussians)
-    colors = sh0_to_rgb(gaussians.sh0[:, 0]).double().numpy()
-    boosted = -options.boost * np.log1p(-gaussians.opacities.double().numpy())
+    colors = sh0_to_rgb(gaussians.sh0[:, 0]).astype(np.float64)
+    boosted = -options.boost * np.log1p(-gaussians.opacities.astype(np.float64))
     trust = np.ones(len(features))
     for round_index in range(options.rounds):
         opacities = np.clip(1 - np.exp(-boosted * trust), 1e-4, 0.999).astype(np.float32)
@@ -208,7 +206,7 @@ def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) ->
         seen = mass / (mass + 1)
         fresh = seen / (1 + error / options.tolerance**2) + 1 - seen
         trust = np.maximum(fresh if round_index == 0 else np.sqrt(trust * fresh), 0.05)
-    return torch.from_numpy(options.boost * trust).float()
+    return (options.boost * trust).astype(np.float32)
 
 
 def choose_start(
@@ -260,7 +258,7 @@ def views_psnr(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> floa
 def _photos(scene: PixelScene | UnalignedScene) -> Photos:
     """The photos at half size, or the pictures that stand in for them."""
     if scene.images is None:
-        scene = replace(scene, images=scene_pictures(scene).contiguous())
+        scene = replace(scene, images=scene_pictures(scene))
     return scene_photos(scene, 2)
 
 
@@ -269,4 +267,4 @@ def _weight(scene: PixelScene | UnalignedScene, view: int, photos: Photos) -> np
     size = photos.width, photos.height
     if isinstance(scene, UnalignedScene):
         return np.ones(size[::-1], np.float32)
-    return cv2.resize(scene.valid[view].numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(scene.valid[view].astype(np.float32), size, interpolation=cv2.INTER_AREA)

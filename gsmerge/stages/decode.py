@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.networks import NetworkContext, decode_gaussians
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.merge import MergedViews
 from gsmerge.types import FeatureGaussians, Gaussians
+
+if TYPE_CHECKING:
+    from gsmerge.networks import NetworkContext
 
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
@@ -101,6 +103,8 @@ def decode(
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
     if networks is not None:
+        from gsmerge.networks import decode_gaussians
+
         gaussians = decode_gaussians(gaussians, parents, features, networks)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
@@ -150,11 +154,11 @@ def mixed_counts(
     Returns:
         ``[g]`` int64.
     """
-    starts, ids = features.starts.numpy(), features.members.numpy()
+    starts, ids = features.starts, features.members
     pixels = ids if members.pixels is None else members.pixels[ids]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     means = np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
-    front = ~features.backing.numpy()
+    front = ~features.backing
     low, high = np.percentile(means[front], (options.k_low, options.k_high)) if front.any() else (0.0, 0.0)
     counts = np.where(front, 1 + (means > low) + 2 * (means > high), 1)
     if options.k_rule == "distortion":
@@ -177,7 +181,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     groups = segmentation.groups
     sizes = np.array(groups.counts)
     seen = members.pixels[members.pixels >= 0]
-    labels = groups.labels.reshape(-1).numpy()[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].numel()]
+    labels = groups.labels.reshape(-1)[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].size]
     num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
     return min(segmentation.count, options.max_k * (len(merged.features) + len(groups) - num_filled))
 
@@ -186,7 +190,7 @@ def divide(
     features: FeatureGaussians, members: Members, counts: np.ndarray, rule: Rule = "depth"
 ) -> tuple[Gaussians, np.ndarray]:
     """The analytic children of :func:`decode`, however faint, and the Feature Gaussian ``[n]`` of each, rising."""
-    divided = (counts > 1) & ~features.backing.numpy()
+    divided = (counts > 1) & ~features.backing
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
         children, of_children = _children(features, members, np.flatnonzero(divided), counts, rule)
@@ -194,7 +198,7 @@ def divide(
         parents = np.concatenate([whole, of_children])
         order = np.argsort(parents, kind="stable")
         parents = parents[order]
-        gaussians = Gaussians.concat([gaussians[torch.from_numpy(whole)], children])[torch.from_numpy(order)]
+        gaussians = Gaussians.concat([gaussians[whole], children])[order]
     return gaussians, parents
 
 
@@ -217,8 +221,8 @@ def halve(
         groups: The Feature Gaussians to divide.
         counts: ``[g]`` most children of each.
     """
-    starts, ids = features.starts.numpy(), features.members.numpy()
-    centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
+    starts, ids = features.starts, features.members
+    centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def run(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         local, own = gather_groups(starts, ids, rows)
@@ -238,9 +242,8 @@ def pool_children(
 ) -> Gaussians:
     """One Gaussian for each run of members, with gain and spread of the Feature Gaussian that it is a child of."""
     moments = pool_members(members, starts, ids, rule)
-    gains, spreads = features.gains.double().numpy()[parents], features.spreads.double().numpy()[parents]
-    means, sh = torch.from_numpy(moments.means), torch.from_numpy(moments.sh)
-    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, means, sh)
+    gains, spreads = features.gains[parents], features.spreads[parents].astype(np.float64)
+    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, moments.means, moments.sh)
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
@@ -275,7 +278,7 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 
     See :func:`split_counts`, which takes the first ones.
     """
-    front = np.flatnonzero(~features.backing.numpy())
+    front = np.flatnonzero(~features.backing)
     if max_children == 1 or len(front) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, front, max_children))
@@ -286,8 +289,8 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 
 def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarray, max_children: int) -> np.ndarray:
     """``[f,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
-    starts, ids = features.starts.numpy(), features.members.numpy()
-    centres, footprints = features.means.double().numpy(), features.footprints.double().numpy()
+    starts, ids = features.starts, features.members
+    centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def run(rows: np.ndarray) -> np.ndarray:
         local, own = gather_groups(starts, ids, rows)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
-from gsmerge.networks import NetworkContext, encode_features
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene
+from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene, to_float32
+
+if TYPE_CHECKING:
+    from gsmerge.networks import NetworkContext
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,11 @@ def encode(
     """
     starts, ids, views = member_rows(scene, members, groups)
     features = from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
-    return features if networks is None else encode_features(features, networks)
+    if networks is None:
+        return features
+    from gsmerge.networks import encode_features
+
+    return encode_features(features, networks)
 
 
 def member_rows(
@@ -67,7 +73,7 @@ def member_rows(
     assert members.pixels is not None
     counts = np.asarray(groups.counts)
     first = np.cumsum(counts) - counts
-    labels = groups.labels.reshape(-1).numpy()[members.pixels] + first[members.pixels // scene.pixels_per_view]
+    labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
     labels = np.where(members.pixels >= 0, labels, -1).astype(np.int32)
     starts, ids = group_members(labels, int(counts.sum()))
     filled = np.diff(starts) > 0
@@ -79,7 +85,7 @@ def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarra
     pixels = scene.pixels_per_view
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        labels = np.where(scene.valid[view].numpy(), groups.labels[view].numpy(), -1).reshape(-1).astype(np.int32)
+        labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
         starts, ids = group_members(labels, groups.counts[view])
         return np.diff(starts), ids + view * pixels
 
@@ -93,21 +99,21 @@ def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarra
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
     """Feature Gaussians of pooled groups, with neutral gains and spreads."""
-    count, tensor = len(moments.means), torch.from_numpy
+    count = len(moments.means)
     return FeatureGaussians(
-        means=tensor(moments.means).float(),
-        covars=tensor(moments.covars).float(),
-        weights=tensor(moments.weights).float(),
-        masses=tensor(moments.masses).float(),
-        extinctions=tensor(moments.extinctions).float(),
-        gains=torch.ones(count),
-        spreads=torch.ones(count),
-        sh0=tensor(moments.sh[:, :1]),
-        shN=tensor(moments.sh[:, 1:]),
-        footprints=tensor(moments.footprints).float(),
-        views=tensor(views),
-        backing=torch.zeros(count, dtype=torch.bool),
-        starts=tensor(starts),
-        members=tensor(ids),
-        latents=torch.zeros(count, 0),
+        means=to_float32(moments.means),
+        covars=to_float32(moments.covars),
+        weights=to_float32(moments.weights),
+        masses=to_float32(moments.masses),
+        extinctions=to_float32(moments.extinctions),
+        gains=np.ones(count, np.float32),
+        spreads=np.ones(count, np.float32),
+        sh0=moments.sh[:, :1],
+        shN=moments.sh[:, 1:],
+        footprints=to_float32(moments.footprints),
+        views=views,
+        backing=np.zeros(count, bool),
+        starts=starts,
+        members=ids,
+        latents=np.zeros((count, 0), np.float32),
     )

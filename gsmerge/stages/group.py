@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from torch import Tensor
+import numpy as np
 
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
@@ -147,7 +147,7 @@ def segment_scene(prepared: PreparedScene, count: int | None) -> Segmentation:
     return Segmentation(groups, _coarse(pictures, options, num_coarse), count, exact=True)
 
 
-def _coarse(pictures: Tensor, options: CompactOptions, count: int) -> Groups | None:
+def _coarse(pictures: np.ndarray, options: CompactOptions, count: int) -> Groups | None:
     return segment(pictures, options.segment, count) if count else None
 
 

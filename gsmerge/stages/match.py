@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
-from torch.nn.functional import normalize
 
+from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
-from gsmerge.networks import NetworkContext, match_geometry
 from gsmerge.networks.neighbors import nearest_of_other_views
-from gsmerge.types import SH_C0, FeatureGaussians, Matches
+from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
+
+if TYPE_CHECKING:
+    from gsmerge.networks import NetworkContext
 
 Method = Literal["overlap", "aabb", "none"]
 Geometry = Literal["analytic", "decoded"]
@@ -80,36 +81,39 @@ def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkCo
     are taken by weight, ties by position. What is fully transparent is left alone.
     """
     if networks is not None and options.geometry == "decoded" and options.method != "none":
+        from gsmerge.networks import match_geometry
+
         features = match_geometry(features, networks)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0
-    if options.method != "none" and len(torch.unique(features.views)) > 1:
+    if options.method != "none" and len(np.unique(features.views)) > 1:
         solid = features.extinctions > 0
         for layer in (solid & ~features.backing, solid & features.backing):
-            rows = torch.nonzero(layer)[:, 0].numpy()
+            rows = np.flatnonzero(layer)
             if len(rows) > 1:
                 of_layer, num_layer = _clusters(features, rows, options)
                 clusters[rows] = num_clusters + of_layer
                 num_clusters += num_layer
     alone = np.flatnonzero(clusters < 0)
     clusters[alone] = num_clusters + np.arange(len(alone))
-    return Matches(torch.from_numpy(clusters), num_clusters + len(alone))
+    return Matches(clusters, num_clusters + len(alone))
 
 
 def _clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
     """Cluster of each of some rows, and the number of clusters."""
-    means, views = features.means.double().numpy()[rows], features.views.numpy()[rows]
-    covars = features.covars.double().numpy()[rows].reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-    colors = SH_C0 * features.sh0[:, 0].double().numpy()[rows]
+    means, views = features.means[rows].astype(np.float64), features.views[rows]
+    covars = features.covars[rows].astype(np.float64).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
     neighbors, boxes = nearest_of_other_views(means, views, options.neighbors), options.method == "aabb"
-    known = boxes and bool(features.latents.any())  # networks without an encoder leave them zero
-    latents = normalize(features.latents if known else features.latents[:, :0], dim=1).detach().numpy()[rows]
+    latents = as_array(features.latents)
+    known = boxes and bool(latents.any())  # networks without an encoder leave them zero
+    latents = normalize(latents[rows] if known else latents[rows, :0])
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity
     edge_scores(neighbors, means, np.ascontiguousarray(covars), colors, latents, views, *limits, boxes, scores)
     if boxes:
         return connected_components(neighbors, scores, options.iou)
-    order = np.lexsort((*means.T, -features.weights.numpy()[rows]))
+    order = np.lexsort((*means.T, -features.weights[rows]))
     size = options.cluster_size or len(np.unique(views))
     return leader_clusters(order, neighbors, scores, views, options.overlap, size)

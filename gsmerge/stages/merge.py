@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.moments import Members
-from gsmerge.networks import NetworkContext, merge_features, refine_features
-from gsmerge.types import FeatureGaussians, Gaussians, Matches, Segmentation
+from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, Segmentation, as_tensor, to_float32
+
+if TYPE_CHECKING:
+    from gsmerge.networks import NetworkContext
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,9 @@ def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext
         return features
     pooled = pool_runs(features, order, cuts)
     if networks is not None:
-        pooled = merge_features(pooled, features, order.numpy(), cuts, networks)
+        from gsmerge.networks import merge_features
+
+        pooled = merge_features(pooled, features, order, cuts, networks)
     return FeatureGaussians.concat([take(features, alone), pooled])
 
 
@@ -69,40 +71,44 @@ def refine(features: FeatureGaussians, networks: NetworkContext | None) -> Featu
         features: Merged Feature Gaussians of all views.
         networks: Networks and the scene, or None.
     """
-    return features if networks is None else refine_features(features, networks)
+    if networks is None:
+        return features
+    from gsmerge.networks import refine_features
+
+    return refine_features(features, networks)
 
 
-def cluster_runs(matches: Matches) -> tuple[Tensor, Tensor, np.ndarray]:
+def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows that are alone in their cluster; the others cluster by cluster; where each cluster begins among them."""
     clusters = matches.clusters
-    alone = torch.bincount(clusters, minlength=matches.count)[clusters] == 1
-    order = torch.nonzero(~alone)[:, 0]
-    order = order[torch.argsort(clusters[order], stable=True)]
-    first = torch.ones(len(order), dtype=torch.bool)
+    alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
+    order = np.flatnonzero(~alone)
+    order = order[np.argsort(clusters[order], kind="stable")]
+    first = np.ones(len(order), bool)
     first[1:] = clusters[order][1:] != clusters[order][:-1]
-    return torch.nonzero(alone)[:, 0], order, torch.nonzero(first)[:, 0].numpy()
+    return np.flatnonzero(alone), order, np.flatnonzero(first)
 
 
-def take(features: FeatureGaussians, index: Tensor) -> FeatureGaussians:
+def take(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
     """The Feature Gaussians that an integer ``index`` selects, with their members."""
     starts, members = _gather(features, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
     return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
 
 
-def _gather(features: FeatureGaussians, index: Tensor) -> tuple[Tensor, Tensor]:
+def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Members of the indexed Feature Gaussians, one after the other: starts and rows."""
-    begin, sizes = features.starts[index], (features.starts[1:] - features.starts[:-1])[index]
-    starts = torch.cat([torch.zeros(1, dtype=torch.int64), sizes.cumsum(0)])
-    offsets = torch.arange(int(starts[-1])) - starts[:-1].repeat_interleave(sizes)
-    return starts, features.members[begin.repeat_interleave(sizes) + offsets]
+    begin, sizes = features.starts[index], np.diff(features.starts)[index]
+    starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
+    offsets = np.arange(starts[-1]) - starts[:-1].repeat(sizes)
+    return starts, features.members[begin.repeat(sizes) + offsets]
 
 
-def pool_runs(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> FeatureGaussians:
+def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
     """One Feature Gaussian for each run of rows in ``order`` that begins at ``cuts``."""
 
-    def rows(tensor: Tensor) -> np.ndarray:
-        return tensor[order].double().numpy()
+    def rows(array: np.ndarray) -> np.ndarray:
+        return array[order].astype(np.float64)
 
     def total(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(values, cuts, axis=0)
@@ -118,25 +124,30 @@ def pool_runs(features: FeatureGaussians, order: Tensor, cuts: np.ndarray) -> Fe
     summed = total(extinctions)
     starts, members = _gather(features, order)
 
-    latents = features.latents[order] * torch.from_numpy(share).float()[:, None]  # in torch: gradients pass
-
-    def single(values: np.ndarray) -> Tensor:
-        return torch.from_numpy(values).float()
-
     return FeatureGaussians(
-        means=single(means),
-        covars=single(covars),
-        weights=single(total(rows(features.weights))),
-        masses=single(total(rows(features.masses))),
-        extinctions=single(summed),
-        gains=single(total(gains * extinctions) / np.maximum(summed, 1e-30)),
-        spreads=single(np.maximum.reduceat(rows(features.spreads), cuts)),
-        sh0=single(total(share[:, None, None] * rows(features.sh0))),
-        shN=single(total(share[:, None, None] * rows(features.shN))),
-        footprints=single(total(share * rows(features.footprints))),
-        views=torch.full((len(cuts),), -1),
-        backing=features.backing[order][torch.from_numpy(cuts)],
-        starts=torch.cat([starts[torch.from_numpy(cuts)], starts[-1:]]),
+        means=to_float32(means),
+        covars=to_float32(covars),
+        weights=to_float32(total(rows(features.weights))),
+        masses=to_float32(total(rows(features.masses))),
+        extinctions=to_float32(summed),
+        gains=to_float32(total(gains * extinctions) / np.maximum(summed, 1e-30)),
+        spreads=to_float32(np.maximum.reduceat(rows(features.spreads), cuts)),
+        sh0=to_float32(total(share[:, None, None] * rows(features.sh0))),
+        shN=to_float32(total(share[:, None, None] * rows(features.shN))),
+        footprints=to_float32(total(share * rows(features.footprints))),
+        views=np.full(len(cuts), -1),
+        backing=features.backing[order[cuts]],
+        starts=np.append(starts[cuts], starts[-1]),
         members=members,
-        latents=torch.zeros(len(cuts), latents.shape[1]).index_add(0, torch.from_numpy(run), latents),
+        latents=_pool_latents(features.latents[order], to_float32(share), run, len(cuts)),
     )
+
+
+def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
+    """``[count,d]`` weighted sums of latents ``[m,d]`` over runs; gradients pass."""
+    if latents.shape[1] == 0:
+        return np.zeros((count, 0), np.float32)
+    import torch
+
+    weighted = as_tensor(latents) * as_tensor(share)[:, None]
+    return torch.zeros(count, latents.shape[1]).index_add(0, as_tensor(run), weighted)

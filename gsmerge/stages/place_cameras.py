@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from gsmerge.render import contributions, plan_view, prepare, render
 from gsmerge.runtime.run_log import RunLog
@@ -32,9 +31,9 @@ def add_views(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
         ValueError: If there is no finite Gaussian.
     """
     g = scene.gaussians
-    finite = torch.isfinite(g.opacities)
-    for tensor in (g.means, g.quats, g.scales, g.sh0, g.shN):
-        finite &= torch.isfinite(tensor).flatten(1).all(1)
+    finite = np.isfinite(g.opacities)
+    for array in (g.means, g.quats, g.scales, g.sh0, g.shN):
+        finite &= np.isfinite(array).all(tuple(range(1, array.ndim)))
     count = int((~finite).sum())
     if count == len(g):
         raise ValueError("expected at least one finite Gaussian, got none")
@@ -54,7 +53,7 @@ def add_pictures(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
     if scene.images is not None:
         return scene
     log.notes.append("no photos: views rendered from the scene itself stand in for them")
-    return replace(scene, images=render(scene.gaussians, scene.cameras).images.clamp(0, 1))
+    return replace(scene, images=render(scene.gaussians, scene.cameras).images.clip(0, 1))
 
 
 def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
@@ -77,14 +76,12 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
     sample = _sampled(gaussians)
-    centre, half = _extent(sample.means.double().numpy())
+    centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.linalg.norm(half)))
     chosen = _most_seen(shares, num_views)
     size = int(np.clip(round(len(gaussians) ** 0.5), SMALLEST, LARGEST))
-    return Cameras(
-        torch.from_numpy(viewmats[chosen]), torch.from_numpy(_lens(size)).repeat(len(chosen), 1, 1), size, size
-    )
+    return Cameras(viewmats[chosen], np.repeat(_lens(size)[None], len(chosen), 0), size, size)
 
 
 def _lens(size: int) -> np.ndarray:

@@ -11,14 +11,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
 from gsmerge.geometry import project
 from gsmerge.moments import Members, scene_members
-from gsmerge.networks import Checkpoint, NetworkContext, find_checkpoint
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
@@ -30,6 +28,7 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import distinct_views, scored_views, subset
 
 if TYPE_CHECKING:
+    from gsmerge.networks import Checkpoint, NetworkContext
     from gsmerge.options import CompactOptions
 
 Scene = TypeVar("Scene", PixelScene, UnalignedScene)
@@ -47,32 +46,38 @@ class Frame:
         unit: Length of the canonical unit in world units, a power of two.
     """
 
-    origin: Tensor
+    origin: np.ndarray
     unit: float
 
     def enter(self, gaussians: Gaussians) -> Gaussians:
         """World to canonical; means in float32."""
-        means, scales = torch.empty(gaussians.means.shape), torch.empty_like(gaussians.scales)
+        means, scales = np.empty(gaussians.means.shape, np.float32), np.empty_like(gaussians.scales)
 
         def fill(first: int) -> None:
             rows = slice(first, first + ROWS)
-            means[rows] = (gaussians.means[rows].double() - self.origin) / self.unit
-            torch.div(gaussians.scales[rows], self.unit, out=scales[rows])
+            means[rows] = (gaussians.means[rows] - self.origin) / self.unit
+            np.divide(gaussians.scales[rows], self.unit, out=scales[rows])
 
         parallel_map(fill, range(0, len(gaussians), ROWS))
         return replace(gaussians, means=means, scales=scales)
 
     def leave(self, gaussians: Gaussians) -> Gaussians:
         """Canonical to world; means in float64."""
-        means = gaussians.means.double() * self.unit + self.origin
+        means = gaussians.means.astype(np.float64) * self.unit + self.origin
         return replace(gaussians, means=means, scales=gaussians.scales * self.unit)
 
     def enter_cameras(self, cameras: Cameras) -> Cameras:
         """World to canonical."""
-        viewmats = cameras.viewmats.double().clone()
+        viewmats = cameras.viewmats.astype(np.float64)
         shift = viewmats[:, :3, 3] + viewmats[:, :3, :3] @ self.origin
         viewmats[:, :3, 3] = shift / self.unit
         return replace(cameras, viewmats=viewmats)
+
+
+def _middle(values: np.ndarray) -> np.ndarray:
+    """The median of ``[n,...]`` rows; of an even number, the lower of the two in the middle."""
+    half = (len(values) - 1) // 2
+    return np.partition(values, half, axis=0)[half]
 
 
 def find_frame(scene: PixelScene) -> Frame:
@@ -82,17 +87,16 @@ def find_frame(scene: PixelScene) -> Frame:
         ValueError: If no Gaussian is valid.
     """
     h, w = scene.cameras.height, scene.cameras.width
-    rows = torch.nonzero(scene.valid.reshape(-1))[:, 0]
+    rows = np.flatnonzero(scene.valid)
     if len(rows) == 0:
         raise ValueError("expected at least one valid Gaussian, got none")
     rows = rows[:: max(1, len(rows) // SAMPLES)]
-    means = scene.gaussians.means[rows].double()
-    origin = means.median(0).values
-    viewmats = scene.cameras.viewmats.double()[rows // (h * w)]
+    means = scene.gaussians.means[rows].astype(np.float64)
+    viewmats = scene.cameras.viewmats[rows // (h * w)]
     depths = (viewmats[:, 2, :3] * means).sum(1) + viewmats[:, 2, 3]
-    depth = float(depths.abs().median())
+    depth = float(_middle(np.abs(depths)))
     unit = 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
-    return Frame(origin, unit)
+    return Frame(_middle(means), unit)
 
 
 def find_unaligned_frame(scene: UnalignedScene) -> Frame:
@@ -103,13 +107,13 @@ def find_unaligned_frame(scene: UnalignedScene) -> Frame:
     """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
-    means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].double()
+    means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].astype(np.float64)
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
-    size = torch.tensor([views.width, views.height])
+    size = np.array([views.width, views.height])
     seen = (depths > 0) & ((pixels > 0) & (pixels < size)).all(-1)
-    depth = float(depths[seen].median()) if bool(seen.any()) else 0.0
-    return Frame(means.median(0).values, 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
+    depth = float(_middle(depths[seen])) if seen.any() else 0.0
+    return Frame(_middle(means), 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
 
 
 def scene_frame(scene: PixelScene | UnalignedScene) -> Frame:
@@ -147,7 +151,7 @@ class PreparedScene:
 
     given: PixelScene | UnalignedScene
     scene: PixelScene | UnalignedScene
-    pictures: Tensor
+    pictures: np.ndarray
     frame: Frame
     settings: CompactOptions
     options: CompactOptions
@@ -161,6 +165,8 @@ class PreparedScene:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
         if self.checkpoint is None:
             return [None]
+        from gsmerge.networks import NetworkContext
+
         options = self.options
         networks = NetworkContext(self.checkpoint.networks, members, self.scene.cameras, options.seed)
         return [networks, None] if options.checkpoint == "auto" else [networks]
@@ -202,9 +208,7 @@ def prepare(
             canonical = add_pictures(unaligned, log)
         photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
         name = options.networks(photos=photos, aligned=aligned)
-        checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
-        if checkpoint is not None:
-            check_networks(checkpoint, options)
+        checkpoint, notes = find_networks(name, options)
         scored = len(scored_views(len(scene))) if scene.images is not None else len(scene)
         log.notes += [*notes, *([f"the input views are scored on {scored} of {len(scene)}"] * (scored < len(scene)))]
         limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
@@ -215,6 +219,23 @@ def prepare(
         return prepared
     with log.stage("segment"):
         return with_tree(prepared)
+
+
+def find_networks(name: str, options: CompactOptions) -> tuple[Checkpoint | None, list[str]]:
+    """The checkpoint of this name, which gives what the options ask, and notes; None for ``"none"``.
+
+    Raises:
+        SceneError: If it is required and cannot be used.
+        UsageError: If it does not give what the options ask for.
+    """
+    if name == "none":  # torch is imported only where there are networks
+        return None, []
+    from gsmerge.networks import find_checkpoint
+
+    checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
+    if checkpoint is not None:
+        check_networks(checkpoint, options)
+    return checkpoint, notes
 
 
 def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:

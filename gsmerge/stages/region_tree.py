@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.kernels.superpixels.region_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.superpixels.regions import pad_labels
@@ -84,20 +82,21 @@ class RegionTree:
         return len(self) - np.arange(len(self.distortions))
 
 
-def pixel_depths(scene: PixelScene) -> Tensor:
+def pixel_depths(scene: PixelScene) -> np.ndarray:
     """``[v,h,w]`` float32 depth of every pixel's Gaussian in its own view, world units."""
     cameras, means = scene.cameras, scene.gaussians.means
     height, width, pixels = cameras.height, cameras.width, scene.pixels_per_view
 
-    def one_view(view: int) -> Tensor:
-        third = cameras.viewmats[view, 2].to(means.dtype)
-        return (means[view * pixels : (view + 1) * pixels] @ third[:3] + third[3]).float().reshape(height, width)
+    def one_view(view: int) -> np.ndarray:
+        third = cameras.viewmats[view, 2].astype(means.dtype)
+        depths = means[view * pixels : (view + 1) * pixels] @ third[:3] + third[3]
+        return depths.astype(np.float32).reshape(height, width)
 
-    return torch.stack(parallel_map(one_view, range(len(scene))))
+    return np.stack(parallel_map(one_view, range(len(scene))))
 
 
 def region_tree(
-    images: Tensor, depths: Tensor, groups: Groups, valid: Tensor, options: AllocateOptions | None = None
+    images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray, options: AllocateOptions | None = None
 ) -> RegionTree:
     """Merge neighbouring superpixels in order of the distortion that it adds, each view down to a single region.
 
@@ -116,9 +115,9 @@ def region_tree(
     extent = max(1.0, options.max_extent * max(images.shape[1:3]))
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
-        usable = _usable_depths(depths[view].numpy(), valid[view].numpy())
-        labels, count = pad_labels(groups.labels[view].numpy()), groups.counts[view]
-        pixels = np.ascontiguousarray(images[view].numpy(), np.float32)
+        usable = _usable_depths(depths[view], valid[view])
+        labels, count = pad_labels(groups.labels[view]), groups.counts[view]
+        pixels = np.ascontiguousarray(images[view], np.float32)
         rows = np.empty((2 * count, ROW))
         weight = options.depth_weight
         start = region_sums(labels, pixels, usable, count, rows) + weight * float(rows[:count, PLANE_ERROR].sum())
@@ -135,13 +134,13 @@ def region_tree(
     return RegionTree(groups, parents, order, first, distortions, min_regions)
 
 
-def _check_pictures(images: Tensor, depths: Tensor, groups: Groups, valid: Tensor) -> None:
+def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> None:
     shape = list(groups.labels.shape)
-    for name, tensor, want in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
-        if list(tensor.shape) != want:
-            raise ValueError(f"{name}: expected shape {want}, got {list(tensor.shape)}")
+    for name, array, want in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
+        if list(array.shape) != want:
+            raise ValueError(f"{name}: expected shape {want}, got {list(array.shape)}")
     for view, count in enumerate(groups.counts):
-        sizes = torch.bincount(groups.labels[view].reshape(-1), minlength=count)
+        sizes = np.bincount(groups.labels[view].reshape(-1), minlength=count)
         if len(sizes) > count or int(sizes.min()) < 1:
             raise ValueError(f"groups: expected {count} superpixels with pixels in view {view}")
 
@@ -168,14 +167,14 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     keep = np.zeros(len(tree.order), bool)
     keep[tree.order[: max(0, len(tree) - budget)]] = True
 
-    def one_view(view: int) -> tuple[Tensor, int]:
+    def one_view(view: int) -> tuple[np.ndarray, int]:
         own = keep[tree.first[view] : tree.first[view + 1]]
         leaves = tree.groups.counts[view]
-        of_leaf = torch.from_numpy(cut_labels(tree.parents[view], own, leaves))
-        return of_leaf[tree.groups.labels[view].long()], leaves - int(own.sum())
+        of_leaf = cut_labels(tree.parents[view], own, leaves)
+        return of_leaf[tree.groups.labels[view]], leaves - int(own.sum())
 
     labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
-    return Groups(torch.stack(labels), counts)
+    return Groups(np.stack(labels), counts)
 
 
 def auto_count(tree: RegionTree, options: AllocateOptions | None = None) -> int:

@@ -18,8 +18,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.budget import parse_share
 from gsmerge.errors import UsageError
@@ -28,7 +26,7 @@ from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.sweeps import refine
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Groups
+from gsmerge.types import Array, Groups, as_array, like
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
 # Effort -> (rectangles per superpixel, sweeps before merging).
@@ -113,7 +111,9 @@ def count_for(options: SegmentOptions, height: int, width: int) -> int:
     return max(1, int(options.share * height * width))
 
 
-def segment(images: Tensor, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None) -> Groups:
+def segment(
+    images: np.ndarray, options: SegmentOptions, count: int | None = None, *, adapt: float | None = None
+) -> Groups:
     """Cut every view into superpixels, several views at once: the same number in each, unless they adapt.
 
     Args:
@@ -132,27 +132,27 @@ def segment(images: Tensor, options: SegmentOptions, count: int | None = None, *
         count, adapt = count_for(options, height, width), 1.0 if options.adapts else None
     kind, effort, compactness = options.segmentation, options.effort, options.compactness
 
-    def one_view(image: Tensor) -> Tensor:
-        return superpixels(image, count, kind, effort=effort, compactness=compactness, adapt=adapt)
+    def one_view(image: np.ndarray) -> np.ndarray:
+        return _labels(image, count, kind, effort=effort, compactness=compactness, adapt=adapt)
 
-    labels = parallel_map(one_view, images.unbind(0))
-    stacked = torch.stack(labels) if labels else torch.empty((0, height, width), dtype=torch.int32)
+    labels = parallel_map(one_view, images)
+    stacked = np.stack(labels) if labels else np.empty((0, height, width), np.int32)
     return Groups(stacked, tuple(int(one.max()) + 1 for one in labels))
 
 
 def superpixels(
-    image: Tensor | np.ndarray,
+    image: Array,
     count: int,
     segmentation: str = "rdseg",
     *,
     effort: str = "default",
     compactness: float = 1e-5,
     adapt: float | None = None,
-) -> Tensor:
+) -> Array:
     """Cut an image into exactly ``count`` superpixels, each non-empty and 4-connected.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
         count: Superpixels, 1 to h·w.
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
@@ -161,7 +161,7 @@ def superpixels(
             is a quarter to four times as many, at most one per pixel; 1 keeps it. None: exactly ``count``.
 
     Returns:
-        ``[h,w]`` int32, dense from 0; the same on every run.
+        ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -170,6 +170,14 @@ def superpixels(
         >>> superpixels(np.zeros((2, 2, 3)), 1).tolist()
         [[0, 0], [0, 0]]
     """
+    labels = _labels(as_array(image), count, segmentation, effort=effort, compactness=compactness, adapt=adapt)
+    return like(labels, image)
+
+
+def _labels(
+    image: np.ndarray, count: int, segmentation: str, *, effort: str, compactness: float, adapt: float | None
+) -> np.ndarray:
+    """:func:`superpixels` of an array."""
     _check(segmentation, effort, compactness)
     pixels = _as_pixels(image)
     height, width, _ = pixels.shape
@@ -182,12 +190,12 @@ def superpixels(
     if segmentation == "rdseg":
         labels = _rdseg(pixels, count, effort, compactness)
     elif segmentation == "grid":
-        return torch.from_numpy(grid_labels(height, width, count))
+        return grid_labels(height, width, count)
     elif segmentation == "slic":
         labels = _slic(pixels, count, compactness)
     else:
         labels = _bass(pixels, count, segmentation, adapt)
-    return torch.from_numpy(np.ascontiguousarray(labels[1:-1, 1:-1]))
+    return np.ascontiguousarray(labels[1:-1, 1:-1])
 
 
 def grid_labels(height: int, width: int, count: int) -> np.ndarray:
@@ -206,22 +214,22 @@ def grid_labels(height: int, width: int, count: int) -> np.ndarray:
     return (first[line][:, None] + np.arange(width) * blocks[:, None] // width).astype(np.int32)
 
 
-def saliency(image: Tensor | np.ndarray) -> Tensor:
+def saliency(image: Array) -> Array:
     """Shi-Tomasi corner response: the smaller eigenvalue of the structure tensor of the grey image, 3 x 3 pixels.
 
     Args:
-        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8.
+        image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
 
     Returns:
-        ``[h,w]`` float32, at least 0; 0 everywhere in a flat image.
+        ``[h,w]`` float32, at least 0; 0 everywhere in a flat image; a tensor for a tensor.
 
     Raises:
         ValueError: If the image has the wrong shape or range.
     """
-    return torch.from_numpy(_corner_response(_as_pixels(image)))
+    return like(_corner_response(_as_pixels(as_array(image))), image)
 
 
-def scene_saliency(images: Tensor) -> np.ndarray:
+def scene_saliency(images: np.ndarray) -> np.ndarray:
     """``[v·h·w]`` :func:`saliency` of every pixel of all views ``[v,h,w,3]``."""
     return np.concatenate(parallel_map(lambda image: _corner_response(_as_pixels(image)).reshape(-1), images))
 
@@ -231,9 +239,8 @@ def _corner_response(pixels: np.ndarray) -> np.ndarray:
     return np.maximum(cv2.cornerMinEigenVal(grey, 3, ksize=3), 0)
 
 
-def _as_pixels(image: Tensor | np.ndarray) -> np.ndarray:
+def _as_pixels(array: np.ndarray) -> np.ndarray:
     """``[h,w,3]`` float32 in [0, 1], contiguous."""
-    array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
         raise ValueError(f"image: expected shape [h, w, 3], got {list(array.shape)}")
     if array.dtype == np.uint8:

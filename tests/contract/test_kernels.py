@@ -12,15 +12,15 @@ import pytest
 
 RENDER_SUMS = """
 import hashlib, sys
-import numpy as np, torch
+import numpy as np
 import gsmerge
 from gsmerge.render import contributions, plan_view, prepare, splat_adjoint
 
 rng = np.random.default_rng(0)
 n, (h, w) = 400, (48, 64)
-tensors = [rng.uniform(-1, 1, (n, 3)), rng.normal(size=(n, 4)), rng.uniform(0.02, 0.2, (n, 3)), rng.uniform(0, 1, n)]
-tensors += [rng.normal(size=(n, 1, 3)), np.zeros((n, 0, 3))]
-splats = prepare(gsmerge.Gaussians(*(torch.from_numpy(t).float() for t in tensors)))
+arrays = [rng.uniform(-1, 1, (n, 3)), rng.normal(size=(n, 4)), rng.uniform(0.02, 0.2, (n, 3)), rng.uniform(0, 1, n)]
+arrays += [rng.normal(size=(n, 1, 3)), np.zeros((n, 0, 3))]
+splats = prepare(gsmerge.Gaussians(*(array.astype(np.float32) for array in arrays)))
 viewmat = np.eye(4)
 viewmat[2, 3] = 3
 plan = plan_view(splats, viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), w, h)

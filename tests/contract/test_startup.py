@@ -45,6 +45,25 @@ def test_import_loads_nothing_heavy() -> None:
     assert loaded_after("import gsmerge") == set()
 
 
+def test_compacting_loads_neither_torch_nor_scipy(made_scene: Path, tmp_path: Path) -> None:
+    """Which take longer to load than a small scene takes to merge; numba asks whether scipy is there."""
+    arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply")]
+    code = f"from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
+    modules = set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split())
+    heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
+    assert modules.isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
+
+
+def test_compacting_needs_neither_torch_nor_scipy(made_scene: Path, tmp_path: Path) -> None:
+    """As if they were not installed; the result is the same to the last bit."""
+    outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]
+    for output, missing in zip(outputs, ((), ("torch", "scipy", "skimage")), strict=True):
+        hide = f"import sys\nsys.modules.update(dict.fromkeys({missing!r}))\n"
+        arguments = ["compact", str(made_scene), "-o", str(output)]
+        run_python(f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0")
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+
+
 def test_missing_file_is_one_line() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "gsmerge", "compact", "nowhere.ply"], capture_output=True, text=True, check=False

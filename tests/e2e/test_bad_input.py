@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 import gsmerge
 
@@ -246,7 +245,7 @@ def test_occupied_folders_are_refused(command: str, made_scene: Path, tmp_path: 
 def test_nothing_left_is_bad_input(scene_copy: Path, run: Run) -> None:
     """Points without any size: no file of nothing is written."""
     gaussians = gsmerge.read_ply(scene_copy / "scene.ply").gaussians
-    points = replace(gaussians, scales=torch.full_like(gaussians.scales, 1e-30))
+    points = replace(gaussians, scales=np.full_like(gaussians.scales, 1e-30))
     gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
     outcome = run("compact", scene_copy, "--fit", "none", "--no-robust")
     assert outcome.code == 3

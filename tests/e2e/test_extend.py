@@ -271,12 +271,12 @@ def test_the_state_is_never_the_input(scene_copy: Path, run: Run) -> None:
 def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     from dataclasses import replace
 
-    import torch
+    import numpy as np
 
     scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
     have = gsmerge.read_ply(scene / "scene.ply").gaussians
     degree = 1 if have.sh_degree == 0 else 0
-    other = replace(have, shN=torch.zeros(len(have), (degree + 1) ** 2 - 1, 3))
+    other = replace(have, shN=np.zeros((len(have), (degree + 1) ** 2 - 1, 3), np.float32))
     gsmerge.write_ply(scene / "scene.ply", other, overwrite=True)
     before = state.read_bytes()
     assert_refused(run("extend", state, scene), 2, f"harmonics of degree {have.sh_degree} as the state's")

@@ -103,7 +103,7 @@ def test_quality_needs_photos(scene: PixelScene, settings: dict[str, str]) -> No
 
 def test_a_search_keeps_what_reading_had_to_say(scene: PixelScene) -> None:
     whole = loose.loosened(scene)
-    means = whole.gaussians.means.clone()
+    means = whole.gaussians.means.copy()
     means[0] = float("nan")
     spoilt = replace(whole, gaussians=replace(whole.gaussians, means=means))
     actual = compact(spoilt, fit_steps=8, quality="10dB")

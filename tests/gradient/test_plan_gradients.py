@@ -26,7 +26,7 @@ FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
 def plan_of(gaussians: Gaussians, **options: Any) -> ViewPlan:
-    cameras = turned_cameras(1)
+    cameras = turned_cameras(1).numpy()
     return plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options)
 
 
@@ -104,12 +104,12 @@ def test_used_memory_is_written_again(number: int, enough: bool, degree: int) ->
 
 def test_opacities_in_place_of_the_gaussians_own() -> None:
     """Dropped Gaussians have no rows' worth of gradient, the others that of their given opacity."""
-    gaussians, colors = random_gaussians(40, 0, 4), normal(40, 3)
+    gaussians, colors = random_gaussians(40, 0, 4).numpy(), normal(40, 3)
     keep = np.arange(40) % 4 > 0
-    given = gaussians.opacities.numpy() * 0.7
+    given = gaussians.opacities * 0.7
     actual = gradients_of_plan(plan_of(gaussians, opacities=given, keep=keep), colors, None)
     assert keep[actual.ids].all()
-    kept = replace(gaussians, opacities=torch.from_numpy(np.where(keep, given, 0)))
+    kept = replace(gaussians, opacities=np.where(keep, given, 0))
     expected = gradients_of_plan(plan_of(kept), colors, None)
     for name in FIELDS:
         np.testing.assert_array_equal(full(actual, name, 40), full(expected, name, 40))
@@ -118,8 +118,8 @@ def test_opacities_in_place_of_the_gaussians_own() -> None:
 def test_finite_differences() -> None:
     """Along the gradient, with Gaussians so wide that no weight crosses a threshold."""
     n, grad_image, grad_left = 12, normal(HEIGHT, WIDTH, 3).astype(float), normal(HEIGHT, WIDTH, seed=1).astype(float)
-    start = random_gaussians(n, 0, 9)
-    means = torch.tensor([0.0, 0.0, 3.0]) + 0.3 * (random_gaussians(n, 0, 9).means - torch.tensor([0.0, 0.0, 3.0]))
+    start, middle = random_gaussians(n, 0, 9).numpy(), np.array([0, 0, 3], np.float32)
+    means = middle + 0.3 * (start.means - middle)
     start = replace(start, means=means, scales=1.5 + 2 * start.scales, opacities=0.1 + 0.3 * start.opacities)
     colors = normal(n, 3, seed=4)
 
@@ -128,7 +128,7 @@ def test_finite_differences() -> None:
         if name == "colors":
             tints = colors + step.astype(np.float32)
         else:
-            moved = replace(start, **{name: getattr(start, name) + torch.from_numpy(step).float()})
+            moved = replace(start, **{name: getattr(start, name) + step.astype(np.float32)})
         image, left = composite(plan_of(moved), tints, BACKGROUND)
         return float((image * grad_image).sum() + (left * grad_left).sum())
 
@@ -150,9 +150,9 @@ def test_finite_differences() -> None:
 def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules["gsmerge.render.plan"], "PIECE", 200)
     monkeypatch.setattr(sys.modules["gsmerge.render.gradient"], "WORTH", 200)
-    gaussians, cameras = random_gaussians(2000, 3, 10), turned_cameras(1)
+    gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
-    K, size = cameras.Ks[0] * torch.tensor([[4.0], [4.0], [1.0]]), (4 * HEIGHT, 4 * WIDTH)
+    K, size = cameras.Ks[0] * [[4.0], [4.0], [1.0]], (4 * HEIGHT, 4 * WIDTH)
     grads = normal(*size, 4)
 
     def run(count: int) -> list[np.ndarray]:
@@ -174,11 +174,11 @@ def huge(g: Gaussians) -> Gaussians:
 
 
 def no_extent(g: Gaussians) -> Gaussians:
-    return replace(g, scales=torch.zeros_like(g.scales))
+    return replace(g, scales=np.zeros_like(g.scales))
 
 
 def no_rotation(g: Gaussians) -> Gaussians:
-    return replace(g, quats=torch.zeros_like(g.quats))
+    return replace(g, quats=np.zeros_like(g.quats))
 
 
 def long_quats(g: Gaussians) -> Gaussians:
@@ -186,16 +186,16 @@ def long_quats(g: Gaussians) -> Gaussians:
 
 
 def too_opaque(g: Gaussians) -> Gaussians:
-    return replace(g, opacities=torch.full_like(g.opacities, 3.0))
+    return replace(g, opacities=np.full_like(g.opacities, 3.0))
 
 
 def at_the_camera(g: Gaussians) -> Gaussians:
-    eye = turned_cameras(1).centres[0].float()
+    eye = turned_cameras(1).numpy().centres[0].astype(np.float32)
     return replace(g, means=eye + 1e-2 * g.means)
 
 
 def one_place(g: Gaussians) -> Gaussians:
-    return replace(g, means=torch.tensor([[0.1, 0.2, 3.0]]).repeat(len(g), 1))
+    return replace(g, means=np.array([[0.1, 0.2, 3.0]], np.float32).repeat(len(g), 0))
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -208,7 +208,7 @@ def one_place(g: Gaussians) -> Gaussians:
 def test_finite_input_gives_finite_gradients(
     change: Callable[[Gaussians], Gaussians], eps2d: float, antialiased: bool
 ) -> None:
-    gaussians = change(random_gaussians(60, 2, 11))
+    gaussians = change(random_gaussians(60, 2, 11).numpy())
     plan = plan_of(gaussians, eps2d=eps2d, antialiased=antialiased)
     actual = gradients_of_plan(plan, normal(60, 3), normal(HEIGHT, WIDTH))
     for name in (*FIELDS, "viewmat"):
@@ -218,7 +218,7 @@ def test_finite_input_gives_finite_gradients(
 
 
 def test_a_view_of_nothing() -> None:
-    gaussians = random_gaussians(5)
+    gaussians = random_gaussians(5).numpy()
     plan = plan_of(replace(gaussians, means=gaussians.means - 100))
     actual = gradients_of_plan(plan, normal(5, 3), None)
     assert len(actual.ids) == len(actual.means) == len(actual.colors) == 0

@@ -252,13 +252,6 @@ def test_gsplat_gets_tensors_of_the_device_alone(with_depths: bool, monkeypatch:
         assert drawn.depths is None or (drawn.depths.is_meta and drawn.depths.shape == (2, 21, 37, 1))
     harmonics = torch.cat([gaussians.sh0, gaussians.shN], 1)
     assert harmonic_colors(gaussians.means, harmonics, gaussians.means[0]).is_meta
-    colors = seen_colors(gaussians.means, gaussians.sh0, gaussians.shN, np.eye(4))
-    camera = {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 6, "eps2d": 0.1}
-    shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-    image, reached = draw_colored(shape, colors, camera, np.zeros(3, np.float32))
-    assert image.is_meta
-    assert reached.is_meta
-    assert image.shape == (6, 8, 3)
 
 
 def test_devices_must_agree() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import make_features
@@ -27,16 +26,16 @@ def random_tree(seed: int, num_views: int, colours: int) -> RegionTree:
     rng = np.random.default_rng(seed)
     height, width = rng.integers(3, 16, 2)
     shape = (num_views, height, width)
-    images = torch.from_numpy(rng.integers(0, colours, (*shape, 3)) / max(colours - 1, 1)).float()
-    depths = torch.from_numpy(1.0 + rng.integers(0, colours, shape)).float()
-    valid = torch.from_numpy(rng.random(shape) > 0.2)
+    images = (rng.integers(0, colours, (*shape, 3)) / max(colours - 1, 1)).astype(np.float32)
+    depths = (1.0 + rng.integers(0, colours, shape)).astype(np.float32)
+    valid = rng.random(shape) > 0.2
     groups = segment(images, SegmentOptions(), int(rng.integers(1, height * width + 1)))
     return region_tree(images, depths, groups, valid)
 
 
 def is_union_of(coarse: Groups, fine: Groups) -> bool:
     for view, count in enumerate(fine.counts):
-        pairs = np.stack([fine.labels[view].numpy().ravel(), coarse.labels[view].numpy().ravel()])
+        pairs = np.stack([fine.labels[view].ravel(), coarse.labels[view].ravel()])
         if np.unique(pairs, axis=1).shape[1] != count:
             return False
     return True
@@ -52,7 +51,7 @@ def test_counts_are_exact_and_nest(seed: int, num_views: int, colours: int, low:
         assert sum(groups.counts) == count
         assert min(groups.counts) >= 1
         for view, own in enumerate(groups.counts):
-            labels = groups.labels[view].numpy()
+            labels = groups.labels[view]
             assert np.array_equal(np.unique(labels), np.arange(own))
             assert connected_parts(labels, connectivity=1, background=-1).max() == own
     assert is_union_of(coarse, fine)
@@ -78,7 +77,7 @@ def test_threads_change_nothing(seed: int) -> None:
             tree = random_tree(seed, 4, 3)
             actual.append((tree.distortions, cut_tree(tree, (len(tree) + 4) // 2).labels))
     np.testing.assert_array_equal(actual[0][0], actual[1][0])
-    assert torch.equal(actual[0][1], actual[1][1])
+    assert np.array_equal(actual[0][1], actual[1][1])
 
 
 def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
@@ -91,10 +90,8 @@ def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:
     harmonics = colours, np.zeros((n, 0, 3))
     members = Members(*(np.ascontiguousarray(c, np.float32) for c in (*columns, *harmonics, np.full(n, 0.01))))
     features = make_features(rng.normal(size=(g, 3)) * 0.01)
-    starts = torch.from_numpy(np.concatenate([[0], np.cumsum(sizes)]))
-    return replace(
-        features, starts=starts, members=torch.arange(n), backing=torch.from_numpy(rng.random(g) < 0.2)
-    ), members
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    return replace(features, starts=starts, members=np.arange(n), backing=(rng.random(g) < 0.2)), members
 
 
 @FEW
@@ -107,5 +104,5 @@ def test_splits_are_exact_and_monotone(seed: int, one: int, other: int, max_chil
     assert many.sum() == min(len(features) + max(one, other), most.sum())
     assert (few <= many).all()
     assert (many <= most).all()
-    assert (few[features.backing.numpy()] == 1).all()
+    assert (few[features.backing] == 1).all()
     assert (few >= 1).all()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import assert_same_set, make_features, move_gaussians, random_rotation, rotmat_to_quat
@@ -28,7 +27,7 @@ def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians
     )  # fmt: skip
     members = Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
     feature = make_features(members.means.mean(0, keepdims=True), sizes=0.02)
-    return replace(feature, starts=torch.tensor([0, count]), members=torch.arange(count)), members
+    return replace(feature, starts=np.array([0, count]), members=np.arange(count)), members
 
 
 @FEW
@@ -36,7 +35,7 @@ def random_group(rng: np.random.Generator, count: int) -> tuple[FeatureGaussians
 def test_order_of_members(seed: int, count: int, k: int) -> None:
     rng = np.random.default_rng(seed)
     feature, members = random_group(rng, count)
-    shuffled = replace(feature, members=torch.from_numpy(rng.permutation(count)))
+    shuffled = replace(feature, members=rng.permutation(count))
     one, other = (decode(f, members, DecodeOptions(k=k)) for f in (feature, shuffled))
     assert_same_set(one, other, atol=1e-5)
 
@@ -47,18 +46,18 @@ def test_children_follow_the_group(seed: int, count: int, k: int, exponent: floa
     rng = np.random.default_rng(seed)
     feature, members = random_group(rng, count)
     turn, factor = random_rotation(seed), 10.0**exponent
-    quats = rotmat_to_quat(torch.from_numpy(turn) @ quat_to_rotmat(torch.from_numpy(members.quats).double()))
+    quats = rotmat_to_quat(turn @ quat_to_rotmat(members.quats.astype(np.float64)))
     moved_members = replace(
         members,
         means=(factor * members.means @ turn.T).astype(np.float32),
-        quats=quats.float().numpy(),
+        quats=quats.astype(np.float32),
         scales=(factor * members.scales).astype(np.float32),
         footprints=(factor * members.footprints).astype(np.float32),
     )
     moved = replace(
         feature,
-        means=(factor * feature.means.double() @ torch.from_numpy(turn).T).float(),
-        covars=(factor**2 * torch.from_numpy(turn) @ feature.covars.double() @ torch.from_numpy(turn).T).float(),
+        means=(factor * feature.means.astype(np.float64) @ turn.T).astype(np.float32),
+        covars=(factor**2 * turn @ feature.covars.astype(np.float64) @ turn.T).astype(np.float32),
         extinctions=feature.extinctions * factor**2,
         footprints=feature.footprints * factor,
     )

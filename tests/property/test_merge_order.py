@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import make_features, random_rotation
@@ -64,7 +63,7 @@ def test_pooling_commutes_with_similarities(seed: int, count: int, exponent: flo
 def rotation_to_quat(turn: np.ndarray) -> np.ndarray:
     from scenes import rotmat_to_quat
 
-    return rotmat_to_quat(torch.from_numpy(turn)).numpy()
+    return rotmat_to_quat(turn)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -81,7 +80,7 @@ def random_features(rng: np.random.Generator, count: int) -> FeatureGaussians:
 
 
 def as_sets(actual: Matches, names: np.ndarray) -> set[frozenset[int]]:
-    clusters = actual.clusters.numpy()
+    clusters = actual.clusters
     return {frozenset(names[clusters == c].tolist()) for c in range(actual.count)}
 
 
@@ -91,13 +90,13 @@ def test_order_of_features(seed: int, count: int, method: str) -> None:
     rng = np.random.default_rng(seed)
     features, options = random_features(rng, count), MatchOptions(match=method, overlap=0.3)  # type: ignore[arg-type]
     order = rng.permutation(count)
-    shuffled = take(features, torch.from_numpy(order))
+    shuffled = take(features, order)
     one, other = match(features, options), match(shuffled, options)
     assert as_sets(one, np.arange(count)) == as_sets(other, order)
     a, b = merge(features, one), merge(shuffled, other)
     assert len(a) == len(b) == one.count
     for name in ("means", "covars", "weights", "extinctions", "masses"):
-        x, y = (np.sort(getattr(f, name).reshape(len(f), -1).numpy(), axis=0) for f in (a, b))
+        x, y = (np.sort(getattr(f, name).reshape(len(f), -1), axis=0) for f in (a, b))
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
@@ -105,11 +104,11 @@ def test_order_of_features(seed: int, count: int, method: str) -> None:
 @given(seeds, st.integers(2, 80), st.floats(-3, 3))
 def test_clusters_do_not_depend_on_the_axes(seed: int, count: int, exponent: float) -> None:
     rng = np.random.default_rng(seed)
-    features, turn, factor = random_features(rng, count), torch.from_numpy(random_rotation(seed)), 10.0**exponent
+    features, turn, factor = random_features(rng, count), random_rotation(seed), 10.0**exponent
     moved = replace(
         features,
-        means=(factor * features.means.double() @ turn.T).float(),
-        covars=(factor**2 * turn @ features.covars.double() @ turn.T).float(),
+        means=(factor * features.means.astype(np.float64) @ turn.T).astype(np.float32),
+        covars=(factor**2 * turn @ features.covars.astype(np.float64) @ turn.T).astype(np.float32),
     )
     options = MatchOptions(overlap=0.3)
     one, other = match(features, options), match(moved, options)
@@ -123,13 +122,12 @@ def test_merging_keeps_sums_and_moments(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     features = random_features(rng, count)
     labels = np.unique(rng.integers(0, max(1, count // 3) + 1, count), return_inverse=True)[1].reshape(-1)
-    merged = merge(features, Matches(torch.from_numpy(labels), int(labels.max()) + 1))
+    merged = merge(features, Matches(labels, int(labels.max()) + 1))
 
     def totals(f: FeatureGaussians) -> np.ndarray:
-        weights, means, covars = f.weights.double(), f.means.double(), f.covars.double()
+        weights, means, covars = f.weights.astype(np.float64), f.means.astype(np.float64), f.covars.astype(np.float64)
         second = covars + means[:, :, None] * means[:, None]
-        return np.concatenate(
-            [weights.sum()[None], f.extinctions.double().sum()[None], weights @ means, (weights @ second.flatten(1))]
-        )
+        extinction = f.extinctions.sum(dtype=np.float64)
+        return np.concatenate([[weights.sum(), extinction], weights @ means, weights @ second.reshape(len(f), 9)])
 
     np.testing.assert_allclose(totals(merged), totals(features), rtol=1e-5, atol=1e-6)

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import scenes
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +18,7 @@ ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
 
 
 def identical(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in scenes.FIELDS)
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in scenes.FIELDS)
 
 
 @FEW

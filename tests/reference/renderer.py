@@ -7,21 +7,23 @@ conventions. It knows no tiles, boxes or early exits, and torch can differentiat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.geometry import covariances
+from gsmerge.types import Array, Gaussians
 
 
 @dataclass(frozen=True)
 class Reference:
     """Image ``[h,w,3]``, transmittance ``[h,w]``, depth ``[h,w]`` and weights ``[n,h,w]``, float64."""
 
-    image: Tensor
-    transmittance: Tensor
-    depth: Tensor
-    weights: Tensor
+    image: Array
+    transmittance: Array
+    depth: Array
+    weights: Array
 
 
 def harmonics(directions: Tensor) -> Tensor:
@@ -58,6 +60,16 @@ def view_colors(means: Tensor, sh: Tensor, viewmat: Tensor) -> Tensor:
     return torch.clamp(torch.einsum("nk,nkc->nc", basis, sh) + 0.5, min=0)
 
 
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """``[n,3,3]`` of quaternions ``[n,4]`` of any length and standard deviations ``[n,3]``."""
+    w, (x, y, z) = quats[:, 0], quats[:, 1:].T
+    zero = torch.zeros_like(w)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    length = (quats * quats).sum(1)[:, None, None]
+    half = (torch.eye(3) + 2 * (w[:, None, None] * cross + cross @ cross) / length) * scales[:, None]
+    return half @ half.transpose(1, 2)
+
+
 def footprints(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -73,6 +85,17 @@ def footprints(
     jacobian[:, :, 2] = -focal * clamped / depth[:, None]
     half = jacobian @ viewmat[:3, :3]
     return slopes * focal + centre, half @ covariances(quats, scales) @ half.transpose(1, 2), depth
+
+
+def render_arrays(
+    gaussians: Gaussians, viewmat: np.ndarray, K: np.ndarray, width: int, height: int, **options: Any
+) -> Reference:
+    """:func:`render_reference` of arrays, in the colours that their harmonics show; gives arrays."""
+    means, quats, scales, opacities, sh0, shN = (t.double() for t in vars(gaussians.to("cpu")).values())
+    view, lens = torch.from_numpy(viewmat).double(), torch.from_numpy(K).double()
+    colors = view_colors(means, torch.cat([sh0, shN], 1), view)
+    drawn = render_reference(means, quats, scales, opacities, colors, view, lens, width, height, **options)
+    return Reference(*(part.numpy() for part in vars(drawn).values()))
 
 
 def render_reference(

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose
-from renderer import render_reference
+from renderer import render_arrays
 
+from gsmerge.geometry import normalize
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.stages.assign import FIRST_PAIRS, find_owners, view_owners
 from gsmerge.stages.segment import superpixels
@@ -20,35 +20,27 @@ K = np.array([[60.0, 0, 36.3], [0, 62.0, 27.1], [0, 0, 1]])
 
 
 def random_gaussians(n: int, seed: int, opacity: float = 0.5, size: float = -3.5) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    return Gaussians(
-        normal(n, 3) * torch.tensor([1.0, 0.8, 1.0]) + torch.tensor([0.0, 0.0, 3.0]),
-        torch.nn.functional.normalize(normal(n, 4), dim=1),
-        torch.exp(normal(n, 3) * 0.9 + size),
-        torch.rand(n, generator=generator) ** opacity,
-        normal(n, 1, 3),
-        torch.zeros(n, 0, 3),
+    rng = np.random.default_rng(seed)
+    columns = (
+        rng.normal(size=(n, 3)) * [1.0, 0.8, 1.0] + [0.0, 0.0, 3.0],
+        normalize(rng.normal(size=(n, 4))),
+        np.exp(rng.normal(size=(n, 3)) * 0.9 + size),
+        rng.random(n) ** opacity,
+        rng.normal(size=(n, 1, 3)),
+        np.zeros((n, 0, 3)),
     )
+    return Gaussians(*(column.astype(np.float32) for column in columns))
 
 
 def some_labels(count: int, seed: int = 0) -> np.ndarray:
-    return superpixels(np.random.default_rng(seed).random((HEIGHT, WIDTH, 3)), count).numpy()
+    return superpixels(np.random.default_rng(seed).random((HEIGHT, WIDTH, 3)), count)
 
 
-def superpixel_sums(gaussians: Gaussians, labels: np.ndarray, viewmat: torch.Tensor | None = None) -> np.ndarray:
+def superpixel_sums(gaussians: Gaussians, labels: np.ndarray, viewmat: np.ndarray | None = None) -> np.ndarray:
     """``[n,labels]`` every Gaussian's weights, one pixel after the other, float64."""
-    g = gaussians
-    weights = render_reference(
-        g.means.double(), g.quats.double(), g.scales.double(), g.opacities.double(),
-        torch.zeros(len(g), 3, dtype=torch.float64),
-        torch.eye(4, dtype=torch.float64) if viewmat is None else viewmat, torch.from_numpy(K), WIDTH, HEIGHT,
-    ).weights  # fmt: skip
-    sums = np.zeros((labels.max() + 1, len(g)))
-    np.add.at(sums, labels.reshape(-1), weights.reshape(len(g), -1).numpy().T)
+    weights = render_arrays(gaussians, np.eye(4) if viewmat is None else viewmat, K, WIDTH, HEIGHT).weights
+    sums = np.zeros((labels.max() + 1, len(gaussians)))
+    np.add.at(sums, labels.reshape(-1), weights.reshape(len(gaussians), -1).T)
     return sums.T
 
 
@@ -96,7 +88,7 @@ def test_one_superpixel_gets_all() -> None:
 def test_equal_sums_go_to_the_smaller_label() -> None:
     gaussians = random_gaussians(1, 0)
     middle = Gaussians(
-        torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.2), torch.tensor([0.5]),
+        np.array([[0.0, 0.0, 3.0]]), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), 0.2), np.array([0.5]),
         gaussians.sh0, gaussians.shN,
     )  # fmt: skip
     even = np.array([[60.0, 0, 32], [0, 60.0, 1], [0, 0, 1]])
@@ -109,12 +101,12 @@ def test_equal_sums_go_to_the_smaller_label() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_best_of_all_views(seed: int) -> None:
     gaussians = random_gaussians(150, seed, size=-2.5)
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    viewmats = np.stack([np.eye(4)] * 3)
     viewmats[1, 0, 3], viewmats[2, 2, 3] = 0.7, 1.0
-    cameras = Cameras(viewmats, torch.from_numpy(K).repeat(3, 1, 1), WIDTH, HEIGHT)
+    cameras = Cameras(viewmats, np.stack([K] * 3), WIDTH, HEIGHT)
     labels = np.stack([some_labels(60, view) for view in range(3)])
     scene = UnalignedScene(gaussians, cameras, None, ("a", "b", "c"))
-    owners = find_owners(scene, Groups(torch.from_numpy(labels), (60,) * 3))
+    owners = find_owners(scene, Groups(labels, (60,) * 3))
     sums = np.stack([superpixel_sums(gaussians, labels[v], viewmats[v]) for v in range(3)], 1)
     assert_allclose(owners.values, sums.max((1, 2)), rtol=1e-3, atol=1e-4)
     seen = np.flatnonzero(owners.views >= 0)
@@ -124,9 +116,7 @@ def test_the_best_of_all_views(seed: int) -> None:
 
 def test_of_equal_views_the_first() -> None:
     gaussians = random_gaussians(100, 3)
-    cameras = Cameras(
-        torch.eye(4, dtype=torch.float64).repeat(4, 1, 1), torch.from_numpy(K).repeat(4, 1, 1), WIDTH, HEIGHT
-    )
-    labels = torch.from_numpy(some_labels(30)).repeat(4, 1, 1)
+    cameras = Cameras(np.stack([np.eye(4)] * 4), np.stack([K] * 4), WIDTH, HEIGHT)
+    labels = np.stack([some_labels(30)] * 4)
     owners = find_owners(UnalignedScene(gaussians, cameras, None, tuple("abcd")), Groups(labels, (30,) * 4))
     assert set(owners.views.tolist()) <= {-1, 0}

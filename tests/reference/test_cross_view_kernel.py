@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from scenes import arc, make_scene, room
 
 from gsmerge.geometry import project
@@ -14,9 +13,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, PixelScene
 
 
-def slowly(
-    means: torch.Tensor, sh0: torch.Tensor, views: torch.Tensor, members: Members, cameras: Cameras
-) -> np.ndarray:
+def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras) -> np.ndarray:
     """``[g,7]``: a loop over points and views."""
     places, depths = project(means, cameras)
     actual = np.zeros((len(means), 7))
@@ -28,13 +25,13 @@ def slowly(
             if v == int(views[i]) or not (0 <= x < cameras.width and 0 <= y < cameras.height):
                 continue
             j = (v * cameras.height + y) * cameras.width + x
-            there = project(torch.from_numpy(members.means[j : j + 1]), cameras)[1][v, 0]
+            there = project(members.means[j : j + 1], cameras)[1][v, 0]
             if not (there > 0 and members.opacities[j] > MIN_OPACITY):
                 continue
-            ratio, seen = float(torch.log(depths[v, i] / there)), seen + 1
+            ratio, seen = float(np.log(depths[v, i] / there)), seen + 1
             kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
             if abs(ratio) < NEAR:
-                color += float(np.abs(SH_C0 * (sh0[i, 0].numpy() - members.sh0[j, 0])).mean())
+                color += float(np.abs(SH_C0 * (sh0[i, 0] - members.sh0[j, 0])).mean())
             ratios += float(np.clip(ratio, -FAR, FAR))
         shares = [kind / max(seen, 1) for kind in kinds]
         actual[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
@@ -48,9 +45,9 @@ def scene() -> PixelScene:
 
 def test_every_point_and_view(scene: PixelScene) -> None:
     """Points on surfaces, before and behind them, behind cameras, and of no view."""
-    generator = torch.Generator().manual_seed(0)
-    rows = torch.randperm(len(scene.gaussians), generator=generator)[:160]
-    means = scene.gaussians.means[rows] * (1 + 0.1 * torch.randn(160, 1, generator=generator))
+    rng = np.random.default_rng(0)
+    rows = rng.permutation(len(scene.gaussians))[:160]
+    means = scene.gaussians.means[rows] * (1 + 0.1 * rng.normal(size=(160, 1)).astype(np.float32))
     means[:8] = -means[:8]
     views = rows // scene.pixels_per_view
     views[8:16] = -1
@@ -61,4 +58,4 @@ def test_every_point_and_view(scene: PixelScene) -> None:
     expected = slowly(means, scene.gaussians.sh0[rows], views, members, scene.cameras)
     assert len(np.unique(actual[:, 0])) > 3
     assert (expected[:, 1:4].max(0) > 0).all()
-    np.testing.assert_allclose(actual.numpy(), expected, atol=1e-5)
+    np.testing.assert_allclose(actual, expected, atol=1e-5)

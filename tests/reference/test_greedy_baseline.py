@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scenes
-import torch
 from clouds import some
 
 from gsmerge import Gaussians
@@ -43,9 +42,9 @@ class Blob:
 
 def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
     """Round after round, pair after pair."""
-    covars = covariances(gaussians.quats.double(), gaussians.scales.double()).numpy()
-    sh = torch.cat([gaussians.sh0, gaussians.shN], 1).double().numpy().reshape(len(gaussians), -1)
-    rows = zip(gaussians.means.double().numpy(), covars, gaussians.opacities.double().numpy(), sh, strict=True)
+    covars = covariances(gaussians.quats.astype(np.float64), gaussians.scales.astype(np.float64))
+    sh = np.concatenate([gaussians.sh0, gaussians.shN], 1).astype(np.float64).reshape(len(gaussians), -1)
+    rows = zip(gaussians.means.astype(np.float64), covars, gaussians.opacities.astype(np.float64), sh, strict=True)
     blobs = [Blob(mean, covar, float(alpha) * slow_area(covar), color) for mean, covar, alpha, color in rows]
     while len(blobs) > count:
         pairs = set()
@@ -98,7 +97,7 @@ def test_opacity_is_mass_over_area() -> None:
     lone = greedy.gaussians_of(greedy.reduce_to(greedy.cloud_of(gaussians), 1))
     cloud = greedy.cloud_of(gaussians)
     assert float(lone.opacities[0]) == pytest.approx(
-        min(0.999, cloud.masses.sum() / greedy.area(lone.scales.double().numpy())[0]), rel=1e-3
+        min(0.999, cloud.masses.sum() / greedy.area(lone.scales.astype(np.float64))[0]), rel=1e-3
     )
 
 
@@ -144,21 +143,21 @@ def test_hostile_sets(count: int) -> None:
     """All in one place, flat, of no opacity."""
     gaussians = some(60)
     stacked = Gaussians(
-        torch.zeros(60, 3), gaussians.quats, gaussians.scales * torch.tensor([1.0, 1.0, 0.0]), torch.zeros(60),
-        gaussians.sh0, gaussians.shN,
+        np.zeros((60, 3), np.float32), gaussians.quats, gaussians.scales * np.array([1, 1, 0], np.float32),
+        np.zeros(60, np.float32), gaussians.sh0, gaussians.shN,
     )  # fmt: skip
     merged = greedy.gaussians_of(greedy.reduce_to(greedy.cloud_of(stacked), count))
     assert len(merged) == count
     for name in scenes.FIELDS:
-        assert torch.isfinite(getattr(merged, name)).all(), name
+        assert np.isfinite(getattr(merged, name)).all(), name
 
 
 def test_one_colour_is_merged_before_another() -> None:
     """Of neighbours at the same distance."""
     base = some(3, degree=0)
-    means = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]])
-    colors = torch.tensor([0.2, 0.21, 0.9])[:, None, None].expand(3, 1, 3)
-    ball = torch.full((3, 3), 0.05)
-    three = Gaussians(means, base.quats, ball, torch.full((3,), 0.5), (colors - 0.5) / SH_C0, base.shN)
+    means = np.array([[0.0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], np.float32)
+    colors = np.array([0.2, 0.21, 0.9], np.float32)[:, None, None].repeat(3, 2)
+    ball, opacities = np.full((3, 3), 0.05, np.float32), np.full(3, 0.5, np.float32)
+    three = Gaussians(means, base.quats, ball, opacities, (colors - 0.5) / SH_C0, base.shN)
     two = greedy.reduce_to(greedy.cloud_of(three), 2)
     np.testing.assert_allclose(np.sort(two.means[:, 0]), [-0.1, 0.05], atol=1e-9)

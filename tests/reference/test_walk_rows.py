@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.raster.blend import DECAY, LNOP, MY, RATE, SLOPE, batch_rows, gather, new_batch
+from gsmerge.kernels.raster.blend import batch_rows, gather, new_batch
 from gsmerge.kernels.raster.project import LN_CUT, TILE
-from gsmerge.kernels.raster.walk import BATCH
+from gsmerge.kernels.raster.walk import BATCH, DECAY, LNOP, MY, RATE, SLOPE
 
 LEFT, TOP = 32, 48  # the tile's first pixel
 

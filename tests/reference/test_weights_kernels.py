@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose
-from renderer import render_reference
+from renderer import render_arrays
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry import normalize, quat_to_rotmat
 from gsmerge.render import ViewPlan, composite, contributions, plan_view, prepare, splat_adjoint
 from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.types import Gaussians
@@ -18,20 +19,16 @@ K = np.array([[40.0, 0, 21.3], [0, 42.0, 19.1], [0, 0, 1]])
 
 
 def random_gaussians(n: int, seed: int, opacity: float = 0.5) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    means = normal(n, 3) * torch.tensor([0.9, 0.8, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
-    return Gaussians(
-        means,
-        torch.nn.functional.normalize(normal(n, 4), dim=1),
-        torch.exp(normal(n, 3) * 0.9 - 3),
-        torch.rand(n, generator=generator) ** opacity,
-        normal(n, 1, 3),
-        torch.zeros(n, 0, 3),
+    rng = np.random.default_rng(seed)
+    columns = (
+        rng.normal(size=(n, 3)) * [0.9, 0.8, 1.0] + [0.0, 0.0, 3.0],
+        normalize(rng.normal(size=(n, 4))),
+        np.exp(rng.normal(size=(n, 3)) * 0.9 - 3),
+        rng.random(n) ** opacity,
+        rng.normal(size=(n, 1, 3)),
+        np.zeros((n, 0, 3)),
     )
+    return Gaussians(*(column.astype(np.float32) for column in columns))
 
 
 def planned(gaussians: Gaussians) -> tuple[ViewPlan, ViewWeights]:
@@ -127,12 +124,8 @@ def test_masses_match_contributions(case: tuple[int, int, float]) -> None:
 def test_weights_match_the_slow_renderer() -> None:
     gaussians = random_gaussians(200, 7)
     _, weights = planned(gaussians)
-    expected = render_reference(
-        gaussians.means.double(), gaussians.quats.double(), gaussians.scales.double(), gaussians.opacities.double(),
-        torch.zeros(200, 3, dtype=torch.float64), torch.eye(4, dtype=torch.float64), torch.from_numpy(K),
-        WIDTH, HEIGHT,
-    ).weights  # fmt: skip
-    error = np.abs(dense(weights, 200).T - expected.reshape(200, -1).numpy())
+    expected = render_arrays(gaussians, np.eye(4), K, WIDTH, HEIGHT).weights
+    error = np.abs(dense(weights, 200).T - expected.reshape(200, -1))
     assert np.quantile(error, 0.999) < 1e-5
     assert error.max() < 0.02  # single pixels where a threshold falls the other way
 
@@ -140,11 +133,8 @@ def test_weights_match_the_slow_renderer() -> None:
 def test_needles_lose_no_pixel() -> None:
     """Columns are cut to what a thin slanted Gaussian can touch; nothing that blends may fall outside."""
     gaussians = random_gaussians(300, 8)
-    needles = Gaussians(
-        gaussians.means, gaussians.quats, torch.tensor([0.7, 1e-4, 1e-4]).expand(300, 3), gaussians.opacities,
-        gaussians.sh0, gaussians.shN,
-    )  # fmt: skip
-    slanted = quat_to_rotmat(needles.quats)[:, :2, 0].abs().amin(1)
+    needles = replace(gaussians, scales=np.array([[0.7, 1e-4, 1e-4]], np.float32).repeat(300, 0))
+    slanted = np.abs(quat_to_rotmat(needles.quats)[:, :2, 0]).min(1)
     assert (slanted > 0.1).sum() > 100
     plan, weights = planned(needles)
     colors = np.random.default_rng(0).normal(size=(300, 3))

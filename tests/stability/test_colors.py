@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.render.photos import scene_photos
@@ -24,10 +23,10 @@ def novel_psnr(gaussians: Gaussians, surfaces: list[scenes.Surface], start: floa
     return float(-10 * np.log10(((image - truth) ** 2).mean()))
 
 
-def painted(scene: PixelScene, images: torch.Tensor) -> PixelScene:
+def painted(scene: PixelScene, images: np.ndarray) -> PixelScene:
     """With other photos, and Gaussians of their colours."""
-    sh0 = ((images.reshape(-1, 1, 3) - 0.5) / SH_C0).float()
-    return replace(scene, images=images.float(), gaussians=replace(scene.gaussians, sh0=sh0))
+    sh0 = ((images.reshape(-1, 1, 3) - 0.5) / SH_C0).astype(np.float32)
+    return replace(scene, images=images.astype(np.float32), gaussians=replace(scene.gaussians, sh0=sh0))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def room() -> PixelScene:
 def test_exposure_that_changes_between_views(room: PixelScene) -> None:
     """The fit compensates; factors with geometric mean one, one merge for both."""
     assert room.images is not None
-    factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
+    factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
     merged = scenes.compacted(painted(room, 0.8 * room.images), fit="none").gaussians
     actual = []
     for images in (0.8 * room.images, 0.8 * room.images * factors):
@@ -57,7 +56,7 @@ def test_exposure_that_changes_between_views(room: PixelScene) -> None:
 def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: str) -> None:
     """The whole command: the fit never hurts, and mostly helps."""
     assert room.images is not None
-    factors = torch.tensor([0.8, 1.2, 1 / 1.2, 1.25])[:, None, None, None]
+    factors = np.array([0.8, 1.2, 1 / 1.2, 1.25], np.float32)[:, None, None, None]
     scene = painted(room, 0.8 * room.images * factors)
     surfaces = [scenes.Surface(s.shape, lambda p, s=s: 0.8 * s.texture(p)) for s in scenes.room()]
     before = novel_psnr(scenes.compacted(scene, robust=robust, fit="none").gaussians, surfaces)
@@ -75,7 +74,7 @@ def test_exposure_of_photos_and_gaussians(room: PixelScene, robust: bool, fit: s
 @pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
 def test_flat_pictures(room: PixelScene, grey: float, segmentation: str) -> None:
     assert room.images is not None
-    flat = painted(room, torch.full_like(room.images, grey))
+    flat = painted(room, np.full_like(room.images, grey))
     result = scenes.compacted(flat, segmentation=segmentation, superpixels=60)
     assert 1 <= len(result.gaussians) <= 4 * 60
     assert result.report.psnr_after > 25  # type: ignore[operator]
@@ -84,7 +83,7 @@ def test_flat_pictures(room: PixelScene, grey: float, segmentation: str) -> None
 @pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
 def test_noise_does_not_explode(room: PixelScene, segmentation: str) -> None:
     assert room.images is not None
-    noise = torch.rand(room.images.shape, generator=torch.Generator().manual_seed(0))
+    noise = np.random.default_rng(0).random(room.images.shape, np.float32)
     result = scenes.compacted(painted(room, noise), segmentation=segmentation, superpixels=60)
     assert len(result.gaussians) <= 4 * 60
 
@@ -94,11 +93,11 @@ def test_noise_does_not_explode(room: PixelScene, segmentation: str) -> None:
 
 def shiny(scene: PixelScene, strength: float) -> PixelScene:
     """Degree 3, the same strong harmonics everywhere, photos rendered from the Gaussians."""
-    coefficients = strength * torch.randn(1, 15, 3, generator=torch.Generator().manual_seed(1))
-    shN = coefficients.expand(len(scene.gaussians), -1, -1).clone()
+    coefficients = np.random.default_rng(1).normal(0, strength, (1, 15, 3)).astype(np.float32)
+    shN = coefficients.repeat(len(scene.gaussians), 0)
     made = replace(scene, gaussians=replace(scene.gaussians, shN=shN))
     images = scenes.images_of(made.gaussians, scene.cameras)[0].clip(0, 1)
-    return replace(made, images=torch.from_numpy(images).float())
+    return replace(made, images=images.astype(np.float32))
 
 
 @pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
@@ -106,25 +105,25 @@ def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = scenes.compacted(scene, **settings).gaussians
     assert actual.sh_degree == 3
-    stripped = replace(actual, shN=torch.zeros_like(actual.shN))
+    stripped = replace(actual, shN=np.zeros_like(actual.shN))
     assert scenes.psnr_of(actual, scene) > scenes.psnr_of(stripped, scene) + 3
 
 
 def test_equal_harmonics_stay_equal(room: PixelScene) -> None:
     scene = shiny(room, 0.3)
     actual = scenes.plain(scene)
-    np.testing.assert_allclose(actual.shN, scene.gaussians.shN[:1].expand_as(actual.shN), atol=1e-5)
+    np.testing.assert_allclose(actual.shN, scene.gaussians.shN[:1].repeat(len(actual), 0), atol=1e-5)
 
 
 def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
     """A base colour below 0 or above 1 that the harmonics bring back."""
     scene = shiny(room, 0.0)
     sh0 = scene.gaussians.sh0 - 1.5
-    shN = scene.gaussians.shN.clone()
+    shN = scene.gaussians.shN.copy()
     shN[:, 1] = 1.5 * SH_C0 / 0.48860251190292  # z is about 1 towards all views
     offset = replace(scene, gaussians=replace(scene.gaussians, sh0=sh0, shN=shN))
     images = scenes.images_of(offset.gaussians, offset.cameras)[0].clip(0, 1)
-    offset = replace(offset, images=torch.from_numpy(images).float())
+    offset = replace(offset, images=images.astype(np.float32))
     for fit in ("none", "color"):
         result, usual = (scenes.compacted(s, robust=False, fit=fit) for s in (offset, scene))
         assert result.report.psnr_after > usual.report.psnr_after - 1.0  # type: ignore[operator]
@@ -140,11 +139,11 @@ def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
 def test_passer_by_in_one_view_does_not_haunt_the_others(room: PixelScene, robust: bool, fit: str) -> None:
     """A red patch in the photo of view 1 and on its Gaussians."""
     assert room.images is not None
-    images = room.images.clone()
-    images[1, 10:24, 14:28] = torch.tensor([1.0, 0.0, 0.0])
+    images = room.images.copy()
+    images[1, 10:24, 14:28] = [1.0, 0.0, 0.0]
     haunted = scenes.compacted(painted(room, images), robust=robust, fit=fit).gaussians
     clean = scenes.compacted(room, robust=robust, fit=fit).gaussians
-    others = room.cameras[torch.tensor([0, 2, 3])]
+    others = room.cameras[[0, 2, 3]]
     a, b = (scenes.images_of(g, others)[0].clip(0, 1) for g in (haunted, clean))
     ghost = np.abs(a - b)[:, 8:28, 10:34].mean()
     unfitted = scenes.compacted(painted(room, images), robust=robust, fit="none").gaussians

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Gaussians, PixelScene, UnalignedScene, compact
 
@@ -104,7 +103,7 @@ def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
     "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"match": "none"}], ids=str
 )
 def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
-    opacities = 0.05 * torch.ones_like(scene.gaussians.opacities)
+    opacities = np.full_like(scene.gaussians.opacities, 0.05)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
     usual = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
     actual = scenes.compacted(faint, superpixels="4.4%", **settings).gaussians
@@ -115,10 +114,10 @@ def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
 def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None:
     """Where little is hidden, integrated optical depth is what is seen; in pictures so fine that the low-pass of the
     renderer, which thickens small Gaussians, does not count."""
-    opacities = 0.05 * torch.ones_like(clean.gaussians.opacities)
+    opacities = np.full_like(clean.gaussians.opacities, 0.05)
     faint = replace(clean, gaussians=replace(clean.gaussians, opacities=opacities))
     actual = scenes.plain(faint, match=match)
-    Ks = clean.cameras.Ks.clone()
+    Ks = clean.cameras.Ks.copy()
     Ks[:, :2] *= 4
     fine = replace(clean.cameras[:1], Ks=Ks[:1], width=4 * clean.cameras.width, height=4 * clean.cameras.height)
     before, after = (scenes.images_of(g, fine)[1].mean() for g in (faint.gaussians, actual))

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.geometry import covariances, project, quat_to_rotmat
@@ -26,12 +25,12 @@ def small() -> PixelScene:
     return scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 12))
 
 
-def changed(scene: PixelScene, **columns: torch.Tensor) -> PixelScene:
+def changed(scene: PixelScene, **columns: np.ndarray) -> PixelScene:
     return replace(scene, gaussians=replace(scene.gaussians, **columns))
 
 
 def one_group_per_view(scene: PixelScene) -> FeatureGaussians:
-    labels = torch.zeros(scene.valid.shape, dtype=torch.int32)
+    labels = np.zeros(scene.valid.shape, np.int32)
     return encode(scene, scene_members(scene), Groups(labels, (1,) * len(scene)), EncodeOptions())
 
 
@@ -42,22 +41,23 @@ def one_group_per_view(scene: PixelScene) -> FeatureGaussians:
     "settings", [{}, {"fit": "color", "k": 4}, {"match": "aabb"}, {"robust": False, "fit": "none"}], ids=str
 )
 def test_all_gaussians_in_one_place(room: PixelScene, settings: dict) -> None:
-    means = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand(len(room.gaussians), 3)
-    first = {name: getattr(room.gaussians, name)[:1].expand_as(getattr(room.gaussians, name)) for name in scenes.FIELDS}
+    columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
+    first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
+    means = np.broadcast_to([0.0, 0.0, 3.0], room.gaussians.means.shape)
     scenes.compacted(changed(room, **{**first, "means": means}), **settings)
 
 
 def test_coincident_members_stack(small: PixelScene) -> None:
     count = small.pixels_per_view
-    same = {name: getattr(small.gaussians, name)[:1].repeat_interleave(count, 0) for name in scenes.FIELDS}
-    same["opacities"] = torch.full((count,), 0.02)
+    same = {name: getattr(small.gaussians, name)[:1].repeat(count, 0) for name in scenes.FIELDS}
+    same["opacities"] = np.full(count, 0.02, np.float32)
     merged = feature_to_gaussians(one_group_per_view(changed(small, **same)))
     one = small.gaussians[:1]
     footprint = scene_members(small).footprints[0]
-    floor = (0.1 * footprint) ** 2 * torch.eye(3)
-    a, b = (covariances(g.quats.double(), g.scales.double())[0] for g in (merged, one))
+    floor = (0.1 * footprint) ** 2 * np.eye(3)
+    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64))[0] for g in (merged, one))
     np.testing.assert_allclose(a, b + floor, rtol=1e-4, atol=1e-8)
-    discs = [float(g.scales[0].double().sort().values[1:].prod()) for g in (merged, one)]
+    discs = [float(np.sort(g.scales[0].astype(np.float64))[1:].prod()) for g in (merged, one)]
     expected = 1 - (1 - 0.02) ** (count * discs[1] / discs[0])
     assert float(merged.opacities[0]) == pytest.approx(expected, rel=1e-4)
 
@@ -67,17 +67,17 @@ def test_coincident_members_stack(small: PixelScene) -> None:
 
 def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
     actual = scenes.plain(small, superpixels="100%")
-    order = torch.cdist(small.gaussians.means, actual.means).argmin(1)
-    assert len(order.unique()) == len(actual) == len(small.gaussians)
+    order = np.linalg.norm(small.gaussians.means[:, None] - actual.means, axis=-1).argmin(1)
+    assert len(np.unique(order)) == len(actual) == len(small.gaussians)
     own, kept = small.gaussians, actual[order]
     np.testing.assert_allclose(kept.means, own.means, atol=1e-6)
     np.testing.assert_allclose(kept.sh0, own.sh0, atol=1e-6)
     np.testing.assert_allclose(kept.opacities, own.opacities, atol=0.03)  # the floor of a tenth of a pixel
-    footprints = torch.from_numpy(scene_members(small).footprints).double()
-    error = covariances(kept.quats.double(), kept.scales.double()) - covariances(
-        own.quats.double(), own.scales.double()
+    footprints = scene_members(small).footprints.astype(np.float64)
+    error = covariances(kept.quats.astype(np.float64), kept.scales.astype(np.float64)) - covariances(
+        own.quats.astype(np.float64), own.scales.astype(np.float64)
     )
-    assert (error.abs().amax((1, 2)) < 1.01 * (0.1 * footprints) ** 2).all()
+    assert (np.abs(error).max((1, 2)) < 1.01 * (0.1 * footprints) ** 2).all()
 
 
 # 3: rank-deficient groups
@@ -85,14 +85,14 @@ def test_every_pixel_its_own_superpixel(small: PixelScene) -> None:
 
 @pytest.mark.parametrize("axes", [[0], [0, 1]], ids=["line", "sheet"])
 def test_flat_groups_have_a_smallest_scale(small: PixelScene, axes: list[int]) -> None:
-    means = torch.zeros_like(small.gaussians.means) + torch.tensor([0.0, 0.0, 3.0])
+    means = np.tile([0.0, 0.0, 3.0], (len(small.gaussians), 1))
     means[:, axes] = small.gaussians.means[:, axes]
-    scene = changed(small, means=means, scales=torch.full_like(small.gaussians.scales, 1e-9))
+    scene = changed(small, means=means, scales=np.full_like(small.gaussians.scales, 1e-9))
     features = one_group_per_view(scene)
     actual = feature_to_gaussians(features)
     assert float(actual.scales.min()) >= 0.0999 * float(features.footprints[0])
-    rotmat = quat_to_rotmat(actual.quats.double())[0]
-    assert float(torch.linalg.det(rotmat)) == pytest.approx(1, abs=1e-6)
+    rotmat = quat_to_rotmat(actual.quats.astype(np.float64))[0]
+    assert np.linalg.det(rotmat) == pytest.approx(1, abs=1e-6)
 
 
 # 4 to 6: needles, overflow, oversized members
@@ -101,9 +101,9 @@ def test_flat_groups_have_a_smallest_scale(small: PixelScene, axes: list[int]) -
 @pytest.mark.parametrize("size", [2, 3, 4, 16])
 def test_needle_in_a_group(small: PixelScene, size: int) -> None:
     """Aspect 1e4: the merged Gaussian keeps within three times the group's extent."""
-    scene = replace(small, valid=torch.zeros_like(small.valid))
-    scene.valid.view(-1)[:size] = True
-    scales = scene.gaussians.scales.clone()
+    scene = replace(small, valid=np.zeros_like(small.valid))
+    scene.valid.reshape(-1)[:size] = True
+    scales = scene.gaussians.scales.copy()
     scales[0, 0] *= 1e4
     clean, actual = (feature_to_gaussians(one_group_per_view(s)) for s in (scene, changed(scene, scales=scales)))
     extent = max(float(clean.scales.max()), float(scene.gaussians.scales[:size].max()))
@@ -111,7 +111,7 @@ def test_needle_in_a_group(small: PixelScene, size: int) -> None:
 
 
 def test_needles_hardly_show(room: PixelScene) -> None:
-    scales = room.gaussians.scales.clone()
+    scales = room.gaussians.scales.copy()
     scales[::40, 0] *= 1e4
     clean, actual = scenes.plain(room), scenes.plain(changed(room, scales=scales))
     assert scenes.psnr_of(actual, room) > scenes.psnr_of(clean, room) - 1
@@ -119,7 +119,7 @@ def test_needles_hardly_show(room: PixelScene) -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"robust": False, "fit": "none"}, {"fit": "color", "k": 4}], ids=str)
 def test_scales_at_the_ends_of_the_range(room: PixelScene, settings: dict) -> None:
-    scales = room.gaussians.scales.clone()
+    scales = room.gaussians.scales.copy()
     scales[::30] = 2e17  # exp(40)
     scales[7::30] = 4e-18  # exp(-40)
     scales[11::30, 1] = 0
@@ -129,9 +129,9 @@ def test_scales_at_the_ends_of_the_range(room: PixelScene, settings: dict) -> No
 @pytest.mark.parametrize("robust", [True, False])
 def test_oversized_members_cost_less_than_a_decibel(room: PixelScene, robust: bool) -> None:
     rng = np.random.default_rng(0)
-    scales = room.gaussians.scales.clone()
+    scales = room.gaussians.scales.copy()
     rows = rng.choice(len(scales), len(scales) // 100, replace=False)
-    scales[rows] *= torch.from_numpy(rng.uniform(4, 15, (len(rows), 1)).astype(np.float32))
+    scales[rows] *= rng.uniform(4, 15, (len(rows), 1)).astype(np.float32)
     settings = {"robust": robust, "fit": "none"}
     clean = scenes.compacted(room, **settings).gaussians
     actual = scenes.compacted(changed(room, scales=scales), **settings).gaussians
@@ -143,7 +143,7 @@ def test_oversized_members_cost_less_than_a_decibel(room: PixelScene, robust: bo
 
 @pytest.mark.parametrize("k", [1, 4])
 def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
-    opacities = room.gaussians.opacities.clone().reshape(room.valid.shape)
+    opacities = room.gaussians.opacities.copy().reshape(room.valid.shape)
     opacities[0] = 0
     half = replace(changed(room, opacities=opacities.reshape(-1)), images=None)  # photos would prune what view 0 hides
     actual = scenes.plain(half, k=k, match="none")
@@ -154,12 +154,12 @@ def test_transparent_pixels_leave_nothing(room: PixelScene, k: int) -> None:
 @pytest.mark.parametrize("fit", ["color", "full"])
 @pytest.mark.parametrize("opacity", [0.0, 1e-5])
 def test_wholly_transparent_scene(room: PixelScene, opacity: float, fit: str) -> None:
-    scene = changed(room, opacities=torch.full_like(room.gaussians.opacities, opacity))
+    scene = changed(room, opacities=np.full_like(room.gaussians.opacities, opacity))
     scenes.compacted(scene, fit=fit)
 
 
 def test_wholly_opaque_scene(room: PixelScene) -> None:
-    scenes.compacted(changed(room, opacities=torch.ones_like(room.gaussians.opacities)))
+    scenes.compacted(changed(room, opacities=np.ones_like(room.gaussians.opacities)))
 
 
 # 10, 11: quaternions
@@ -167,14 +167,14 @@ def test_wholly_opaque_scene(room: PixelScene) -> None:
 
 def test_sign_and_length_of_quaternions_do_not_matter(room: PixelScene) -> None:
     rng = np.random.default_rng(0)
-    factors = torch.from_numpy(rng.choice([-1, 1], (len(room.gaussians), 1)) * rng.uniform(0.01, 100, (1,))).float()
+    factors = (rng.choice([-1, 1], (len(room.gaussians), 1)) * rng.uniform(0.01, 100)).astype(np.float32)
     before, after = scenes.plain(room), scenes.plain(changed(room, quats=room.gaussians.quats * factors))
     scenes.assert_same_set(before, after, atol=1e-5)
 
 
 def test_zero_quaternions_mean_no_rotation(room: PixelScene) -> None:
-    zero, one = room.gaussians.quats.clone(), room.gaussians.quats.clone()
-    zero[::3], one[::3] = 0, torch.tensor([1.0, 0, 0, 0])
+    zero, one = room.gaussians.quats.copy(), room.gaussians.quats.copy()
+    zero[::3], one[::3] = 0, [1, 0, 0, 0]
     settings = {"robust": False, "fit": "none"}
     a, b = (scenes.compacted(changed(room, quats=q), **settings).gaussians for q in (zero, one))
     scenes.assert_same_set(a, b, atol=1e-6)
@@ -182,11 +182,11 @@ def test_zero_quaternions_mean_no_rotation(room: PixelScene) -> None:
 
 def test_tiny_changes_make_tiny_changes(room: PixelScene) -> None:
     """Axes may flip, covariances must not."""
-    nudge = 1e-7 * torch.randn(room.gaussians.means.shape, generator=torch.Generator().manual_seed(0)).double()
+    nudge = np.random.default_rng(0).normal(0, 1e-7, room.gaussians.means.shape)
     moved = changed(room, means=room.gaussians.means + nudge)
     actual = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
-    a, b = (covariances(g.quats.double(), g.scales.double()) for g in actual)
-    assert float((a - b).abs().max()) < 1e-6
+    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64)) for g in actual)
+    assert np.abs(a - b).max() < 1e-6
 
 
 # 14: something huge and near
@@ -194,7 +194,7 @@ def test_tiny_changes_make_tiny_changes(room: PixelScene) -> None:
 
 def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
     """In the corner of view 0; the others must not notice."""
-    means, scales = room.gaussians.means.clone(), room.gaussians.scales.clone()
+    means, scales = room.gaussians.means.copy(), room.gaussians.scales.copy()
     eye = room.cameras.centres[0]
     means[0] = eye + 0.02 * (means[0] - eye)
     scales[0] = 5.0
@@ -209,7 +209,7 @@ def test_huge_gaussian_in_front_of_one_camera(room: PixelScene) -> None:
 @pytest.mark.parametrize("settings", [{}, {"fit": "color", "k": 4}, {"robust": False, "fit": "none"}], ids=str)
 def test_pixels_at_and_behind_their_own_eye(room: PixelScene, where: str, settings: dict) -> None:
     """A tenth of every view, superpixels as a whole among them."""
-    means = room.gaussians.means.clone().reshape(3, 36, 48, 3)
+    means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
     part = means[:, :8, :24]
     means[:, :8, :24] = eyes if where == "at" else 2 * eyes - part
@@ -233,7 +233,7 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
 
     def sky_psnr(gaussians: Gaussians) -> float:
         image = np.clip(scenes.images_of(gaussians, scene.cameras)[0], 0, 1)
-        return float(-10 * np.log10(((image - scene.images.numpy()) ** 2)[far].mean()))  # type: ignore[union-attr]
+        return float(-10 * np.log10(((image - scene.images) ** 2)[far].mean()))  # type: ignore[union-attr]
 
     if settings.get("robust", True):  # one plain layer is not closed, see test_conservation
         assert sky_psnr(actual) > sky_psnr(scene.gaussians) - 0.5
@@ -248,7 +248,7 @@ def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
     grey = scenes.flat(0.5, 0.5, 0.5)
     scene = scenes.make_scene([scenes.plane(2.0, grey, right=0.03), scenes.plane(4.0, grey)], scenes.arc(2))
     actual = scenes.plain(scene, k=k)
-    torn = (actual.means[:, 2] - 2).abs().minimum((actual.means[:, 2] - 4).abs()) > 0.2
+    torn = np.minimum(np.abs(actual.means[:, 2] - 2), np.abs(actual.means[:, 2] - 4)) > 0.2
     assert not torn.any()
 
 

@@ -89,7 +89,7 @@ def test_images_of_another_size_are_brought_to_the_grid(scene_copy: Path, size: 
     for path in (scene_copy / "images").iterdir():
         cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), size))
     loaded = load_scene(scene_copy)
-    assert float((loaded.scene.images - usual).abs().mean()) < 0.05
+    assert np.abs(loaded.scene.images - usual).mean() < 0.05
     assert loaded.notes == (
         f"photos of {size[0]} x {size[1]} are resized to 48 x 32, the cameras' and the Gaussian grid's size",
     )

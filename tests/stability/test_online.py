@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from arriving import fed, parts_of, state_of
-from safetensors.torch import load_file, save_file
+from safetensors.numpy import load_file, save_file
 
 from gsmerge import Compactor, PixelScene, SceneError
 from gsmerge.encoded.gsm_file import SCHEMA

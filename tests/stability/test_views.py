@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Cameras, PixelScene
+from gsmerge.online.photos import concat_cameras
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_repeated_view_with_the_full_fit(room: PixelScene) -> None:
 def test_pure_rotation(fit: str) -> None:
     eye = np.zeros(3)
     viewmats = [scenes.look_at(eye, np.array([x, 0.0, 3.0])) for x in (-0.4, 0.0, 0.4)]
-    cameras = Cameras(torch.stack(viewmats), scenes.intrinsics(3, 48, 36), 48, 36)
+    cameras = Cameras(np.stack(viewmats), scenes.intrinsics(3, 48, 36), 48, 36)
     scene = scenes.make_scene(scenes.wall(), cameras)
     result = scenes.compacted(scene, fit=fit)
     assert result.report.choices["fit"]["accepted"]
@@ -73,7 +73,7 @@ def test_single_view(room: PixelScene, fit: str) -> None:
     single = scenes.take_views(room, [1])
     matched, apart = scenes.compacted(single, fit=fit), scenes.compacted(single, fit=fit, match="none")
     for name in scenes.FIELDS:
-        assert torch.equal(getattr(matched.gaussians, name), getattr(apart.gaussians, name))
+        np.testing.assert_array_equal(getattr(matched.gaussians, name), getattr(apart.gaussians, name))
     assert matched.report.choices.get("merge") in ((None,) if fit == "full" else ("plain", "wide", "wider"))
     fit = matched.report.choices["fit"]
     assert fit["holdout_after"] > fit["holdout_before"] > 10
@@ -85,10 +85,10 @@ def test_single_view(room: PixelScene, fit: str) -> None:
 def test_disjoint_views_are_merged_like_single_ones() -> None:
     surfaces = scenes.wall()
     near = scenes.arc(1)
-    shift = torch.eye(4, dtype=torch.float64)
+    shift = np.eye(4)
     shift[0, 3] = -30
     far = replace(near, viewmats=near.viewmats @ shift)
-    both = Cameras(torch.cat([near.viewmats, far.viewmats]), torch.cat([near.Ks, far.Ks]), near.width, near.height)
+    both = concat_cameras(near, far)
     together = scenes.plain(scenes.make_scene(surfaces, both))
     scene = scenes.make_scene(surfaces, both)
     apart = [scenes.plain(scenes.take_views(scene, [view])) for view in (0, 1)]
@@ -127,13 +127,13 @@ def test_order_of_views_hardly_matters_to_the_fit(room: PixelScene, fit: str, mo
 
 def misplaced(scene: PixelScene, degrees: float) -> PixelScene:
     """Views 1 and 2 with their Gaussians turned about their own eyes, one to either side."""
-    means, viewmats = scene.gaussians.means.clone().reshape(3, -1, 3), scene.cameras.viewmats.clone()
+    means, viewmats = scene.gaussians.means.copy().reshape(3, -1, 3), scene.cameras.viewmats.copy()
     for view, sign in ((1, 1), (2, -1)):
         angle = np.deg2rad(sign * degrees)
-        turn = torch.eye(4, dtype=torch.float64)
+        turn = np.eye(4)
         turn[0, 0] = turn[2, 2] = np.cos(angle)
         turn[0, 2], turn[2, 0] = np.sin(angle), -np.sin(angle)
-        old = viewmats[view].clone()
+        old = viewmats[view].copy()
         viewmats[view] = turn @ old
         camera = means[view] @ old[:3, :3].T + old[:3, 3]
         means[view] = (camera - viewmats[view, :3, 3]) @ viewmats[view, :3, :3]

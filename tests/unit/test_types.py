@@ -2,33 +2,42 @@ from __future__ import annotations
 
 from dataclasses import FrozenInstanceError, fields, replace
 
+import numpy as np
 import pytest
 import torch
 
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, PixelScene
+from gsmerge.types import (
+    Cameras,
+    FeatureGaussians,
+    Gaussians,
+    Groups,
+    PixelScene,
+    UnalignedScene,
+    as_array,
+    as_tensor,
+    like,
+)
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:
-    row = torch.arange(start, start + n, dtype=torch.float32)
-    return Gaussians(
-        row[:, None].expand(n, 3), row[:, None].expand(n, 4), row[:, None].expand(n, 3), row,
-        row[:, None, None].expand(n, 1, 3), row[:, None, None].expand(n, coefficients, 3),
-    )  # fmt: skip
+    def rows(*shape: int) -> np.ndarray:
+        return np.arange(start, start + n, dtype=np.float32).reshape(n, *[1] * len(shape)) * np.ones(shape, np.float32)
+
+    return Gaussians(rows(3), rows(4), rows(3), rows(), rows(1, 3), rows(coefficients, 3))
 
 
 def cameras(c: int = 2) -> Cameras:
-    return Cameras(torch.eye(4, dtype=torch.float64).repeat(c, 1, 1), torch.eye(3).repeat(c, 1, 1).double(), 4, 3)
+    return Cameras(np.stack([np.eye(4)] * c), np.stack([np.eye(3)] * c), 4, 3)
 
 
 def features(sizes: list[int]) -> FeatureGaussians:
-    g = len(sizes)
-    column = torch.arange(g, dtype=torch.float32)
-    starts = torch.tensor([0, *torch.tensor(sizes).cumsum(0).tolist()])
+    g, starts = len(sizes), np.cumsum([0, *sizes])
+    column = np.arange(g, dtype=np.float32)
     return FeatureGaussians(
-        means=column[:, None].expand(g, 3), covars=column[:, None, None].expand(g, 3, 3), weights=column, masses=column,
-        extinctions=column, gains=column, spreads=column, sh0=torch.zeros(g, 1, 3), shN=torch.zeros(g, 0, 3),
-        footprints=column, views=column.long(), backing=torch.zeros(g, dtype=torch.bool), starts=starts,
-        members=torch.arange(int(starts[-1])), latents=torch.zeros(g, 0),
+        means=np.stack([column] * 3, 1), covars=column[:, None, None] * np.ones((3, 3), np.float32), weights=column,
+        masses=column, extinctions=column, gains=column, spreads=column, sh0=np.zeros((g, 1, 3), np.float32),
+        shN=np.zeros((g, 0, 3), np.float32), footprints=column, views=np.arange(g), backing=np.zeros(g, bool),
+        starts=starts, members=np.arange(starts[-1]), latents=np.zeros((g, 0), np.float32),
     )  # fmt: skip
 
 
@@ -36,14 +45,14 @@ def test_gaussians_are_indexed_by_row() -> None:
     g = gaussians(5, 3)
     assert len(g) == 5
     assert g[1:3].means[:, 0].tolist() == [1, 2]
-    assert g[torch.tensor([4, 0])].opacities.tolist() == [4, 0]
+    assert g[np.array([4, 0])].opacities.tolist() == [4, 0]
     assert g[g.opacities > 2].shN.shape == (2, 3, 3)
     assert len(g[:0]) == 0
 
 
 def test_gaussians_are_frozen() -> None:
     with pytest.raises(FrozenInstanceError):
-        gaussians(1).means = torch.zeros(1, 3)  # type: ignore[misc]
+        gaussians(1).means = np.zeros((1, 3))  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(("coefficients", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3), (24, 4)])
@@ -54,13 +63,75 @@ def test_degree(coefficients: int, degree: int) -> None:
 def test_concat_keeps_the_order() -> None:
     both = Gaussians.concat([gaussians(2, 3), gaussians(3, 3, start=2)])
     for f in fields(Gaussians):
-        assert torch.equal(getattr(both, f.name), getattr(gaussians(5, 3), f.name))
+        assert np.array_equal(getattr(both, f.name), getattr(gaussians(5, 3), f.name))
 
 
 def test_to_keeps_everything() -> None:
-    g = gaussians(2).to("cpu")
-    assert torch.equal(g.means, gaussians(2).means)
-    assert cameras().to("cpu").width == 4
+    """Arrays become tensors that share their memory, and tensors arrays; of either kind the same stays as it is."""
+    g, c = gaussians(2, 3), cameras()
+    tensors, moved = g.to("cpu"), c.to(torch.device("cpu"))
+    assert (moved.width, moved.height) == (4, 3)
+    for one, other in ((g, tensors), (c, moved)):
+        back = other.numpy()
+        for name in ("viewmats", "Ks") if one is c else [f.name for f in fields(Gaussians)]:
+            array, tensor = getattr(one, name), getattr(other, name)
+            assert isinstance(tensor, torch.Tensor)
+            assert isinstance(getattr(back, name), np.ndarray)
+            assert torch.equal(tensor, torch.from_numpy(array))
+            assert np.shares_memory(getattr(back, name), array)
+            assert getattr(other.to("cpu"), name) is tensor
+            assert getattr(one.numpy(), name) is array
+    assert all(getattr(g.to("meta"), f.name).is_meta for f in fields(Gaussians))
+
+
+def test_device_is_that_of_tensors() -> None:
+    assert gaussians(2).device is None
+    assert gaussians(2).to("cpu").device == torch.device("cpu")
+    assert gaussians(2).to("meta").device == torch.device("meta")
+
+
+def test_gradients_pass_to_a_device_and_end_in_arrays() -> None:
+    means = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
+    tensors = replace(gaussians(2).to("cpu"), means=means)
+    tensors.to("cpu").means.sum().backward()
+    assert means.grad is not None
+    viewmats = torch.eye(4)[None].requires_grad_()
+    assert Cameras(viewmats, torch.eye(3)[None], 4, 3).to("cpu").viewmats.requires_grad
+    assert tensors.numpy().means.tolist() == [[1, 1, 1]] * 2
+    assert tensors.numpy().means.dtype == np.float64
+
+
+def test_concat_of_tensors_is_of_tensors() -> None:
+    """With their gradients; arrays among them become tensors."""
+    opacities = torch.ones(2, requires_grad=True)
+    first = replace(gaussians(2, 3).to("cpu"), opacities=opacities)
+    for second in (gaussians(3, 3, start=2), gaussians(3, 3, start=2).to("cpu")):
+        both = Gaussians.concat([first, second])
+        assert both.device == torch.device("cpu")
+        assert both.opacities.requires_grad
+        assert both.opacities.tolist() == [1, 1, 2, 3, 4]
+        for name in ("means", "quats", "scales", "sh0", "shN"):
+            assert np.array_equal(getattr(both.numpy(), name), getattr(gaussians(5, 3), name))
+
+
+def test_tensors_are_indexed_like_arrays() -> None:
+    g = gaussians(5, 3)
+    for index in (slice(1, 3), np.array([4, 0]), g.opacities > 2, [3]):
+        actual, expected = g.to("cpu")[index], g[index]
+        assert actual.device is not None
+        for f in fields(Gaussians):
+            assert np.array_equal(getattr(actual.numpy(), f.name), getattr(expected, f.name))
+
+
+def test_single_arrays() -> None:
+    array, tensor = np.arange(3.0), torch.arange(3.0, requires_grad=True)
+    assert as_array(array) is array
+    assert np.shares_memory(as_array(as_tensor(array)), array)
+    assert as_tensor(tensor) is tensor
+    assert as_array(tensor).tolist() == as_array([0.0, 1.0, 2.0]).tolist() == [0, 1, 2]
+    assert like(array, np.zeros(1)) is array
+    assert torch.equal(like(array, torch.zeros(1)), torch.from_numpy(array))
+    assert like(array, torch.zeros(1, device="meta")).is_meta
 
 
 @pytest.mark.parametrize(
@@ -69,7 +140,7 @@ def test_to_keeps_everything() -> None:
 )
 def test_wrong_shapes_are_named(name: str, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected shape .* got "):
-        replace(gaussians(5), **{name: torch.zeros(shape)})
+        replace(gaussians(5), **{name: np.zeros(shape)})
 
 
 def test_incomplete_harmonics_are_refused() -> None:
@@ -82,15 +153,16 @@ def test_cameras() -> None:
     assert len(c) == 3
     assert len(c[:1]) == 1
     assert (c[1:].width, c[1:].height) == (4, 3)
-    viewmat = torch.tensor([[0.0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]], dtype=torch.float64)
-    assert replace(c, viewmats=viewmat.expand(3, 4, 4)).centres[0].tolist() == [7, -6, -5]
+    viewmat = np.array([[0.0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]])
+    turned = replace(c, viewmats=np.stack([viewmat] * 3))
+    assert turned.centres[0].tolist() == turned.to("cpu").centres[0].tolist() == [7, -6, -5]
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"viewmats": torch.eye(3).expand(2, 3, 3)}, "viewmats: expected shape"),
-        ({"Ks": torch.eye(3).expand(1, 3, 3)}, "Ks: expected shape"),
+        ({"viewmats": np.stack([np.eye(3)] * 2)}, "viewmats: expected shape"),
+        ({"Ks": np.eye(3)[None]}, "Ks: expected shape"),
         ({"width": 0}, "expected a positive image size, got 0 x 3"),
         ({"height": -1}, "expected a positive image size"),
     ],
@@ -101,7 +173,8 @@ def test_wrong_cameras_are_refused(change: dict, message: str) -> None:
 
 
 def scene() -> PixelScene:
-    return PixelScene(gaussians(24), cameras(), torch.zeros(2, 3, 4, 3), torch.ones(2, 3, 4).bool(), ("a", "b"))
+    images, valid = np.zeros((2, 3, 4, 3), np.float32), np.ones((2, 3, 4), bool)
+    return PixelScene(gaussians(24), cameras(), images, valid, ("a", "b"))
 
 
 def test_scene() -> None:
@@ -113,21 +186,48 @@ def test_scene() -> None:
 def test_what_the_file_has() -> None:
     assert scene().num_missing == 0
     assert len(scene().file_gaussians) == scene().num_gaussians == 24
-    missing = torch.zeros(2, 3, 4).bool()
+    missing = np.zeros((2, 3, 4), bool)
     missing[1, 2, 3] = missing[0, 0, 1] = True
     some = replace(scene(), missing=missing)
     assert (some.num_missing, some.num_gaussians, int(some.stored.sum())) == (2, 22, 22)
-    assert torch.equal(some.file_gaussians.means, torch.cat([gaussians(24).means[:1], gaussians(24).means[2:23]]))
+    kept = np.r_[0, 2:23]
+    assert np.array_equal(some.file_gaussians.means, gaussians(24).means[kept])
+
+
+@pytest.mark.parametrize("missing", [None, np.zeros((2, 3, 4), bool)])
+def test_scenes_of_tensors_become_such_of_arrays(missing: np.ndarray | None) -> None:
+    given = replace(scene(), missing=missing)
+    assert isinstance(given.numpy().gaussians.means, np.ndarray)
+    changed = {"gaussians": given.gaussians.to("cpu"), "cameras": given.cameras.to("cpu")}
+    changed |= {name: as_tensor(getattr(given, name)) for name in ("images", "valid")}
+    if missing is not None:
+        changed["missing"] = as_tensor(missing)
+    loose = UnalignedScene(changed["gaussians"], changed["cameras"], changed["images"], given.names)
+    for tensors in (
+        replace(given, **changed),
+        replace(given, **{**changed, "images": None}),
+        loose,
+        replace(loose, images=None),
+    ):
+        arrays = tensors.numpy()
+        assert type(arrays) is type(tensors)
+        assert arrays.names == given.names
+        for one in (*vars(arrays.gaussians).values(), arrays.cameras.viewmats, arrays.cameras.Ks):
+            assert isinstance(one, np.ndarray)
+        for name in ("images", "valid", "missing"):
+            one, other = getattr(arrays, name, None), getattr(tensors, name, None)
+            assert (one is None) == (other is None)
+            assert one is None or (isinstance(one, np.ndarray) and np.array_equal(one, getattr(given, name)))
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"gaussians": gaussians(23)}, "expected 2 x 3 x 4 = 24 Gaussians, got 23"),
-        ({"valid": torch.ones(2, 4, 3).bool()}, "valid: expected shape"),
-        ({"images": torch.zeros(2, 3, 4, 4)}, "images: expected shape"),
+        ({"valid": np.ones((2, 4, 3), bool)}, "valid: expected shape"),
+        ({"images": np.zeros((2, 3, 4, 4))}, "images: expected shape"),
         ({"names": ("a",)}, "expected 2 view names, got 1"),
-        ({"missing": torch.ones(2, 4, 3).bool()}, "missing: expected shape"),
+        ({"missing": np.ones((2, 4, 3), bool)}, "missing: expected shape"),
     ],
 )
 def test_wrong_scenes_are_refused(change: dict, message: str) -> None:
@@ -136,9 +236,9 @@ def test_wrong_scenes_are_refused(change: dict, message: str) -> None:
 
 
 def test_groups_count_all_views() -> None:
-    assert len(Groups(torch.zeros(2, 3, 4, dtype=torch.int32), (3, 4))) == 7
+    assert len(Groups(np.zeros((2, 3, 4), np.int32), (3, 4))) == 7
     with pytest.raises(ValueError, match="labels: expected shape"):
-        Groups(torch.zeros(2, 3, 4, dtype=torch.int32), (3,))
+        Groups(np.zeros((2, 3, 4), np.int32), (3,))
 
 
 def test_features_concat_shifts_the_starts() -> None:
@@ -152,4 +252,4 @@ def test_features_concat_shifts_the_starts() -> None:
 @pytest.mark.parametrize("name", ["weights", "masses", "extinctions", "gains", "spreads", "footprints", "starts"])
 def test_wrong_features_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name}: expected shape"):
-        replace(features([1, 2]), **{name: torch.zeros(7)})
+        replace(features([1, 2]), **{name: np.zeros(7)})

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from torch import Tensor
 
 from gsmerge.io.alignment.layouts import Layout, exact_layouts, subsample
 from gsmerge.io.alignment.score import find_correspondences, pixel_limit, split_blocks
@@ -24,7 +23,7 @@ _ONE_FOCAL = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2
 
 
 def estimate_cameras(
-    path: Path, gaussians: Gaussians, valid: Tensor, names: Sequence[str], width: int, height: int
+    path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
     """Poses and one focal length under which every row of a full or trimmed grid projects into its own pixel.
 
@@ -44,7 +43,7 @@ def estimate_cameras(
     return make_camera_file(path, SOURCE, W2C_OPENCV, views)
 
 
-def _calibrate(means: Tensor, valid: Tensor, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
+def _calibrate(means: np.ndarray, valid: np.ndarray, layout: Layout) -> tuple[float, float, list[np.ndarray]]:
     """(largest median distance in pixels, focal length, poses) of one order of the rows; inf without one."""
     pairs = find_correspondences(means, valid, layout)
     middle = np.median(pairs.points, 0)

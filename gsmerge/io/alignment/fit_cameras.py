@@ -15,10 +15,10 @@ from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
 from gsmerge.io.alignment.poses import choose_fit, find_aligned_poses, other_conventions
 from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput, color_error
-from gsmerge.io.cameras.camera_file import CameraFile, with_convention, with_poses
+from gsmerge.io.cameras.camera_file import CameraFile, with_convention
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photos import Photos, as_tensor, natural_key, photo_size
+from gsmerge.io.photos import Photos, as_floats, natural_key, photo_size
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
@@ -79,7 +79,7 @@ def fit_cameras(
     if other_poses is not None:
         poses, recovery = other_poses
         notes.append(f"{poses.describe(camera_file.convention)}: read so")
-        inputs = replace(inputs, cameras=with_poses(inputs.cameras, poses.viewmats))
+        inputs = replace(inputs, cameras=replace(inputs.cameras, viewmats=poses.viewmats))
         camera_file = with_convention(camera_file, poses.convention)
     if recovery is None and order not in MAY_BE_UNALIGNED:
         both = _other_size_and_poses(source, camera_file)
@@ -101,7 +101,7 @@ def _make_input(source: _Source, camera_file: CameraFile, fit: GridFit, *, photo
         gaussians=ply.gaussians,
         valid=ply.valid,
         cameras=fit.cameras,
-        images=None if fitted is None else as_tensor(fitted),
+        images=None if fitted is None else as_floats(fitted),
         labellings=[list(range(len(names))), sorted(range(len(names)), key=lambda i: natural_key(names[i]))],
         depths=partial(read_depths, Path(camera_file.path)),
         order=source.order,
@@ -154,7 +154,7 @@ def _other_size_and_poses(source: _Source, camera_file: CameraFile) -> CameraFit
     SceneError if several readings fit alike.
     """
     fits = []
-    for poses in other_conventions(camera_file.viewmats.double().numpy(), camera_file.convention):
+    for poses in other_conventions(camera_file.viewmats, camera_file.convention):
         fit = _other_size(source, with_convention(camera_file, poses.convention), exact_frames=True)
         if fit is not None and fit.recovery is not None:
             fits.append((poses, fit.recovery.best.worst_px, fit))

@@ -28,9 +28,9 @@ def score_incomplete(inputs: AlignmentInput) -> list[AlignmentScore]:
     scores: list[AlignmentScore] = []
     width, height = inputs.cameras.width, inputs.cameras.height
     missing = len(inputs.cameras) * width * height - len(inputs.gaussians)
-    ids = np.flatnonzero(inputs.valid.numpy())
-    points = inputs.gaussians.means.numpy()[ids].astype(np.float64)
-    rows = ProjectedRows(points, ids, inputs.viewmats, inputs.Ks, width, height)
+    ids = np.flatnonzero(inputs.valid)
+    points = inputs.gaussians.means[ids].astype(np.float64)
+    rows = ProjectedRows(points, ids, inputs.cameras.viewmats, inputs.cameras.Ks, width, height)
     for order, read in (("view-major", _pruned), ("view-fastest", _interleaved), ("unordered", _unordered)):
         possible = missing > 0 or (missing == 0 and order == "unordered")
         if possible and inputs.order in ("auto", order) and not any(score.ok for score in scores):
@@ -60,7 +60,7 @@ def _pruned_and_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Alignment
     best = _search(inputs, rows, pruned_layout, scale_by(scale))
     if best is None:
         return None
-    every = replace(rows, points=inputs.gaussians.means.numpy().astype(np.float64))
+    every = replace(rows, points=inputs.gaussians.means.astype(np.float64))
     frame = scale_by(finer_scale(every, best.layout, scale))
     for _ in range(_ROUNDS):
         score = _search(inputs, rows, pruned_layout, frame)
@@ -68,7 +68,11 @@ def _pruned_and_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Alignment
             break
         best = score
         pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(best.layout))
-        finer = (f for f in candidate_similarities(pairs, inputs.viewmats, inputs.Ks, effort=1) if f.scale != 1)
+        finer = (
+            f
+            for f in candidate_similarities(pairs, inputs.cameras.viewmats, inputs.cameras.Ks, effort=1)
+            if f.scale != 1
+        )
         frame = next(finer, frame)
     return replace(best, ok=best.ok and best.worst_px < _CERTAIN_PX)
 
@@ -79,14 +83,14 @@ def _interleaved(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore 
 
 def _unordered(inputs: AlignmentInput, rows: ProjectedRows) -> AlignmentScore | None:
     """Only in frames that need no solving: without an order no pixel is known before the frame is."""
-    base, color_of = sh0_to_rgb(inputs.gaussians.sh0.numpy()[rows.ids, 0]), None
+    base, color_of = sh0_to_rgb(inputs.gaussians.sh0[rows.ids, 0]), None
     if inputs.images is not None:
-        photos = inputs.images.numpy().reshape(len(inputs.cameras), -1, 3)
+        photos = inputs.images.reshape(len(inputs.cameras), -1, 3)
 
         def color_of(some: np.ndarray, view: int, pixels: np.ndarray) -> np.ndarray:
             return np.abs(base[some].clip(0, 1) - photos[view, pixels]).mean(1)
 
-    frames = candidate_similarities(None, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=0)
+    frames = candidate_similarities(None, inputs.cameras.viewmats, inputs.cameras.Ks, scale=inputs.scale, effort=0)
     scores = (_search(inputs, rows, partial(unordered_layout, color_of=color_of), frame) for frame in frames)
     return next((score for score in scores if score is not None), None)
 
@@ -99,5 +103,5 @@ def _search(
     inputs: AlignmentInput, rows: ProjectedRows, search: Callable[[ProjectedRows], Layout | None], frame: Similarity
 ) -> AlignmentScore | None:
     """The score of what one search makes of the rows in one frame."""
-    layout = search(replace(rows, viewmats=frame.move_viewmats(inputs.viewmats)))
+    layout = search(replace(rows, viewmats=frame.move_viewmats(inputs.cameras.viewmats)))
     return None if layout is None else score_layout(inputs, layout, frame)

@@ -7,8 +7,6 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal, get_args
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.types import Cameras, Gaussians, PixelScene
@@ -172,7 +170,12 @@ def subsample(layout: Layout, per_block: int) -> Layout:
 
 
 def to_grid(
-    gaussians: Gaussians, valid: Tensor, layout: Layout, cameras: Cameras, images: Tensor | None, names: tuple[str, ...]
+    gaussians: Gaussians,
+    valid: np.ndarray,
+    layout: Layout,
+    cameras: Cameras,
+    images: np.ndarray | None,
+    names: tuple[str, ...],
 ) -> PixelScene:
     """The scene on the full grid of the layout; pixels without a row get a fully transparent Gaussian.
 
@@ -192,16 +195,14 @@ def to_grid(
         source[i * size + pixels] = rows.reshape(-1)
     missing = source < 0
     if not missing.any():
-        index = torch.from_numpy(source)
-        return PixelScene(gaussians[index], cameras, images, valid[index].reshape(grid), names)
+        return PixelScene(gaussians[source], cameras, images, valid[source].reshape(grid), names)
     before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(len(source))))
-    index, none = torch.from_numpy(source[before]), torch.from_numpy(missing)
-    out, kept = gaussians[index], valid[index]
-    kept[none] = False
+    out, kept = gaussians[source[before]], valid[source[before]]
+    kept[missing] = False
     for values in (out.opacities, out.sh0, out.shN):
-        values[none] = 0.0
-    out.quats[none] = torch.tensor((1.0, 0, 0, 0))
-    return PixelScene(out, cameras, images, kept.reshape(grid), names, none.reshape(grid))
+        values[missing] = 0
+    out.quats[missing] = (1, 0, 0, 0)
+    return PixelScene(out, cameras, images, kept.reshape(grid), names, missing.reshape(grid))
 
 
 def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
@@ -214,13 +215,13 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     """
     if scene.images is None or scene.missing is None:
         return scene
-    V, Ks = scene.cameras.viewmats.double().numpy(), scene.cameras.Ks.double().numpy()
+    V = scene.cameras.viewmats
     views, height, width = scene.valid.shape
-    valid, g = scene.valid.numpy().reshape(views, -1), scene.gaussians
-    means = g.means.double().numpy().reshape(views, -1, 3)
+    valid, g = scene.valid.reshape(views, -1), scene.gaussians
+    means = g.means.astype(np.float64).reshape(views, -1, 3)
     y, x = np.mgrid[:height, :width].reshape(2, -1) + 0.5
     pixels = np.stack([x, y, np.ones(x.size)], 1)
-    rays = pixels @ np.linalg.inv(Ks).transpose(0, 2, 1)  # [v,p,3] in the camera, z = 1
+    rays = pixels @ np.linalg.inv(scene.cameras.Ks).transpose(0, 2, 1)  # [v,p,3] in the camera, z = 1
     z = np.einsum("vi,vpi->vp", V[:, 2, :3], means) + V[:, 2, 3, None]
     length = np.linalg.norm(rays, axis=2)
     maps = depths.reshape(views, -1).astype(np.float64)
@@ -239,15 +240,15 @@ def fill_from_depths(scene: PixelScene, depths: np.ndarray) -> PixelScene:
     view = rows // (height * width)
     local = rays.reshape(-1, 3)[rows] * new_z.reshape(-1)[rows, None]
     world = np.einsum("tji,tj->ti", V[view, :3, :3], local - V[view, :3, 3])
-    source, at = torch.from_numpy(before[rows]), torch.from_numpy(rows)
-    full = Gaussians(**{field.name: getattr(g, field.name).clone() for field in fields(g)})
-    full.means[at] = torch.from_numpy(world).to(g.means.dtype)
-    growth = torch.from_numpy(new_z.reshape(-1)[rows] / z.reshape(-1)[before[rows]]).float()
-    full.scales[at] = g.scales[source] * growth[:, None]
-    full.quats[at], full.opacities[at] = g.quats[source], g.opacities[source]
-    full.sh0[at] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[at])
-    kept = scene.valid.reshape(-1).clone()
-    kept[at] = True
+    source = before[rows]
+    full = Gaussians(**{field.name: getattr(g, field.name).copy() for field in fields(g)})
+    full.means[rows] = world
+    growth = new_z.reshape(-1)[rows] / z.reshape(-1)[source]
+    full.scales[rows] = g.scales[source] * growth.astype(np.float32)[:, None]
+    full.quats[rows], full.opacities[rows] = g.quats[source], g.opacities[source]
+    full.sh0[rows] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[rows])
+    kept = scene.valid.reshape(-1).copy()
+    kept[rows] = True
     return replace(scene, gaussians=full, valid=kept.reshape(scene.valid.shape))
 
 

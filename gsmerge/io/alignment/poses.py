@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput
-from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, Convention, from_viewmats, to_viewmats, with_poses
+from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, Convention, from_viewmats, to_viewmats
 from gsmerge.types import Cameras, Gaussians
 
 Fit = TypeVar("Fit")
@@ -78,24 +77,23 @@ class CameraCheck:
         return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as any others"
 
 
-def check_cameras(gaussians: Gaussians, valid: Tensor, cameras: Cameras, images: Tensor | None) -> CameraCheck:
+def check_cameras(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> CameraCheck:
     """Project some valid Gaussians into all views, and compare them with ``images [c,h,w,3]`` where there are any."""
-    rows = np.flatnonzero(valid.numpy())
+    rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // _SAMPLES)]
-    points = gaussians.means.numpy()[rows].astype(np.float64)
-    colors = sh0_to_rgb(gaussians.sh0.numpy()[rows, 0]).clip(0, 1)
+    points = gaussians.means[rows].astype(np.float64)
+    colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
     visible, errors, others = np.zeros(len(rows), bool), [], []
     rng = np.random.default_rng(0)
-    viewmats, Ks = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
     for view in range(len(cameras)):
         with np.errstate(all="ignore"):
-            xy, depth = project_points(points, viewmats[view], Ks[view])
+            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
             xy = np.floor(xy)
         inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
         visible |= inside
         if images is not None and inside.any():
             x, y = xy[inside].astype(np.int64).T
-            photo = images[view].numpy()[y, x]
+            photo = images[view, y, x]
             errors.append(np.abs(colors[inside] - photo).mean(1))
             others.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
     share, ratio = float(visible.mean()), np.nan
@@ -111,8 +109,8 @@ def find_aligned_poses(inputs: AlignmentInput, camera_file: CameraFile) -> tuple
     if inputs.order == "none":
         return None
     fits = []
-    for poses in other_conventions(inputs.viewmats, camera_file.convention):
-        cameras = with_poses(inputs.cameras, poses.viewmats)
+    for poses in other_conventions(inputs.cameras.viewmats, camera_file.convention):
+        cameras = replace(inputs.cameras, viewmats=poses.viewmats)
         if check_cameras(inputs.gaussians, inputs.valid, cameras, None).ok:
             recovery = recover(replace(inputs, cameras=cameras))
             fits += [] if recovery is None else [(poses, recovery.best.worst_px, recovery)]
@@ -132,7 +130,7 @@ def choose_fit(camera_file: CameraFile, fits: Sequence[tuple[Poses, float, Fit]]
 
 
 def choose_poses(
-    gaussians: Gaussians, valid: Tensor, cameras: Cameras, images: Tensor | None, convention: Convention
+    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None, convention: Convention
 ) -> tuple[Poses | None, CameraCheck, str | None]:
     """Which reading of the poses sees unaligned Gaussians, judged by how many it sees and by their colours.
 
@@ -144,8 +142,8 @@ def choose_poses(
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     others = [
-        (poses, check_cameras(gaussians, valid, with_poses(cameras, poses.viewmats), images))
-        for poses in other_conventions(cameras.viewmats.double().numpy(), convention)
+        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images))
+        for poses in other_conventions(cameras.viewmats, convention)
     ]
     ranked = sorted(others, key=lambda one: -one[1].score)
     if not ranked or not ranked[0][1].ok:

@@ -90,6 +90,11 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if close:
         return _by_colors(inputs, [first, *close])
     runner_up = min(others, key=lambda e: e.worst_px, default=None)
+    return _accepted(inputs, best, runner_up)
+
+
+def _accepted(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentScore | None) -> Recovery | None:
+    """A reading that the pixels alone decide for; None where shuffled pixels are about as near."""
     shuffled_px, shuffled_color = shuffled_score(inputs, best)
     if not _stands_out(best, shuffled_px):
         return None
@@ -122,10 +127,7 @@ def _plain(inputs: AlignmentInput) -> Recovery | None:
     distance = max(best.worst_px, _SMALLEST_PX)
     if best.worst_px > _PLAIN_PX or any(other.worst_px < SHUFFLED_MARGIN * distance for other in others):
         return None
-    shuffled_px, shuffled_color = shuffled_score(inputs, best)
-    if not _stands_out(best, shuffled_px):
-        return None
-    return Recovery(best, None, shuffled_px / distance, None, _confirmed(inputs, best, shuffled_color))
+    return _accepted(inputs, best, None)
 
 
 def _by_colors(inputs: AlignmentInput, close: list[AlignmentScore]) -> Recovery | None:
@@ -176,12 +178,14 @@ def _readings(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Align
 
 def _best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> AlignmentScore:
     pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout, samples))
-    frames = candidate_similarities(pairs, inputs.viewmats, inputs.Ks, scale=inputs.scale, effort=effort)
+    frames = candidate_similarities(
+        pairs, inputs.cameras.viewmats, inputs.cameras.Ks, scale=inputs.scale, effort=effort
+    )
     scores = [score_layout(inputs, layout, frame, pairs) for frame in frames]
     lowest = min(score.worst_px for score in scores)
     best = next(score for score in scores if score.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
     if best.ok and best.frame is not IDENTITY and inputs.scale is None:
-        return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.viewmats, inputs.Ks))
+        return replace(best, ok=fits_all_cameras(best.frame, pairs, inputs.cameras.viewmats, inputs.cameras.Ks))
     return best
 
 
@@ -201,7 +205,10 @@ def _nearest_views(inputs: AlignmentInput, layout: Layout) -> list[int] | None:
         if not len(own.rows):
             return None
         views = (np.full(len(own.rows), view) for view in range(len(inputs.cameras)))
-        errors = [np.median(pixel_errors(replace(own, views=some), inputs.viewmats, inputs.Ks)) for some in views]
+        errors = [
+            np.median(pixel_errors(replace(own, views=some), inputs.cameras.viewmats, inputs.cameras.Ks))
+            for some in views
+        ]
         chosen.append(int(np.argmin(errors)))
     return chosen if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 

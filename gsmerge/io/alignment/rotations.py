@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
-from gsmerge.geometry import quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry import normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io.hints import QuatChoice
 from gsmerge.types import PixelScene
 
@@ -42,25 +41,25 @@ def read_rotations(scene: PixelScene, quats: QuatChoice) -> PixelScene:
         normals, thinnest = _smooth_normals(scene), scene.gaussians.scales.argmin(1)
         roots = square_roots(from_xyzw(stored))
         first, second = (_cosines(root, thinnest, normals) for root in roots)
-        read = torch.where((second > first)[:, None], roots[1], roots[0])
+        read = np.where((second > first)[:, None], roots[1], roots[0])
     else:
-        read = _multiply(_camera_quats(scene).repeat_interleave(scene.pixels_per_view, 0), stored)
+        read = _multiply(_camera_quats(scene).repeat(scene.pixels_per_view, 0), stored)
     return replace(scene, gaussians=replace(scene.gaussians, quats=read))
 
 
-def from_xyzw(quats: Tensor) -> Tensor:
+def from_xyzw(quats: np.ndarray) -> np.ndarray:
     """``[n,4]`` xyzw -> wxyz."""
     return quats[:, [3, 0, 1, 2]]
 
 
-def square_roots(quats: Tensor) -> tuple[Tensor, Tensor]:
+def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The two rotations that give those of ``quats [n,4]`` wxyz when applied twice: half the angle; half a turn more.
 
     Where there is no angle, the second is half a turn about an arbitrary axis.
     """
-    unit = torch.nn.functional.normalize(quats, dim=1)
-    unit = torch.where(unit[:, :1] < 0, -unit, unit)
-    half = torch.nn.functional.normalize(unit + unit.new_tensor([1.0, 0, 0, 0]), dim=1)
+    unit = normalize(quats)
+    unit = np.where(unit[:, :1] < 0, -unit, unit)
+    half = normalize(unit + np.array((1, 0, 0, 0), unit.dtype))
     return half, _half_a_turn_more(half)
 
 
@@ -71,7 +70,7 @@ def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
     """
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
-    ordered = scales.sort(1).values
+    ordered = np.sort(scales, 1)
     flat = ordered[:, 0] < _FLAT * ordered[:, 1]
     normals, rows, views = normals[flat], rows[flat], views[flat]
     if len(rows) < _MIN_TESTED:
@@ -92,18 +91,20 @@ def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
     )
 
 
-def _camera_quats(scene: PixelScene) -> Tensor:
+def _camera_quats(scene: PixelScene) -> np.ndarray:
     """``[v,4]`` rotations from each camera to the world, wxyz."""
-    return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].double().transpose(1, 2)).float()
+    return rotmat_to_quat(scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)).astype(np.float32)
 
 
-def _cosines(quats: Tensor, thinnest: Tensor, normals: Tensor) -> Tensor:
+def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """``[n]`` between the thinnest axes of Gaussians with rotations ``[n,4]`` and the normals, 0 to 1."""
-    axes = quat_to_rotmat(quats).gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
-    return (axes * normals).sum(1).abs()
+    axes = np.take_along_axis(quat_to_rotmat(quats), thinnest[:, None, None], 2)[:, :, 0]
+    return np.abs((axes * normals).sum(1))
 
 
-def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Tensor, normals: Tensor) -> bool:
+def _is_root(
+    scene: PixelScene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
+) -> bool:
     """Whether the roots of the rotations read as xyzw follow the surface by far better than all other readings.
 
     The better of two is better by chance as well: every other reading gets a second rotation as the roots have it, half
@@ -119,38 +120,40 @@ def _is_root(scene: PixelScene, rows: Tensor, single: list[Tensor], thinnest: Te
     return 1 - _better_of(roots, thinnest, smooth, _FOLLOWS) <= _MAX_LEFT * (1 - best_other)
 
 
-def _better_of(pair: tuple[Tensor, Tensor], thinnest: Tensor, normals: Tensor, threshold: float) -> float:
+def _better_of(
+    pair: tuple[np.ndarray, np.ndarray], thinnest: np.ndarray, normals: np.ndarray, threshold: float
+) -> float:
     """Mean cosine if each Gaussian has the better one of two rotations ``[n,4]``; the share above a threshold > 0."""
-    better = torch.maximum(*(_cosines(quats, thinnest, normals) for quats in pair))
-    return float((better > threshold).float().mean() if threshold else better.mean())
+    better = np.maximum(*(_cosines(quats, thinnest, normals) for quats in pair))
+    return float((better > threshold).mean() if threshold else better.mean())
 
 
-def _half_a_turn_more(quats: Tensor) -> Tensor:
+def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
     """Rotations ``[n,4]`` with half a turn more about their own axes."""
-    length = quats[:, 1:].norm(dim=1, keepdim=True)
-    axis = torch.where(length > 0, quats[:, 1:] / length, quats.new_tensor([0.0, 0, 1]))
-    return torch.cat([-length, quats[:, :1] * axis], 1)
+    length = np.linalg.norm(quats[:, 1:], axis=1, keepdims=True)
+    axis = np.where(length > 0, normalize(quats[:, 1:]), np.array((0, 0, 1), quats.dtype))
+    return np.concatenate([-length, quats[:, :1] * axis], 1)
 
 
-def _smooth_normals(scene: PixelScene) -> Tensor:
+def _smooth_normals(scene: PixelScene) -> np.ndarray:
     """``[n,3]`` normals of the surface at all pixels, of means averaged over some pixels around."""
     v, h, w = scene.valid.shape
-    weights = scene.valid.reshape(v, 1, h, w).float()
-    means = torch.where(weights > 0, scene.gaussians.means.reshape(v, h, w, 3).permute(0, 3, 1, 2).float(), 0.0)
-    middle = means.sum((0, 2, 3), keepdim=True) / weights.sum().clamp(min=1)
-    both = torch.cat([(means - middle) * weights, weights], 1)
-    around = torch.nn.functional.avg_pool2d(both, _AROUND, 1, _AROUND // 2)
-    grid = (around[:, :3] / around[:, 3:].clamp(min=1e-6)).permute(0, 2, 3, 1)
-    x, y = torch.arange(w), torch.arange(h)
-    across = grid[:, :, (x + _STEP).clamp(max=w - 1)] - grid[:, :, (x - _STEP).clamp(min=0)]
-    down = grid[:, (y + _STEP).clamp(max=h - 1)] - grid[:, (y - _STEP).clamp(min=0)]
-    return torch.nn.functional.normalize(torch.linalg.cross(across, down).reshape(-1, 3), dim=1)
+    weights = scene.valid[..., None].astype(np.float32)
+    means = scene.gaussians.means.reshape(v, h, w, 3)
+    middle = means.mean((0, 1, 2), np.float64, where=weights > 0).astype(means.dtype)
+    both = np.concatenate([np.where(weights > 0, means - middle, 0).astype(np.float32), weights], 3)
+    around = np.stack([cv2.blur(view, (_AROUND, _AROUND), borderType=cv2.BORDER_CONSTANT) for view in both])
+    grid = around[..., :3] / np.maximum(around[..., 3:], np.float32(1e-6))
+    x, y = np.arange(w), np.arange(h)
+    across = grid[:, :, np.minimum(x + _STEP, w - 1)] - grid[:, :, np.maximum(x - _STEP, 0)]
+    down = grid[:, np.minimum(y + _STEP, h - 1)] - grid[:, np.maximum(y - _STEP, 0)]
+    return normalize(np.cross(across, down).reshape(-1, 3))
 
 
-def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
+def _normals(scene: PixelScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals ``[t,3]`` of some pixels' surface, their rows and their views."""
     v, h, w = scene.valid.shape
-    inner = torch.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].flatten(1)
+    inner = np.arange(v * h * w).reshape(v, h, w)[:, _STEP:-_STEP, _STEP:-_STEP].reshape(v, -1)
     step = max(1, inner.shape[1] // _SAMPLES)
     while step > 1 and np.gcd(step, w - 2 * _STEP) > 1:
         step += 1
@@ -160,18 +163,16 @@ def _normals(scene: PixelScene) -> tuple[Tensor, Tensor, Tensor]:
     for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):
         good = good & valid[rows + offset]
     rows = rows[good]
-    across = (means[rows + _STEP] - means[rows - _STEP]).float()
-    down = (means[rows + _STEP * w] - means[rows - _STEP * w]).float()
-    normals = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=1)
-    return normals, rows, rows.div(h * w, rounding_mode="floor")
+    across = (means[rows + _STEP] - means[rows - _STEP]).astype(np.float32)
+    down = (means[rows + _STEP * w] - means[rows - _STEP * w]).astype(np.float32)
+    return normalize(np.cross(across, down)), rows, rows // (h * w)
 
 
-def _multiply(a: Tensor, b: Tensor) -> Tensor:
+def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products of quaternions wxyz: first ``b``, then ``a``."""
-    aw, ax, ay, az = a.unbind(1)
-    bw, bx, by, bz = b.unbind(1)
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
     product = [
         aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
     ]  # fmt: skip
-    return torch.stack(product, 1)
+    return np.stack(product, 1)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from torch import Tensor
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.alignment.layouts import Layout, plain_layout, subsample
@@ -24,24 +23,14 @@ class AlignmentInput:
     """What the pixels are recovered from."""
 
     gaussians: Gaussians  # the file's n rows
-    valid: Tensor  # ``[n]`` bool
+    valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
-    images: Tensor | None  # ``[c,h,w,3]``, or None
+    images: np.ndarray | None  # ``[c,h,w,3]``, or None
     labellings: Sequence[Sequence[int]]  # orders that the views may be in: the file's, that of the names
     # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
     order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
     scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
-
-    @property
-    def viewmats(self) -> np.ndarray:
-        """``[c,4,4]`` float64."""
-        return np.asarray(self.cameras.viewmats.double().numpy())
-
-    @property
-    def Ks(self) -> np.ndarray:  # noqa: N802 - the field's name
-        """``[c,3,3]`` float64."""
-        return np.asarray(self.cameras.Ks.double().numpy())
 
 
 @dataclass(frozen=True)
@@ -70,14 +59,14 @@ def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
     return subsample(layout, max(MIN_SAMPLES, samples // len(layout.views)))
 
 
-def find_correspondences(means: Tensor, valid: Tensor, layout: Layout) -> Correspondences:
+def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -> Correspondences:
     """The valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
     rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
     blocks = np.repeat(np.arange(len(layout.views)), [len(some) for some in layout.rows])
-    good = valid.numpy()[rows]
+    good = valid[rows]
     rows, pixels, blocks = rows[good], pixels[good], blocks[good]
     y, x = np.divmod(pixels, layout.width)
-    points = means.numpy()[rows].astype(np.float64)
+    points = means[rows].astype(np.float64)
     return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[blocks], blocks, rows)
 
 
@@ -87,7 +76,7 @@ def score_layout(
     """The score of a layout in a frame, on a sample of its rows: ``pairs``, where they are at hand."""
     if pairs is None:
         pairs = find_correspondences(inputs.gaussians.means, inputs.valid, sample_layout(layout))
-    errors = pixel_errors(pairs, frame.move_viewmats(inputs.viewmats), inputs.Ks)
+    errors = pixel_errors(pairs, frame.move_viewmats(inputs.cameras.viewmats), inputs.cameras.Ks)
     medians = [float(np.median(part)) for part in split_blocks(errors, pairs, len(layout.views)) if len(part)]
     median, worst = float(np.median(errors)) if len(errors) else math.inf, max(medians, default=math.inf)
     ok = bool(medians) and worst < pixel_limit(layout.width, layout.height) and bool(np.isfinite(errors).mean() > 0.5)
@@ -99,7 +88,7 @@ def shuffled_score(inputs: AlignmentInput, best: AlignmentScore) -> tuple[float,
     rng, some = np.random.default_rng(0), sample_layout(best.layout)
     shuffled = replace(some, pixels=tuple(rng.permutation(pixels) for pixels in some.pixels))
     pairs = find_correspondences(inputs.gaussians.means, inputs.valid, shuffled)
-    errors = pixel_errors(pairs, best.frame.move_viewmats(inputs.viewmats), inputs.Ks)
+    errors = pixel_errors(pairs, best.frame.move_viewmats(inputs.cameras.viewmats), inputs.cameras.Ks)
     return float(np.median(errors)), _color_distance(inputs, pairs)
 
 
@@ -111,9 +100,9 @@ def color_error(inputs: AlignmentInput, layout: Layout) -> float:
 def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
     if inputs.images is None or not len(pairs.rows):
         return math.nan
-    base = sh0_to_rgb(inputs.gaussians.sh0.numpy()[pairs.rows, 0])
+    base = sh0_to_rgb(inputs.gaussians.sh0[pairs.rows, 0])
     x, y = pairs.pixels.astype(np.int64).T
-    return float(np.abs(base.clip(0, 1) - inputs.images.numpy()[pairs.views, y, x]).mean(1).mean())
+    return float(np.abs(base.clip(0, 1) - inputs.images[pairs.views, y, x]).mean(1).mean())
 
 
 @dataclass(frozen=True)
@@ -134,7 +123,7 @@ class Alignment:
         return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
 
 
-def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Alignment:
+def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
     """Project a sample of every view's own Gaussians into that view.
 
     ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid [V·H·W]``
@@ -143,7 +132,7 @@ def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Al
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)
 
 
-def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Correspondences:
+def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Correspondences:
     """The sample of :func:`check_alignment`."""
     views, width, height = len(cameras), cameras.width, cameras.height
     if len(gaussians) != views * height * width:
@@ -155,7 +144,7 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: Tensor) -> Corr
 def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
     """:func:`check_alignment` of a sample under cameras that may be others."""
     limit = pixel_limit(cameras.width, cameras.height)
-    errors = pixel_errors(pairs, cameras.viewmats.double().numpy(), cameras.Ks.double().numpy())
+    errors = pixel_errors(pairs, cameras.viewmats, cameras.Ks)
     medians = tuple(
         float(np.quantile(part, 0.5, method="lower")) if len(part) else math.nan
         for part in split_blocks(errors, pairs, len(cameras))

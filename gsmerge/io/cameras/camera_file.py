@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
@@ -50,10 +48,10 @@ class CameraFile:
     """c cameras in the order of their file."""
 
     path: str  # the file or folder
-    viewmats: Tensor  # ``[c,4,4]`` world to camera, OpenCV axes, float64
-    Ks: Tensor  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
-    widths: Tensor  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
-    heights: Tensor  # the same
+    viewmats: np.ndarray  # ``[c,4,4]`` world to camera, OpenCV axes, float64
+    Ks: np.ndarray  # ``[c,3,3]`` intrinsics in pixels, float64; the top-left pixel's centre is (0.5, 0.5)
+    widths: np.ndarray  # ``[c]`` int64, pixels; 0 where unknown, 1 where unknown and the intrinsics are divided by it
+    heights: np.ndarray  # the same
     names: tuple[str, ...]  # image names as the file gives them
     source: str  # the format's name
     convention: Convention = W2C_OPENCV  # how the format stores poses
@@ -109,10 +107,10 @@ def make_camera_file(
     lenses = tuple(view.lens for view in views)
     return CameraFile(
         path=str(path),
-        viewmats=torch.from_numpy(to_viewmats(poses, convention)),
-        Ks=torch.from_numpy(Ks),
-        widths=torch.tensor([w for w, _ in sizes], dtype=torch.int64),
-        heights=torch.tensor([h for _, h in sizes], dtype=torch.int64),
+        viewmats=to_viewmats(poses, convention),
+        Ks=Ks,
+        widths=np.array([w for w, _ in sizes], np.int64),
+        heights=np.array([h for _, h in sizes], np.int64),
         names=tuple(view.name for view in views),
         source=source,
         convention=convention,
@@ -166,23 +164,18 @@ def from_viewmats(viewmats: np.ndarray, convention: Convention) -> np.ndarray:
 
 def with_convention(camera_file: CameraFile, convention: Convention) -> CameraFile:
     """The same file, its poses read in another convention."""
-    stored = from_viewmats(camera_file.viewmats.numpy(), camera_file.convention)
-    return replace(camera_file, viewmats=torch.from_numpy(to_viewmats(stored, convention)), convention=convention)
-
-
-def with_poses(cameras: Cameras, viewmats: np.ndarray) -> Cameras:
-    """The same cameras at other poses ``[c,4,4]``."""
-    return replace(cameras, viewmats=torch.from_numpy(viewmats))
+    stored = from_viewmats(camera_file.viewmats, camera_file.convention)
+    return replace(camera_file, viewmats=to_viewmats(stored, convention), convention=convention)
 
 
 def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     """The views of these ids, in that order."""
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
-    tensors = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
+    arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
     images = None if cameras.images is None else cameras.images[ids]
     names = tuple(cameras.names[i] for i in ids)
-    return replace(cameras, **tensors, names=names, images=images, lenses=lenses if any(lenses) else ())
+    return replace(cameras, **arrays, names=names, images=images, lenses=lenses if any(lenses) else ())
 
 
 def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
@@ -216,9 +209,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
         if 0 in size or size == (1, 1):
             raise SceneError(path, "expected the image size (w, h) of the cameras, found none")
     check_pixels(path, *size)
-    sides = torch.stack([camera_file.widths, camera_file.heights], 1)
-    known = (sides > 0).all(1, keepdim=True)
-    scale = torch.where(known, torch.tensor(size) / sides.clamp_min(1), 1.0)
-    Ks = camera_file.Ks.clone()
-    Ks[:, :2] *= scale[:, :, None]
+    sides = np.stack([camera_file.widths, camera_file.heights], 1)
+    known = (sides > 0).all(1, keepdims=True)
+    Ks = camera_file.Ks.copy()
+    Ks[:, :2] *= np.where(known, size / np.maximum(sides, 1), 1.0)[:, :, None]
     return Cameras(camera_file.viewmats, Ks, *size)

@@ -30,7 +30,7 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
         if not same_shape((w, h), size):
             problem = f"expected images of the cameras' {w} x {h} to undistort ({name}), found {size[0]} x {size[1]}"
             raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
-    straight = undistort_photos(photos, to_cameras(pinholes, size).Ks.numpy(), camera_file.lenses)
+    straight = undistort_photos(photos, to_cameras(pinholes, size).Ks, camera_file.lenses)
     return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
 
 

@@ -6,15 +6,17 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_file
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
 from gsmerge.io.photos import decode_embedded, photo_size
+
+if TYPE_CHECKING:
+    import torch  # imported only where there is a chunk
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
@@ -42,6 +44,8 @@ def read_re10k(path: Path, scene: str | None = None) -> CameraFile:
 
 
 def _load(path: Path) -> list[Mapping[str, Any]]:
+    import torch
+
     check_file(path)
     problem = "expected a chunk written by torch.save, found"
     if not zipfile.is_zipfile(path):
@@ -78,6 +82,8 @@ def _chosen(path: Path, entries: list[Mapping[str, Any]], scene: str | None) -> 
 
 
 def _rows(path: Path, cameras: Any) -> np.ndarray:
+    import torch
+
     if not isinstance(cameras, torch.Tensor) or cameras.ndim != 2 or cameras.shape[1] != _COLUMNS:
         shape = list(cameras.shape) if isinstance(cameras, torch.Tensor) else type(cameras).__name__
         raise SceneError(path, f"expected cameras [v,{_COLUMNS}], found {shape}")
@@ -90,11 +96,15 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
 
 def _has_values(tensor: torch.Tensor) -> bool:
     """Whether its numbers are there, one after the other: a chunk may hold tensors of other kinds."""
+    import torch
+
     return tensor.layout == torch.strided and tensor.device.type == "cpu"
 
 
 def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
     """``[v,h,w,3]`` uint8; None where the chunk has none."""
+    import torch
+
     listed = isinstance(images, list | tuple)
     if images is None or (listed and not images):
         return None

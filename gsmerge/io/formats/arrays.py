@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from torch import Tensor
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.formats.ply_file import MAX_LOG_SCALE
-from gsmerge.types import Gaussians
+from gsmerge.types import Array, Gaussians, as_array
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,8 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
             raise ValueError(f"expected finite Gaussians, got NaN or inf in row {first_row + int(bad[0, 0])}")
         return values
 
-    def array(tensor: Tensor) -> np.ndarray:
-        return check(tensor.detach().cpu().double().numpy())
+    def array(values: Array) -> np.ndarray:
+        return check(as_array(values).astype(np.float64))
 
     degree = min(max_degree, gaussians.sh_degree)
     quats = array(gaussians.quats)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
@@ -78,7 +77,7 @@ class PlyScene:
     """
 
     gaussians: Gaussians
-    valid: torch.Tensor
+    valid: np.ndarray
     info: PlyInfo
 
 
@@ -154,8 +153,7 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
     )
-    tensors = {k: torch.from_numpy(v) for k, v in out.items()}
-    return PlyScene(valid=tensors.pop("valid"), gaussians=Gaussians(**tensors), info=info)
+    return PlyScene(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
 
 def _vertex(path: Path, data: PlyData) -> PlyElement:

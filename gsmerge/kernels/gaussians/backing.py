@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.gaussians.pool import MAX_OPACITY, _member_caps, _rotation, kth_smallest
+from gsmerge.kernels.gaussians.pool import MAX_OPACITY, _member_caps, _rotation
+from gsmerge.kernels.gaussians.select import partition
 from gsmerge.kernels.jit import kernel
 
 
@@ -17,14 +18,15 @@ def draw_in(starts, ids, inverse_depths, pixel, out):
     longest = 0
     for g in range(starts.shape[0] - 1):
         longest = max(longest, starts[g + 1] - starts[g])
-    scratch = np.empty(longest)
+    order = np.empty(longest, np.int64)
     for g in range(starts.shape[0] - 1):
         n = starts[g + 1] - starts[g]
         if n == 0:
             continue
         for j in range(n):
-            scratch[j] = inverse_depths[ids[starts[g] + j]]
-        middle = kth_smallest(scratch[:n], n // 2)
+            order[j] = ids[starts[g] + j]
+        partition(inverse_depths, order, 0, n, n // 2)
+        middle = inverse_depths[order[n // 2]]
         reach = min(pixel * np.sqrt(n), 0.9)
         for j in range(n):
             i = ids[starts[g] + j]
@@ -38,13 +40,13 @@ def image_extinctions(starts, ids, means, quats, scales, opacities, footprints, 
     longest = 0
     for g in range(starts.shape[0] - 1):
         longest = max(longest, starts[g + 1] - starts[g])
-    caps, scratch = np.ones(longest), np.empty(longest)
+    caps, order = np.ones(longest), np.empty(longest, np.int64)
     r = viewmat[:3, :3]
     for g in range(starts.shape[0] - 1):
         members = ids[starts[g] : starts[g + 1]]
         if members.shape[0] == 0:
             continue
-        _member_caps(members, scales, footprints, caps, scratch)
+        _member_caps(members, scales, footprints, caps, order)
         total = 0.0
         for j in range(members.shape[0]):
             i = members[j]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.kernels.gaussians.select import partition
 from gsmerge.kernels.jit import kernel
 
 LEAF = 16  # points up to which a run is not divided
@@ -29,30 +30,6 @@ def _widest_axis(points, order, low, high):
 
 
 @kernel
-def _divide(points, order, low, high, middle, axis):
-    """Reorder a run so that what is before its middle is not above it along an axis, and what follows not below."""
-    last = high - 1
-    while low < last:
-        pivot = points[order[(low + last) // 2], axis]
-        i, j = low, last
-        while i <= j:
-            while points[order[i], axis] < pivot:
-                i += 1
-            while points[order[j], axis] > pivot:
-                j -= 1
-            if i <= j:
-                order[i], order[j] = order[j], order[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            last = j
-        elif middle >= i:
-            low = i
-        else:
-            break
-
-
-@kernel
 def build_tree(points, order, axes, splits):
     """Build the tree of finite points ``[n,3]``.
 
@@ -70,7 +47,7 @@ def build_tree(points, order, axes, splits):
         if high - low <= LEAF:
             continue
         axis, middle = _widest_axis(points, order, low, high), (low + high) // 2
-        _divide(points, order, low, high, middle, axis)
+        partition(points[:, axis], order, low, high, middle)
         axes[node], splits[node] = axis, points[order[middle], axis]
         for side in range(2):
             nodes[top] = 2 * node + 1 + side

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.kernels.gaussians.select import partition
 from gsmerge.kernels.jit import kernel
 
 MAX_OPACITY = 0.995  # optical depth of a member is -ln(1 - opacity); 1 would be infinite
@@ -40,41 +41,20 @@ def _two_largest_product(a, b, c):
     return max(a * b, a * c, b * c)
 
 
-@kernel(part=True)
-def kth_smallest(values, k):
-    """The number that sorting would put at place k; reorders the values. (Numba's own sort compiles for a second.)"""
-    low, high = 0, values.shape[0] - 1
-    while low < high:
-        pivot = values[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if k <= j:
-            high = j
-        elif k >= i:
-            low = i
-        else:
-            break
-    return values[k]
-
-
 @kernel
-def _member_caps(ids, scales, footprints, caps, scratch):
-    """Shrink factor of each member: at most CAP times the median extent of the group, extents in footprints."""
+def _member_caps(ids, scales, footprints, caps, order):
+    """Shrink factor of each member: at most CAP times the median extent of the group, extents in footprints.
+
+    ``caps`` and ``order``, float64 and int64 of at least the group's length, are written.
+    """
     n = ids.shape[0]
     for j in range(n):
         i = ids[j]
-        extent = _largest(scales[i, 0], scales[i, 1], scales[i, 2]) / footprints[i]
-        scratch[j] = extent
-        caps[j] = extent
-    limit = CAP * kth_smallest(scratch[:n], (n - 1) // 2)  # of two, the smaller one
+        caps[j] = _largest(scales[i, 0], scales[i, 1], scales[i, 2]) / footprints[i]
+        order[j] = j
+    middle = (n - 1) // 2  # of two, the smaller one
+    partition(caps, order, 0, n, middle)
+    limit = CAP * caps[order[middle]]
     for j in range(n):
         caps[j] = limit / caps[j] if caps[j] > limit else 1.0
 
@@ -103,13 +83,13 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
     longest = 0
     for g in range(starts.shape[0] - 1):
         longest = max(longest, starts[g + 1] - starts[g])
-    caps, scratch = np.ones(longest), np.empty(longest)
+    caps, order = np.ones(longest), np.empty(longest, np.int64)
     for g in range(starts.shape[0] - 1):
         members = ids[starts[g] : starts[g + 1]]
         if members.shape[0] == 0:
             continue
         if own_covariance:
-            _member_caps(members, scales, footprints, caps, scratch)
+            _member_caps(members, scales, footprints, caps, order)
         _pool_group(
             members,
             caps,

@@ -12,13 +12,25 @@ from numpy import float32 as f4
 from gsmerge.kernels.jit import kernel
 from gsmerge.kernels.raster.prefetch import prefetch_row
 from gsmerge.kernels.raster.project import LN_CUT, TILE
-from gsmerge.kernels.raster.walk import BATCH, PLANE, PLANES, blend_rows, weigh_rows
+from gsmerge.kernels.raster.walk import (
+    BATCH,
+    COLOR,
+    DECAY,
+    FIRST,
+    LAST,
+    LNOP,
+    MY,
+    PLANE,
+    PLANES,
+    RATE,
+    SLOPE,
+    blend_rows,
+    weigh_rows,
+)
 
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
 
 P1, P2, P3, P4, P5 = (np.uint64(PLANE * plane) for plane in range(1, 6))
-MY, RATE, SLOPE, DECAY, LNOP, FIRST, LAST = (np.uint64(BATCH * plane) for plane in range(1, 8))  # of a batch; mean x: 0
-COLOR = np.uint64(BATCH * 8)
 SPARE = f4(0.02)  # rows beside those in which a Gaussian shows, for rounding
 
 

@@ -20,8 +20,8 @@ C1, C2 = f4(1e-4), f4(9e-4)  # SSIM's constants for a data range of 1
 SHARE = f4(1 / (SIDE * SIDE))
 
 
-@kernel
-def _sum_rows(padded, rings, slot):
+@kernel(part=True)
+def sum_rows(padded, rings, slot):
     """Sums over the seven values about each one of padded rows, of every channel apart."""
     for q in range(padded.shape[0]):
         row, out = padded[q], rings[q, slot]
@@ -29,8 +29,8 @@ def _sum_rows(padded, rings, slot):
             out[i] = row[i] + row[i + 3] + row[i + 6] + row[i + 9] + row[i + 12] + row[i + 15] + row[i + 18]
 
 
-@kernel
-def _sum_columns(rings, slot, sums):
+@kernel(part=True)
+def sum_columns(rings, slot, sums):
     """Sums over the seven rows of rings, the newest of which is in ``slot``."""
     for q in range(rings.shape[0]):
         ring, out = rings[q], sums[q]
@@ -40,8 +40,8 @@ def _sum_columns(rings, slot, sums):
             out[i] = a[i] + b[i] + c[i] + d[i] + e[i] + f[i] + g[i]
 
 
-@kernel
-def _write_products(x, y, padded):
+@kernel(part=True)
+def write_products(x, y, padded):
     p0, p1, p2, p3, p4 = padded[0], padded[1], padded[2], padded[3], padded[4]
     for i in range(x.shape[0]):
         a, b = x[i], y[i]
@@ -49,8 +49,8 @@ def _write_products(x, y, padded):
         p2[PAD + i], p3[PAD + i], p4[PAD + i] = a * a, b * b, a * b
 
 
-@kernel
-def _write_terms(sums, weight, padded):
+@kernel(part=True)
+def write_terms(sums, weight, padded):
     """Derivatives of a row of windows' SSIM by the means of x, x² and xy, times the weights of their pixels."""
     s0, s1, s2, s3, s4 = sums[0], sums[1], sums[2], sums[3], sums[4]
     p0, p1, p2 = padded[0], padded[1], padded[2]
@@ -65,8 +65,8 @@ def _write_terms(sums, weight, padded):
         p1[PAD + i], p2[PAD + i] = w * square, w * cross
 
 
-@kernel
-def _write_gradient(sums, x, y, weight, plain, similar, gradient):
+@kernel(part=True)
+def write_gradient(sums, x, y, weight, plain, similar, gradient):
     """The gradient of a row, and its weighted squared error."""
     s0, s1, s2, squares = sums[0], sums[1], sums[2], f4(0.0)
     for i in range(x.shape[0]):
@@ -77,8 +77,8 @@ def _write_gradient(sums, x, y, weight, plain, similar, gradient):
     return squares
 
 
-@kernel
-def _repeat(weight, wide):
+@kernel(part=True)
+def repeat(weight, wide):
     for i in range(weight.shape[0]):
         wide[3 * i] = wide[3 * i + 1] = wide[3 * i + 2] = weight[i]
 
@@ -110,20 +110,20 @@ def image_gradient(image, photo, weight, ssim_lambda, first, last, gradient, err
     for new in range(first - 2 * RADIUS, last + 2 * RADIUS):
         slot = new % SIDE
         if 0 <= new < height:
-            _write_products(image[new], photo[new], padded)
-            _sum_rows(padded, rings, slot)
+            write_products(image[new], photo[new], padded)
+            sum_rows(padded, rings, slot)
         else:
             rings[:, slot] = f4(0.0)
         window = new - RADIUS  # the row whose windows are complete
         if 0 <= window < height and window >= first - RADIUS:
-            _sum_columns(rings, slot, sums)
-            _repeat(weight[window], wide)
-            _write_terms(sums, wide, term_padded)
-            _sum_rows(term_padded, term_rings, window % SIDE)
+            sum_columns(rings, slot, sums)
+            repeat(weight[window], wide)
+            write_terms(sums, wide, term_padded)
+            sum_rows(term_padded, term_rings, window % SIDE)
         else:
             term_rings[:, window % SIDE] = f4(0.0)
         row = window - RADIUS  # the row all of whose windows are complete
         if first <= row < last:
-            _sum_columns(term_rings, window % SIDE, term_sums)
-            _repeat(weight[row], wide)
-            errors[row] = _write_gradient(term_sums, image[row], photo[row], wide, plain, similar, gradient[row])
+            sum_columns(term_rings, window % SIDE, term_sums)
+            repeat(weight[row], wide)
+            errors[row] = write_gradient(term_sums, image[row], photo[row], wide, plain, similar, gradient[row])

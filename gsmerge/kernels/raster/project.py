@@ -40,8 +40,8 @@ def _between(value, low, high):
     return value if value > low else low
 
 
-@kernel
-def _cull_block(block, camera):
+@kernel(part=True)
+def cull_block(block, camera):
     """Replace plane 0 by 1 where a bounding sphere may touch the image, else 0; 1 to 4 by the box that it may touch.
 
     Planes in: mean x, y, z, scales x, y, z, opacity. The box: first and last column, first and last row, pixels.
@@ -81,8 +81,8 @@ def _cull_block(block, camera):
         block[i + P3], block[i + P4] = _between(my - ry, f4(0.0), height), _between(my + ry, f4(0.0), height)
 
 
-@kernel
-def _touches(block, lane, wanted):
+@kernel(part=True)
+def touches(block, lane, wanted):
     """Whether the box of a Gaussian holds one of the tiles that are ``wanted``, see :func:`cull`."""
     j = np.uint64(lane)
     last_x, last_y = wanted.shape[1] - 1, wanted.shape[0] - 1
@@ -113,17 +113,17 @@ def cull(means, scales, opacities, keep, wanted, camera, first, last, ids):
             block[j], block[j + P1], block[j + P2] = means[i, 0], means[i, 1], means[i, 2]
             block[j + P3], block[j + P4], block[j + P5] = scales[i, 0], scales[i, 1], scales[i, 2]
             block[j + P6] = opacities[i]
-        _cull_block(block, camera)
+        cull_block(block, camera)
         for lane in range(size):
             ids[count] = start + lane
             kept = all_kept or keep[start + lane] != 0
-            kept = kept and (block[lane] > f4(0.0)) and (all_wanted or _touches(block, lane, wanted))
+            kept = kept and (block[lane] > f4(0.0)) and (all_wanted or touches(block, lane, wanted))
             count += 1 if kept else 0
     return count
 
 
-@kernel
-def _axes_block(block, camera):
+@kernel(part=True)
+def axes_block(block, camera):
     """Project positions and half axes of a block, in place.
 
     Planes in: mean x, y, z, quaternion w, x, y, z, scales x, y, z.
@@ -170,11 +170,11 @@ def _axes_block(block, camera):
         block[i + P8] = (b0 * m02 + b1 * m12 + b2 * m22) * s2
 
 
-@kernel
-def _footprint_block(block, eps2d):
+@kernel(part=True)
+def footprint_block(block, eps2d):
     """Footprints of a block from its half axes, in place.
 
-    Planes in: those of :func:`_axes_block`. Planes out: mean_x, mean_y, depth (as they were), rate_x, slope, rate_y,
+    Planes in: those of :func:`axes_block`. Planes out: mean_x, mean_y, depth (as they were), rate_x, slope, rate_y,
     variance x, variance y, share of the density that the dilation leaves (squared).
     """
     for lane in range(BLOCK):
@@ -197,11 +197,11 @@ def _footprint_block(block, eps2d):
         block[i + P8] = det0 / det
 
 
-@kernel
-def _box_block(block, width, height):
+@kernel(part=True)
+def box_block(block, width, height):
     """Pixel ranges of a block where a weight may reach 1/255, in place.
 
-    Planes in: those of :func:`_footprint_block`, ln opacity in plane 10. Planes out: 6 to 9 first column, last
+    Planes in: those of :func:`footprint_block`, ln opacity in plane 10. Planes out: 6 to 9 first column, last
     column, first row, last row; an empty range has its last below its first.
     """
     half, one, zero = f4(0.5), f4(1.0), f4(0.0)
@@ -220,8 +220,8 @@ def _box_block(block, width, height):
         )
 
 
-@kernel
-def _store_block(block, start, size, footprints, depths, boxes):
+@kernel(part=True)
+def store_block(block, start, size, footprints, depths, boxes):
     """Write a block's footprints, depths and tile boxes."""
     for lane in range(size):
         j = np.uint64(lane)
@@ -262,10 +262,10 @@ def project(means, quats, scales, lnops, ids, camera, footprints, depths, boxes)
             block[j + P5], block[j + P6] = quats[i, 2], quats[i, 3]
             block[j + P7], block[j + P8], block[j + P9] = scales[i, 0], scales[i, 1], scales[i, 2]
             block[j + P10] = lnops[start + lane]
-        _axes_block(block, camera)
-        _footprint_block(block, camera[EPS2D])
+        axes_block(block, camera)
+        footprint_block(block, camera[EPS2D])
         if antialiased:
             for lane in range(size):
                 block[lane + P10] += f4(0.5) * np.log(max(block[lane + P8], f4(0.005 * 0.005)))
-        _box_block(block, camera[WIDTH], camera[HEIGHT])
-        _store_block(block, start, size, footprints, depths, boxes)
+        box_block(block, camera[WIDTH], camera[HEIGHT])
+        store_block(block, start, size, footprints, depths, boxes)

@@ -31,30 +31,30 @@ PLANES = 20 + POSE
 P = tuple(np.uint64(BLOCK * plane) for plane in range(PLANES))
 
 
-@kernel
-def _dot(u, v):
+@kernel(part=True)
+def dot(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@kernel
-def _mix(x, u, y, v):
+@kernel(part=True)
+def mix(x, u, y, v):
     """x u + y v."""
     return x * u[0] + y * v[0], x * u[1] + y * v[1], x * u[2] + y * v[2]
 
 
-@kernel
-def _scaled(u, s):
+@kernel(part=True)
+def scaled(u, s):
     return u[0] * s[0], u[1] * s[1], u[2] * s[2]
 
 
-@kernel
-def _times(m, u):
+@kernel(part=True)
+def times(m, u):
     """Rows m times u."""
-    return _dot(m[0], u), _dot(m[1], u), _dot(m[2], u)
+    return dot(m[0], u), dot(m[1], u), dot(m[2], u)
 
 
-@kernel
-def _transposed(m, u):
+@kernel(part=True)
+def transposed(m, u):
     """Columns of rows m times u."""
     return (
         m[0][0] * u[0] + m[1][0] * u[1] + m[2][0] * u[2],
@@ -63,8 +63,8 @@ def _transposed(m, u):
     )
 
 
-@kernel
-def _rotation(w, x, y, z, h):
+@kernel(part=True)
+def rotation(w, x, y, z, h):
     """Rows of the rotation matrix of a unit quaternion; h is 2, or 0 for no rotation."""
     one = f4(1.0)
     return (
@@ -74,10 +74,10 @@ def _rotation(w, x, y, z, h):
     )
 
 
-@kernel
-def _rotation_backward(w, x, y, z, h, a, gc, b, gd):
+@kernel(part=True)
+def rotation_backward(w, x, y, z, h, a, gc, b, gd):
     """Gradient of a quaternion, over h, from those of a M and b M, M its matrix: only what is across it."""
-    g0, g1, g2 = _mix(a[0], gc, b[0], gd), _mix(a[1], gc, b[1], gd), _mix(a[2], gc, b[2], gd)
+    g0, g1, g2 = mix(a[0], gc, b[0], gd), mix(a[1], gc, b[1], gd), mix(a[2], gc, b[2], gd)
     two = f4(2.0)
     gw = x * (g2[1] - g1[2]) + y * (g0[2] - g2[0]) + z * (g1[0] - g0[1])
     gx = w * (g2[1] - g1[2]) + y * (g0[1] + g1[0]) + z * (g0[2] + g2[0]) - two * x * (g1[1] + g2[2])
@@ -87,17 +87,17 @@ def _rotation_backward(w, x, y, z, h, a, gc, b, gd):
     return h * (gw - along * w), h * (gx - along * x), h * (gy - along * y), h * (gz - along * z)
 
 
-@kernel
-def _conic_backward(u, v, eps2d, sxx, sxy, syy, thinning):
+@kernel(part=True)
+def conic_backward(u, v, eps2d, sxx, sxy, syy, thinning):
     """Conic A, B, C (the exponent is -1/2 (A xx + 2 B xy + C yy)), and the gradient xx, xy, yy of the covariance.
 
     With the conic Q and half the second moments M it is Q M Q. What the dilation takes of the density, with an
     antialiased s = ``thinning``, adds s (inv(S) - Q), S the covariance before the dilation.
     """
-    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
+    uu, vv, uv = dot(u, u), dot(v, v), dot(u, v)
     # |u x v|^2, as in the forward pass
     normal = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-    det0 = _dot(normal, normal)
+    det0 = dot(normal, normal)
     det = det0 + eps2d * (uu + vv + eps2d)
     det = det if det > f4(1e-20) else f4(1e-20)
     scale, scale0 = f4(1.0) / det, f4(1.0) / (det0 if det0 > f4(1e-30) else f4(1.0))
@@ -110,8 +110,8 @@ def _conic_backward(u, v, eps2d, sxx, sxy, syy, thinning):
     return a, b, c, gxx, gxy, gyy
 
 
-@kernel
-def _block_backward(block, camera):
+@kernel(part=True)
+def block_backward(block, camera):
     """Replace the Gaussians of a block by their gradients."""
     r0, r1, r2 = (camera[0], camera[1], camera[2]), (camera[3], camera[4], camera[5]), (camera[6], camera[7], camera[8])
     t0, t1, t2 = camera[SHIFT], camera[SHIFT + 1], camera[SHIFT + 2]
@@ -124,46 +124,46 @@ def _block_backward(block, camera):
         i = np.uint64(lane)
         # what the forward pass computed: camera position, rows a, b of J W, rotation m, half axes u, v
         p = block[i + P[0]], block[i + P[1]], block[i + P[2]]
-        x, y, z = _dot(r0, p) + t0, _dot(r1, p) + t1, _dot(r2, p) + t2
+        x, y, z = dot(r0, p) + t0, dot(r1, p) + t1, dot(r2, p) + t2
         iz = one / z
         ux, uy, jx, jy = x * iz, y * iz, fx * iz, fy * iz
         tx, ty = _between(ux, left, right), _between(uy, above, below)
         jxz, jyz = -jx * tx, -jy * ty
-        a, b = _mix(jx, r0, jxz, r2), _mix(jy, r1, jyz, r2)
+        a, b = mix(jx, r0, jxz, r2), mix(jy, r1, jyz, r2)
         qw, qx, qy, qz = block[i + P[3]], block[i + P[4]], block[i + P[5]], block[i + P[6]]
         qq = qw * qw + qx * qx + qy * qy + qz * qz
         h, qn = two if qq > f4(1e-30) else zero, one / np.sqrt(qq if qq > f4(1e-30) else one)
         qw, qx, qy, qz = qw * qn, qx * qn, qy * qn, qz * qn
-        m = _rotation(qw, qx, qy, qz, h)
+        m = rotation(qw, qx, qy, qz, h)
         s0, s1, s2, wide = block[i + P[7]], block[i + P[8]], block[i + P[9]], widest * z
         free = one if s0 < wide else zero, one if s1 < wide else zero, one if s2 < wide else zero
         s = s0 if s0 < wide else wide, s1 if s1 < wide else wide, s2 if s2 < wide else wide
-        c, d = _transposed(m, a), _transposed(m, b)
-        u, v = _scaled(c, s), _scaled(d, s)
+        c, d = transposed(m, a), transposed(m, b)
+        u, v = scaled(c, s), scaled(d, s)
         # covariance, half axes, and c, d through them
         sv, sx, sy = block[i + P[13]], block[i + P[14]], block[i + P[15]]
         sxx, sxy, syy = half * block[i + P[16]], half * block[i + P[17]], half * block[i + P[18]]
-        ca, cb, cc, gxx, gxy, gyy = _conic_backward(u, v, eps2d, sxx, sxy, syy, filtered * sv)
-        gu, gv = _mix(two * gxx, u, two * gxy, v), _mix(two * gxy, u, two * gyy, v)
-        gs = _scaled((gu[0] * c[0] + gv[0] * d[0], gu[1] * c[1] + gv[1] * d[1], gu[2] * c[2] + gv[2] * d[2]), free)
-        gc, gd = _scaled(gu, s), _scaled(gv, s)
-        block[i + P[3]], block[i + P[4]], block[i + P[5]], block[i + P[6]] = _rotation_backward(
+        ca, cb, cc, gxx, gxy, gyy = conic_backward(u, v, eps2d, sxx, sxy, syy, filtered * sv)
+        gu, gv = mix(two * gxx, u, two * gxy, v), mix(two * gxy, u, two * gyy, v)
+        gs = scaled((gu[0] * c[0] + gv[0] * d[0], gu[1] * c[1] + gv[1] * d[1], gu[2] * c[2] + gv[2] * d[2]), free)
+        gc, gd = scaled(gu, s), scaled(gv, s)
+        block[i + P[3]], block[i + P[4]], block[i + P[5]], block[i + P[6]] = rotation_backward(
             qw, qx, qy, qz, h * qn, a, gc, b, gd
         )
         block[i + P[7]], block[i + P[8]], block[i + P[9]] = gs
         # J W, and through it and the image position the camera position
-        ga, gb = _times(m, gc), _times(m, gd)
-        kxz, kyz = _dot(ga, r2), _dot(gb, r2)
+        ga, gb = times(m, gc), times(m, gd)
+        kxz, kyz = dot(ga, r2), dot(gb, r2)
         gux = fx * (ca * sx + cb * sy) - (jx * kxz if ux == tx else zero)
         guy = fy * (cb * sx + cc * sy) - (jy * kyz if uy == ty else zero)
-        giz = fx * (_dot(ga, r0) - tx * kxz) + fy * (_dot(gb, r1) - ty * kyz) + gux * x + guy * y
+        giz = fx * (dot(ga, r0) - tx * kxz) + fy * (dot(gb, r1) - ty * kyz) + gux * x + guy * y
         g = gux * iz, guy * iz, -iz * iz * giz
-        block[i + P[0]], block[i + P[1]], block[i + P[2]] = _transposed((r0, r1, r2), g)
+        block[i + P[0]], block[i + P[1]], block[i + P[2]] = transposed((r0, r1, r2), g)
         opacity = block[i + P[19]]
         block[i + P[19]] = sv / opacity if opacity <= one else zero
-        block[i + P[20]], block[i + P[21]], block[i + P[22]] = _mix(g[0], p, jx, ga)
-        block[i + P[23]], block[i + P[24]], block[i + P[25]] = _mix(g[1], p, jy, gb)
-        block[i + P[26]], block[i + P[27]], block[i + P[28]] = _mix(g[2], p, one, _mix(jxz, ga, jyz, gb))
+        block[i + P[20]], block[i + P[21]], block[i + P[22]] = mix(g[0], p, jx, ga)
+        block[i + P[23]], block[i + P[24]], block[i + P[25]] = mix(g[1], p, jy, gb)
+        block[i + P[26]], block[i + P[27]], block[i + P[28]] = mix(g[2], p, one, mix(jxz, ga, jyz, gb))
         block[i + P[29]], block[i + P[30]], block[i + P[31]] = g
 
 
@@ -199,7 +199,7 @@ def project_backward(
             block[j + P[13]], block[j + P[14]], block[j + P[15]] = sums[k, 3], sums[k, 4], sums[k, 5]
             block[j + P[16]], block[j + P[17]], block[j + P[18]] = sums[k, 6], sums[k, 7], sums[k, 8]
             block[j + P[19]] = opacities[i]
-        _block_backward(block, camera)
+        block_backward(block, camera)
         for lane in range(size):
             k = np.uint64(start + lane)
             j = np.uint64(lane)

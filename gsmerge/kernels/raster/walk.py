@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy import float32 as f4
@@ -21,6 +22,8 @@ from gsmerge.kernels.raster.project import LN_CUT, TILE
 BATCH = 32
 PLANE = TILE * TILE
 PLANES = 11  # of a batch: mean x and y, rate, slope, decay, ln opacity, first and last row, colour
+MY, RATE, SLOPE, DECAY, LNOP, FIRST, LAST = (np.uint64(BATCH * plane) for plane in range(1, 8))  # mean x is at 0
+COLOR = np.uint64(BATCH * 8)
 MAX_ALPHA, MIN_TRANSMITTANCE = f4(0.99), f4(1e-4)
 
 # exp(p) = poly(p)^8 on [ln(1/255), 0]: minimax of relative error 8e-8 for exp(p / 8), coefficients scaled by 8^-k.

@@ -6,21 +6,9 @@ import numpy as np
 from numpy import float32 as f4
 
 from gsmerge.kernels.jit import kernel
-from gsmerge.kernels.raster.blend import (
-    DECAY,
-    LNOP,
-    P1,
-    RATE,
-    SLOPE,
-    batch_rows,
-    gather,
-    live_rows,
-    new_batch,
-    open_tile,
-    tile_box,
-)
+from gsmerge.kernels.raster.blend import P1, batch_rows, gather, live_rows, new_batch, open_tile, tile_box
 from gsmerge.kernels.raster.project import LN_CUT, TILE
-from gsmerge.kernels.raster.walk import BATCH, PLANE, weigh_rows
+from gsmerge.kernels.raster.walk import BATCH, DECAY, LNOP, PLANE, RATE, SLOPE, weigh_rows
 
 LANES = 4  # channels of an image row: one vector register
 

@@ -74,8 +74,8 @@ def cut_gain(integral, near, far, step, side, num_pixels, compactness):
     return best / num_pixels, best_cut
 
 
-@kernel
-def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, heads, gain, bits):
+@kernel(part=True)
+def enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, heads, gain, bits):
     """Store a rectangle with its best cut, in the bucket of the cut's gain or ``limit``; single pixels wait nowhere.
 
     A cut below another waits for it anyway, so its bucket never needs to be above the one being emptied.
@@ -94,8 +94,8 @@ def _enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, 
         heads[bucket] = node
 
 
-@kernel
-def _paint(nodes, count, height, width):
+@kernel(part=True)
+def paint(nodes, count, height, width):
     labels = np.full((height + 2, width + 2), -1, np.int32)
     for node in range(count):
         for y in range(nodes[node, 0] + 1, nodes[node, 2] + 1):
@@ -128,7 +128,7 @@ def split_rectangles(pixels, count, block, compactness):
         y0, y1 = i * height // num_rows, (i + 1) * height // num_rows
         for j in range(num_columns):
             x0, x1 = j * width // num_columns, (j + 1) * width // num_columns
-            _enqueue(num_leaves, y0, x0, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, bits)
+            enqueue(num_leaves, y0, x0, y1, x1, bucket, integral, stride, compactness, nodes, heads, gain, bits)
             num_leaves += 1
     while num_leaves < count and bucket >= 0:
         node = heads[bucket]
@@ -143,6 +143,6 @@ def split_rectangles(pixels, count, block, compactness):
             top, left = (row, column) if part == 1 else (y0, x0)
             bottom, right = (y1, x1) if part == 1 else (row if across else y1, x1 if across else column)
             target = num_leaves if part == 1 else node
-            _enqueue(target, top, left, bottom, right, bucket, integral, stride, compactness, nodes, heads, gain, bits)
+            enqueue(target, top, left, bottom, right, bucket, integral, stride, compactness, nodes, heads, gain, bits)
         num_leaves += 1
-    return _paint(nodes, num_leaves, height, width), num_leaves
+    return paint(nodes, num_leaves, height, width), num_leaves

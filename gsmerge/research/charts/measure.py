@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from torch import Tensor
 
 from gsmerge.io import HeldOutViews, atomic_output
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate, near_plane
@@ -73,7 +72,7 @@ def keep_pictures(
     photos, names = views.images, views.names
     ids, near = pick_views(len(names), MAX_PICTURES), near_plane(scene)
     for i, view in enumerate(ids):
-        image = render(gaussians, views.cameras[[view]], near=near).images[0].clamp(0, 1)
+        image = render(gaussians, views.cameras[[view]], near=near).images[0].clip(0, 1)
         _write(picture_path(folder, key, i, "render"), to_picture(image))
         if photos is None:
             continue
@@ -84,9 +83,9 @@ def keep_pictures(
     return tuple(names[view] for view in ids)
 
 
-def error_map(image: Tensor, photo: Tensor) -> Picture:
+def error_map(image: np.ndarray, photo: np.ndarray) -> Picture:
     """Mean absolute error over the channels as a heat map, on the same scale for all pictures."""
-    error = (image - photo).abs().mean(2).numpy() / MAX_ERROR
+    error = np.abs(image - photo).mean(2) / MAX_ERROR
     return heat_map(error.clip(0, 1))
 
 

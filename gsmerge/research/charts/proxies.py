@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from gsmerge.io.content_hash import digest
 from gsmerge.measure.preview import draw_means
@@ -37,10 +36,10 @@ class Proxy:
     psnr: float  # mean over those, dB
 
 
-def proxy_psnr(image: Tensor, count: int, segmentation: str) -> float:
+def proxy_psnr(image: np.ndarray, count: int, segmentation: str) -> float:
     """PSNR (dB) of a photo ``[h,w,3]`` (sRGB in [0, 1]) with ``count`` superpixels in their mean colours."""
     means = draw_means(image, superpixels(image, count, segmentation))
-    return psnr(means.astype(np.float64) / 255, image.double().numpy())
+    return psnr(means.astype(np.float64) / 255, image.astype(np.float64))
 
 
 def proxy_points(scene_sha256: str, max_views: int) -> dict[str, tuple[str, float]]:
@@ -55,7 +54,7 @@ def proxy_points(scene_sha256: str, max_views: int) -> dict[str, tuple[str, floa
 def measure_proxies(
     folder: Path,
     scene: str,
-    images: Tensor,
+    images: np.ndarray,
     points: Mapping[str, tuple[str, float]],
     *,
     max_views: int,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 
 from gsmerge.kernels.raster.harmonics import view_colors
 from gsmerge.research.generate.options import Noise
@@ -124,4 +123,4 @@ def pixel_gaussians(seen: TrueView, lens: Lens, noise: Noise, rng: np.random.Gen
     means = means.astype(np.float32)
     sh0, shN = _harmonics(colors, means, seen.c2w[:3, 3], noise, rng)
     columns = (means, quats, scales, opacities, sh0, shN)
-    return Gaussians(*(torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in columns))
+    return Gaussians(*(np.ascontiguousarray(a, dtype=np.float32) for a in columns))

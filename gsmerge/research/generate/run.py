@@ -175,9 +175,9 @@ def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> Non
         name = f"images/view_{i:03d}.png"
         _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
         (folder / name).write_bytes(data.tobytes())
-        c2w = np.linalg.inv(cameras.viewmats[i].numpy()) @ FLIP
+        c2w = np.linalg.inv(cameras.viewmats[i]) @ FLIP
         frames.append({"file_path": name, "transform_matrix": c2w.tolist()})
-    K = cameras.Ks[0].numpy()
+    K = cameras.Ks[0]
     shared = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": cameras.width, "h": cameras.height}
     document = {"camera_model": "PINHOLE", **shared, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

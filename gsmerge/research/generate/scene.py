@@ -8,7 +8,6 @@ from functools import partial
 
 import cv2
 import numpy as np
-import torch
 
 from gsmerge.research.generate.noise import Float, TrueView, pixel_gaussians
 from gsmerge.research.generate.options import MIXED, GenerateOptions, Noise, draw_noise
@@ -134,5 +133,5 @@ def _move_pose(pose: Array, world: Array, unit: float) -> Array:
 
 
 def _cameras(poses: Sequence[Array], lens: Lens) -> Cameras:
-    viewmats = torch.from_numpy(np.stack([np.linalg.inv(pose) for pose in poses]))
-    return Cameras(viewmats, torch.from_numpy(np.repeat(lens.intrinsics[None], len(poses), 0)), lens.width, lens.height)
+    viewmats = np.stack([np.linalg.inv(pose) for pose in poses])
+    return Cameras(viewmats, np.repeat(lens.intrinsics[None], len(poses), 0), lens.width, lens.height)

@@ -12,8 +12,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsmerge.io.cameras.camera_file import CONVENTIONS
 from gsmerge.measure.evaluate import Views
@@ -72,9 +70,9 @@ def repeat_views(given: StressScene) -> StressScene:
 
 def move(given: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """The world scaled, and moved by ``shift`` in units of its own size."""
-    offset = torch.tensor(shift, dtype=torch.float64) * scene_frame(given.scene).unit * factor
+    offset = np.array(shift, np.float64) * scene_frame(given.scene).unit * factor
     scene, views = given.scene, given.views
-    means = factor * scene.gaussians.means.double() + offset
+    means = factor * scene.gaussians.means.astype(np.float64) + offset
     gaussians = replace(scene.gaussians, means=means, scales=scene.gaussians.scales * factor)
     scene = replace(scene, gaussians=gaussians, cameras=_move_cameras(scene.cameras, factor, offset))
     if views is not None:
@@ -82,8 +80,8 @@ def move(given: StressScene, factor: float, shift: Sequence[float]) -> StressSce
     return StressScene(scene, views)
 
 
-def _move_cameras(cameras: Cameras, factor: float, offset: Tensor) -> Cameras:
-    viewmats = cameras.viewmats.double().clone()
+def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Cameras:
+    viewmats = cameras.viewmats.astype(np.float64)
     viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ offset
     return replace(cameras, viewmats=viewmats)
 
@@ -93,12 +91,12 @@ def perturb_poses(given: StressScene, degrees: float) -> StressScene:
     scene = given.scene
     assert isinstance(scene, PixelScene)
     rng = np.random.default_rng(SEED)
-    means = scene.gaussians.means.double().clone().reshape(len(scene), -1, 3)
-    viewmats = scene.cameras.viewmats.double().clone()
+    means = scene.gaussians.means.astype(np.float64).reshape(len(scene), -1, 3)
+    viewmats = scene.cameras.viewmats.astype(np.float64)
     for view in range(len(scene)):
         axis = rng.normal(size=3)
-        turn = torch.from_numpy(cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0])
-        old = viewmats[view].clone()
+        turn = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0]
+        old = viewmats[view].copy()
         viewmats[view, :3] = turn @ old[:3]
         camera = means[view] @ old[:3, :3].T + old[:3, 3]
         means[view] = (camera - viewmats[view, :3, 3]) @ viewmats[view, :3, :3]
@@ -111,12 +109,12 @@ def change_exposure(given: StressScene, share: float) -> StressScene:
     scene = given.scene
     assert isinstance(scene, PixelScene)
     assert scene.images is not None
-    gains = torch.tensor([1 + share if view % 2 else 1 - share for view in range(len(scene))], dtype=torch.float32)
-    rows = gains.repeat_interleave(scene.pixels_per_view)[:, None, None]
+    gains = np.array([1 + share if view % 2 else 1 - share for view in range(len(scene))], np.float32)
+    rows = gains.repeat(scene.pixels_per_view)[:, None, None]
     g = scene.gaussians
     sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
     gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
-    images = (scene.images * gains[:, None, None, None]).clamp(0, 1)
+    images = (scene.images * gains[:, None, None, None]).clip(0, 1)
     return replace(given, scene=replace(scene, gaussians=gaussians, images=images))
 
 
@@ -126,7 +124,7 @@ def break_rows(given: StressScene) -> StressScene:
     chosen = _choose(len(scene.gaussians), BROKEN_SHARE)
     if isinstance(scene, UnalignedScene):
         return replace(given, scene=replace(scene, gaussians=scene.gaussians[~chosen]))
-    gaussians = replace(scene.gaussians, opacities=torch.where(chosen, torch.zeros(()), scene.gaussians.opacities))
+    gaussians = replace(scene.gaussians, opacities=np.where(chosen, np.float32(0), scene.gaussians.opacities))
     valid = scene.valid & ~chosen.reshape(scene.valid.shape)
     return replace(given, scene=replace(scene, gaussians=gaussians, valid=valid))
 
@@ -135,7 +133,7 @@ def throw_away(given: StressScene) -> StressScene:
     """A few Gaussians a thousand times as far away."""
     scene = given.scene
     chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
-    means = torch.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
+    means = np.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
     return replace(given, scene=replace(scene, gaussians=replace(scene.gaussians, means=means)))
 
 
@@ -143,13 +141,13 @@ def enlarge(given: StressScene) -> StressScene:
     """Some Gaussians many times as large."""
     gaussians = given.scene.gaussians
     chosen = _choose(len(gaussians), LARGE_SHARE)[:, None]
-    scales = torch.where(chosen, LARGE_FACTOR * gaussians.scales, gaussians.scales)
+    scales = np.where(chosen, LARGE_FACTOR * gaussians.scales, gaussians.scales)
     return replace(given, scene=replace(given.scene, gaussians=replace(gaussians, scales=scales)))
 
 
-def _choose(count: int, share: float) -> Tensor:
+def _choose(count: int, share: float) -> np.ndarray:
     """``[count]`` bool: a random share of them, at least one."""
-    chosen = torch.zeros(count, dtype=torch.bool)
+    chosen = np.zeros(count, bool)
     chosen[np.random.default_rng(SEED).choice(count, max(1, round(share * count)), replace=False)] = True
     return chosen
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from gsmerge.budget import BudgetOptions
 from gsmerge.errors import GsmergeError, SceneError, UsageError
@@ -165,7 +164,7 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
             return True, f"{figures} against renders of the input"
         return result.after >= result.before - MAX_WORSE, f"{figures}; its input {result.before:.2f} dB"
     if case.check == "bits":
-        same = all(torch.equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
+        same = all(np.array_equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
         return same, "equal" if same else f"differs: {both}"
     if case.check == "near":
         return result.after >= base.after - MAX_NEAR - slack, both
@@ -188,15 +187,15 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
     """The scene read from cameras whose poses are in another convention than that of their format."""
     assert load.cameras is not None
     assert case.convention is not None
-    stored = from_viewmats(load.cameras.viewmats.numpy(), case.convention)
-    wrong = replace(load.cameras, viewmats=torch.from_numpy(to_viewmats(stored, load.cameras.convention)))
+    stored = from_viewmats(load.cameras.viewmats, case.convention)
+    wrong = replace(load.cameras, viewmats=to_viewmats(stored, load.cameras.convention))
     try:
         opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
         ply = read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints)
         read = align_scene(ply, load.files, wrong, hints=hints).scene
     except SceneError as error:
         return True, f"refused: {error.problem}"
-    expected, viewmats = load.scene.cameras.viewmats.numpy(), read.cameras.viewmats.numpy()
+    expected, viewmats = load.scene.cameras.viewmats, read.cameras.viewmats
     tolerance = 1e-3 * (1 + np.abs(expected).max())
     same = expected.shape == viewmats.shape and np.allclose(expected, viewmats, atol=tolerance)
     return bool(same), "recognised" if same else "taken for something else"
@@ -205,13 +204,13 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
 def _find_defect(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:
     """What is wrong with a result for any scene; None where nothing is."""
     for name in _FIELDS:
-        if not bool(torch.isfinite(getattr(gaussians, name)).all()):
+        if not np.isfinite(getattr(gaussians, name)).all():
             return f"{name} are not finite"
     if not 1 <= len(gaussians) <= scene.num_gaussians:
         return f"{len(gaussians)} Gaussians of {scene.num_gaussians}"
-    if not bool(((gaussians.opacities > 0) & (gaussians.opacities < 1)).all()):
+    if not ((gaussians.opacities > 0) & (gaussians.opacities < 1)).all():
         return "opacities outside of 0 to 1"
-    if not bool((gaussians.scales > 0).all()):
+    if not (gaussians.scales > 0).all():
         return "scales that are not positive"
-    lengths = gaussians.quats.norm(dim=1)
-    return None if bool((lengths - 1).abs().max() < 1e-4) else "quaternions that are no unit quaternions"
+    lengths = np.linalg.norm(gaussians.quats, axis=1)
+    return None if np.abs(lengths - 1).max() < 1e-4 else "quaternions that are no unit quaternions"

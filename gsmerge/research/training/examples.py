@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
@@ -147,8 +146,10 @@ def make_example(
 
 def _median_depth(features: FeatureGaussians, cameras: Cameras) -> float:
     """Of Feature Gaussians in their own views; a footprint is a pixel there."""
-    focals = (cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]).abs().sqrt()
-    return float((features.footprints.double() * focals.double()[features.views]).median())
+    focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]))
+    depths = features.footprints * focals.astype(np.float64)[features.views]
+    middle = (len(depths) - 1) // 2
+    return float(np.partition(depths, middle)[middle])
 
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:
@@ -161,13 +162,13 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
     views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
     if len(ids) == views:
         return example
-    place = torch.full((views,), -1)
-    place[list(ids)] = torch.arange(len(ids))
-    rows = torch.nonzero(place[example.features.views] >= 0)[:, 0]
+    place = np.full(views, -1)
+    place[list(ids)] = np.arange(len(ids))
+    rows = np.flatnonzero(place[example.features.views] >= 0)
     part = take(example.features, rows)
     members = place[part.members // pixels] * pixels + part.members % pixels
     columns = {f.name: getattr(example.members, f.name) for f in fields(Members) if f.name != "pixels"}
-    chosen = (torch.tensor(ids)[:, None] * pixels + torch.arange(pixels)).flatten().numpy()
+    chosen = (np.array(ids)[:, None] * pixels + np.arange(pixels)).reshape(-1)
     order = [*ids, *(photo for photo in range(len(example.photos)) if photo not in set(ids))]
     photos = example.photos
     return replace(

@@ -14,12 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.geometry import quat_to_rotmat
 from gsmerge.measure.lpips import lpips_loss
 from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks import Networks
-from gsmerge.networks.residuals import RESIDUAL, ROTATION, gaussian_sizes, residual_limits
-from gsmerge.render.autograd import render_differentiable
+from gsmerge.networks.residuals import RESIDUAL, ROTATION, gaussian_sizes, quat_to_rotmat, residual_limits
+from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR
 from gsmerge.research.training.options import TrainOptions
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, predict
@@ -36,7 +35,7 @@ def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
     sums: dict[int, Tensor] = {}
     for levels in every:
         for k, targets in levels.items():
-            values = targets.corrections[targets.mask].double()
+            values = torch.from_numpy(targets.corrections[targets.mask]).double()
             part = torch.stack([torch.full((RESIDUAL,), len(values)), values.sum(0), values.square().sum(0)])
             sums[k] = sums.get(k, 0) + part
     variances = {k: squares / count - (total / count).square() for k, (count, total, squares) in sums.items()}
@@ -97,10 +96,8 @@ MAX_DB = 100.0  # PSNR of windows without an error
 def draw_window(gaussians: Gaussians, window: Window, background: np.ndarray) -> Tensor:
     """``[h,w,3]`` render of a window, differentiable."""
     eps2d = window.crop.example.photos.eps2d
-    drawn = render_differentiable(
-        gaussians, window.camera, background, with_depths=False, eps2d=eps2d, near=NEAR
-    )  # fmt: skip
-    return drawn.images[0]
+    camera = window.camera.to("cpu")
+    return render_tensors(gaussians, camera, background, with_depths=False, eps2d=eps2d, near=NEAR).images[0]
 
 
 def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
@@ -133,7 +130,7 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
     """
     with torch.no_grad():
         if networks is None:
-            gaussians, matched = analytic_gaussians(window.crop, options), 0.0
+            gaussians, matched = analytic_gaussians(window.crop, options).to("cpu"), 0.0
         else:
             prediction = predict(window.crop, networks, options, 0)
             gaussians, matched = prediction.gaussians, prediction.matched
@@ -157,7 +154,7 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     g, merged = prediction.gaussians, prediction.merged
     if len(g) == 0:
         return g.means.new_zeros(())
-    moments = pool_members(members, merged.starts.numpy(), merged.members.numpy(), "paper")
+    moments = pool_members(members, merged.starts, merged.members, "paper")
     scales, quats = (torch.from_numpy(axes).float()[prediction.parents] for axes in principal_axes(moments.covars))
     scales, turns = _nearest_axes(scales, quats, g.quats)
     sizes = gaussian_sizes(scales)

@@ -34,7 +34,7 @@ from gsmerge.types import FeatureGaussians, Gaussians, Matches
 class Prediction:
     """A crop's children, corrected by the networks."""
 
-    gaussians: Gaussians  # n corrected children, with gradients
+    gaussians: Gaussians  # n corrected children, tensors with gradients
     parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
     merged: FeatureGaussians  # the crop's, merged and refined
     corrections: Tensor  # [n,13] of all stages together, from the analytic children as the targets
@@ -62,7 +62,7 @@ def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) ->
     refined, residuals = apply_corrections(merged, group_features, raw, networks)
     group_features = context.describe(refined)
     children, parents = divide(refined, example.members, np.full(len(refined), crop.k))
-    children = prepare_children(children, parents, refined, group_features, networks)
+    children = prepare_children(children.to("cpu"), parents, refined, group_features, networks)
     heads = run_heads(children, parents, refined, group_features, context)
     before = before + residuals if crop.k == 1 else torch.zeros_like(heads)
     last = heads + (before - before.detach())  # adds the gradient of earlier corrections, which the base has already
@@ -71,7 +71,7 @@ def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) ->
     gaussians, corrections = move_gaussians(children, last, frames), before + heads
     if example.targets and networks.options.outputs == "absolute":
         analytic, _ = divide(merge(parts, matches), example.members, np.full(len(refined), crop.k))
-        corrections = corrections_between(analytic, gaussians, frames)
+        corrections = corrections_between(analytic.to("cpu"), gaussians, frames)
     return Prediction(gaussians, own, refined, corrections, _matched(matches))
 
 
@@ -88,7 +88,7 @@ def match_crop(
     """Clusters of the r Feature Gaussians ``parts`` of a crop: those that were fitted, or what matches now."""
     known = crop.example.matches
     if known is not None:
-        ids, local = torch.unique(known.clusters[crop.rows], return_inverse=True)
+        ids, local = np.unique(known.clusters[crop.rows], return_inverse=True)
         return Matches(local, len(ids))
     with torch.no_grad():
         return match(parts, options.match_options(), context)
@@ -99,26 +99,27 @@ def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
     matches = crop.example.matches
     assert matches is not None
     rows, targets = merged_rows(matches), crop.example.targets[crop.k]
-    inside, inner = torch.zeros(2, matches.count, dtype=torch.bool)
+    inside, inner = np.zeros((2, matches.count), bool)
     inside[rows[crop.rows]], inner[rows[crop.rows[crop.inner]]] = True, True
-    own = torch.nonzero(inside[targets.parents])[:, 0]
-    return targets.corrections[own], targets.mask[own] & inner[targets.parents[own]]
+    own = np.flatnonzero(inside[targets.parents])
+    scored = targets.mask[own] & inner[targets.parents[own]]
+    return torch.from_numpy(targets.corrections[own]), torch.from_numpy(scored)
 
 
-def merged_rows(matches: Matches) -> Tensor:
+def merged_rows(matches: Matches) -> np.ndarray:
     """``[g]`` row after merging of every Feature Gaussian before merging."""
     alone, order, cuts = cluster_runs(matches)
-    rows = torch.empty(len(matches.clusters), dtype=torch.int64)
-    rows[alone] = torch.arange(len(alone))
-    first = torch.zeros(len(order), dtype=torch.int64)
-    first[torch.from_numpy(cuts)] = 1
-    rows[order] = len(alone) + first.cumsum(0) - 1
+    rows = np.empty(len(matches.clusters), np.int64)
+    rows[alone] = np.arange(len(alone))
+    first = np.zeros(len(order), np.int64)
+    first[cuts] = 1
+    rows[order] = len(alone) + first.cumsum() - 1
     return rows
 
 
 def _matched(matches: Matches) -> float:
     """Share of the Feature Gaussians that are not alone in their cluster."""
-    sizes = torch.bincount(matches.clusters, minlength=matches.count)
+    sizes = np.bincount(matches.clusters, minlength=matches.count)
     return float(sizes[sizes > 1].sum()) / max(1, len(matches.clusters))
 
 
@@ -133,10 +134,11 @@ def _merged(
     of_pooled = context.describe(pooled)
     moved = rotate_vectors(group_features.frames, shifts[:, MEAN] * group_features.sizes[:, None])[order]
     run = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
-    share = parts.weights[order] / torch.zeros(len(cuts)).index_add(0, run, parts.weights[order])[run].clamp_min(1e-12)
+    weights = torch.from_numpy(parts.weights[order])
+    share = weights / torch.zeros(len(cuts)).index_add(0, run, weights)[run].clamp_min(1e-12)
     world = torch.zeros(len(cuts), 3).index_add(0, run, share[:, None] * moved)
     local = rotate_vectors(of_pooled.frames.transpose(1, 2), world) / of_pooled.sizes[:, None]
-    raw = run_merger(pooled, of_pooled, parts, order.numpy(), cuts, context)
+    raw = run_merger(pooled, of_pooled, parts, order, cuts, context)
     pooled, residuals = apply_corrections(pooled, of_pooled, raw, context.networks)
     from_encoder = torch.cat([local, torch.zeros(len(cuts), residuals.shape[1] - 3)], 1)
     merged = FeatureGaussians.concat([take(parts, alone), pooled])

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 
 from gsmerge.measure.evaluate import Views
 from gsmerge.measure.visibility import context_points, visible_pixels
@@ -34,7 +33,7 @@ class TrainingScene:
     def photos(self, level: float = 1) -> Photos:
         """All photos, each side divided by ``level``."""
         names = tuple(map(str, range(len(self.cameras))))
-        unaligned = UnalignedScene(self.scene.gaussians[:0], self.cameras, torch.from_numpy(self.images), names)
+        unaligned = UnalignedScene(self.scene.gaussians[:0], self.cameras, self.images, names)
         return scene_photos(unaligned, level)
 
 
@@ -55,16 +54,16 @@ def make_training_scene(scene: PixelScene, ids: Sequence[int], held_out: Views |
     canonical, frame = canonicalise(part)
     rest = [view for view in range(len(scene)) if view not in set(ids)]
     order = [*ids, *rest]
-    cameras, images = scene.cameras[order], scene.images.numpy()[order]
+    cameras, images = scene.cameras[order], scene.images[order]
     if held_out is not None:
         width, height = cameras.width, cameras.height
-        ratio = torch.tensor([width / held_out.cameras.width, height / held_out.cameras.height, 1.0])
+        ratio = np.array([width / held_out.cameras.width, height / held_out.cameras.height, 1.0])
         cameras = replace(
             cameras,
-            viewmats=torch.cat([cameras.viewmats.double(), held_out.cameras.viewmats.double()]),
-            Ks=torch.cat([cameras.Ks.double(), held_out.cameras.Ks.double() * ratio.double()[:, None]]),
+            viewmats=np.concatenate([cameras.viewmats, held_out.cameras.viewmats]).astype(np.float64),
+            Ks=np.concatenate([cameras.Ks, held_out.cameras.Ks * ratio[:, None]]).astype(np.float64),
         )
-        resized = [_resize(image, width, height) for image in held_out.images.numpy()]
+        resized = [_resize(image, width, height) for image in held_out.images]
         images = np.concatenate([images, np.stack(resized)])
     return TrainingScene(canonical, scene_members(canonical), frame.enter_cameras(cameras), images)
 
@@ -89,8 +88,7 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
         transmittances of views multiply, so this says what any subset of them covers.
     """
     scene, photos = training.scene, training.photos(level)
-    viewmats, Ks = torch.from_numpy(photos.viewmats), torch.from_numpy(photos.Ks)
-    cameras = Cameras(viewmats, Ks, photos.width, photos.height)
+    cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
 
     def one_view(view: int) -> np.ndarray:
         part = subset(scene, [view])

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
@@ -167,10 +166,10 @@ def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
     yield "images", example.images
     yield "covers", example.covers
     if example.matches is not None:
-        yield "clusters", example.matches.clusters.numpy()
+        yield "clusters", example.matches.clusters
     for k, targets in example.targets.items():
         for f in fields(Targets):
-            yield f"targets.{k}.{f.name}", getattr(targets, f.name).numpy()
+            yield f"targets.{k}.{f.name}", getattr(targets, f.name)
 
 
 def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
@@ -200,23 +199,20 @@ def read_shard(shard: Shard, *, check: bool = True) -> Example:
         prefix = f"{name}."
         return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
-    def tensors(name: str) -> dict[str, Any]:
-        return {key: torch.from_numpy(value) for key, value in part(name).items()}
-
     black = np.broadcast_to(np.float32(0), arrays["images"].shape)
     clusters = arrays.get("clusters")
     return Example(
         name=shard.scene,
         unit=float(facts["unit"]),
         members=Members(**part("members")),
-        cameras=Cameras(**tensors("cameras"), width=facts["size"][0], height=facts["size"][1]),
-        features=FeatureGaussians(**tensors("features")),
-        base=Gaussians(**tensors("base")),
+        cameras=Cameras(**part("cameras"), width=facts["size"][0], height=facts["size"][1]),
+        features=FeatureGaussians(**part("features")),
+        base=Gaussians(**part("base")),
         photos=Photos(black, **part("photos"), eps2d=facts["eps2d"]),
         images=arrays["images"],
         covers=arrays["covers"],
-        matches=None if clusters is None else Matches(torch.from_numpy(clusters), int(clusters.max()) + 1),
-        targets={k: Targets(**tensors(f"targets.{k}")) for k in facts["levels"]},
+        matches=None if clusters is None else Matches(clusters, int(clusters.max()) + 1),
+        targets={k: Targets(**part(f"targets.{k}")) for k in facts["levels"]},
     )
 
 
@@ -238,4 +234,4 @@ def read_targets(shard: Shard) -> dict[int, Targets]:
     """
     arrays, facts = _read(shard.path, "targets.")
     names = [f.name for f in fields(Targets)]
-    return {k: Targets(*(torch.from_numpy(arrays[f"targets.{k}.{n}"]) for n in names)) for k in facts["levels"]}
+    return {k: Targets(*(arrays[f"targets.{k}.{n}"] for n in names)) for k in facts["levels"]}

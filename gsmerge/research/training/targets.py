@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import quat_to_rotmat
-from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes
+from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, RESIDUAL, ROTATION, SIZE, gaussian_sizes, quat_to_rotmat
 from gsmerge.networks.tokens import compute_group_features
 from gsmerge.render.photos import Photos
 from gsmerge.research.training.options import TrainOptions
@@ -33,9 +32,9 @@ Progress = Callable[[int, int], None]  # step, steps
 class Targets:
     """Corrections by the fit of the n analytic Gaussians of one K."""
 
-    parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
-    corrections: Tensor  # [n,13]
-    mask: Tensor  # [n] whether there is a target
+    parents: np.ndarray  # [n] int64, the merged Feature Gaussian of each, ascending
+    corrections: np.ndarray  # [n,13] float32
+    mask: np.ndarray  # [n] whether there is a target
 
 
 def fit_targets(
@@ -70,9 +69,10 @@ def fit_targets(
 
         children, parents = divide(merged, training.members, np.full(len(merged), k))
         fitted, mask = _fit_level(name, photos, sized, children, options, report)
-        own, corrections = torch.from_numpy(parents), torch.zeros(len(children), RESIDUAL)
-        corrections[mask] = corrections_between(children[mask], fitted, frames[own][mask])
-        targets[k] = Targets(own, corrections, mask)
+        corrections = np.zeros((len(children), RESIDUAL), np.float32)
+        start, end = children[mask].to("cpu"), fitted.to("cpu")
+        corrections[mask] = corrections_between(start, end, frames[torch.from_numpy(parents[mask])])
+        targets[k] = Targets(parents, corrections, mask)
     return targets
 
 
@@ -83,11 +83,11 @@ def _fit_level(
     start: Gaussians,
     options: TrainOptions,
     progress: Callable[[int, int, float, float], None],
-) -> tuple[Gaussians, Tensor]:
+) -> tuple[Gaussians, np.ndarray]:
     """Gaussians after a full fit without growth, and a mask ``[n]`` of those that were fitted, which a photo shows."""
     fit = FitOptions(fit_steps=options.fit_steps)
     mask = start.opacities >= DecodeOptions().min_opacity
-    mask[mask.clone()] = visible_mask(start[mask], photos[1], fit.min_contribution)
+    mask[mask.copy()] = visible_mask(start[mask], photos[1], fit.min_contribution)
     fitted, report = fit_full(start[mask], photos, fit, seed=options.seed, progress=progress, masks=masks)
     if not report.accepted:
         problem = f"expected a scene that the fit makes better ({report.stopped})"
@@ -96,7 +96,7 @@ def _fit_level(
 
 
 def corrections_between(start: Gaussians, end: Gaussians, frames: Tensor) -> Tensor:
-    """``[n,13]`` corrections in frames ``[n,3,3]`` that turn ``start`` into ``end``."""
+    """``[n,13]`` corrections in frames ``[n,3,3]`` that turn ``start`` into ``end``, all of them tensors."""
     back, sizes = frames.transpose(1, 2), gaussian_sizes(start.scales).clamp_min(1e-12)
     residuals = torch.zeros(len(start), RESIDUAL)
     residuals[:, MEAN] = (back @ (end.means - start.means)[:, :, None])[:, :, 0] / sizes[:, None]

@@ -24,8 +24,8 @@ class Crop:
 
     example: Example
     k: int  # Gaussians that each becomes
-    rows: Tensor  # [r] ascending rows of its Feature Gaussians
-    inner: Tensor  # [r] bool, whether targets count; the others are neighbours
+    rows: np.ndarray  # [r] ascending rows of its Feature Gaussians
+    inner: np.ndarray  # [r] bool, whether targets count; the others are neighbours
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ class Window:
     def camera(self) -> Cameras:
         """One camera whose image is the box."""
         c = box_camera(self.crop.example.photos, self.photo, self.box)
-        viewmat, K = torch.from_numpy(c["viewmat"]), torch.from_numpy(c["K"])
-        return Cameras(viewmat[None], K[None], c["width"], c["height"])
+        return Cameras(c["viewmat"][None], c["K"][None], c["width"], c["height"])
 
     @property
     def image(self) -> Tensor:
@@ -79,8 +78,8 @@ class Window:
 def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: float, rng: np.random.Generator) -> Crop:
     """The ``count`` Feature Gaussians nearest to a random one, of which the share ``inner`` nearest to it is scored."""
     k, means = levels[int(rng.integers(len(levels)))], example.features.means
-    order = torch.argsort((means - means[int(rng.integers(len(means)))]).square().sum(1), stable=True)[:count]
-    near, close = torch.zeros(2, len(means), dtype=torch.bool)
+    order = np.argsort(np.square(means - means[rng.integers(len(means))]).sum(1), kind="stable")[:count]
+    near, close = np.zeros((2, len(means)), bool)
     near[order], close[order[: max(1, int(inner * len(order)))]] = True, True
     rows = _whole_clusters(example, near)
     return Crop(example, k, rows, close[rows])
@@ -115,14 +114,14 @@ def sample_window(
     while len(rows) > most and box.halved() != box:
         box = box.halved()
         rows = _rows(example, photo, box)
-    return Window(photo, box, Crop(example, k, rows, torch.ones(len(rows), dtype=torch.bool)))
+    return Window(photo, box, Crop(example, k, rows, np.ones(len(rows), bool)))
 
 
 def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
     """A whole photo, with all Feature Gaussians."""
     height, width = example.images.shape[1:3]
-    rows = torch.arange(len(example.features))
-    return Window(photo, Box(0, 0, width, height), Crop(example, k, rows, torch.ones(len(rows), dtype=torch.bool)))
+    rows = np.arange(len(example.features))
+    return Window(photo, Box(0, 0, width, height), Crop(example, k, rows, np.ones(len(rows), bool)))
 
 
 def _box_around(x: int, y: int, side: int, width: int, height: int) -> Box:
@@ -131,22 +130,22 @@ def _box_around(x: int, y: int, side: int, width: int, height: int) -> Box:
     return Box(min(max(0, x - w // 2), width - w), min(max(0, y - h // 2), height - h), w, h)
 
 
-def _rows(example: Example, photo: int, box: Box) -> Tensor:
+def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     """Ascending rows of the Feature Gaussians that reach into the window, or nearly do."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
     plan = plan_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
-    reached = torch.zeros(len(example.base), dtype=torch.bool)
-    reached[torch.from_numpy(plan.ids[np.unique(plan.members)].astype(np.int64))] = True
+    reached = np.zeros(len(example.base), bool)
+    reached[plan.ids[np.unique(plan.members)]] = True
     return _whole_clusters(example, reached)
 
 
-def _whole_clusters(example: Example, chosen: Tensor) -> Tensor:
+def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
     """Ascending rows of the ``chosen [g]`` Feature Gaussians, and of those that were fitted as one with them."""
     if example.matches is not None:
-        inside = torch.zeros(example.matches.count, dtype=torch.bool)
+        inside = np.zeros(example.matches.count, bool)
         inside[example.matches.clusters[chosen]] = True
         chosen = inside[example.matches.clusters]
-    return torch.nonzero(chosen)[:, 0]
+    return np.flatnonzero(chosen)
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import torch
 
 from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.render.photos import Photos
@@ -199,8 +198,8 @@ def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: 
     return replace(system, weights=list(weights), gains=gains)
 
 
-def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> torch.Tensor:
+def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> np.ndarray:
     """New sh0 within a little more than the range of colours, or where they were outside it, no farther out."""
-    before = 0.5 + SH_C0 * gaussians.sh0[:, 0].double().numpy()
+    before = 0.5 + SH_C0 * gaussians.sh0[:, 0].astype(np.float64)
     color = np.clip(before + offsets, np.minimum(before, -0.05), np.maximum(before, 1.05))
-    return torch.from_numpy((color - 0.5) / SH_C0).float()[:, None]
+    return ((color - 0.5) / SH_C0).astype(np.float32)[:, None]

@@ -16,7 +16,8 @@ import numpy as np
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.render import composite, plan_view, splat_adjoint
-from gsmerge.render.gradient import plan_gradients
+from gsmerge.render.blend import blend, view_colors
+from gsmerge.render.gradient import gradients_of
 from gsmerge.render.photos import Photos, render_photos
 from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.grow import grow_to
@@ -37,6 +38,7 @@ PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 
+NO_LOSS = np.empty((0, 0), np.float32)  # on the transmittance
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 Masks = tuple[np.ndarray, np.ndarray]  # of the photos at full and at half size, [v,h,w] bool
 Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
@@ -91,10 +93,11 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
         opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
     drawn = plan_view(state.splats, **photos.camera(view), opacities=opacities)
-    colors = state.view_colors()
-    image, transmittance = composite(drawn, colors, background)
+    all_colors = state.view_colors()
+    colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
+    image, transmittance = blend(drawn, colors, background)
     gradient, error = image_gradient(image, photos.images[view], weight, plan.options.ssim_lambda)
-    g = plan_gradients(drawn, gradient, image=image, transmittance=transmittance, colors=colors)
+    g = gradients_of(drawn, colors, image, transmittance, gradient, NO_LOSS, with_viewmat=False)
     rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
     g.opacities[:] += np.float32(plan.options.opacity_reg / count)
     g.scales[:] += np.float32(plan.options.scale_reg / count) / state.units[g.ids, None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
@@ -58,7 +57,7 @@ def grow(state: State, photos: Photos, count: int) -> State:
     parents, rows = state.x[picked], np.arange(num)
     longest = parents[:, SIZE:QUAT].argmax(1)
     reach = OFFSET * np.exp(parents[rows, SIZE + longest])
-    rotations = quat_to_rotmat(torch.from_numpy(parents[:, QUAT:LOGIT])).numpy()
+    rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
     shift = rotations[rows, :, longest] * reach[:, None]
     halves = parents.copy()
     halves[rows, SIZE + longest] += 0.5 * np.log(1 - OFFSET**2)

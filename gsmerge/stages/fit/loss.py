@@ -7,16 +7,17 @@ quick to differentiate, so its values differ from the measured ones of :func:`gs
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy import float32 as f4
-from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.image_loss import C1, C2
 from gsmerge.runtime.threads import parallel_map, use_threads
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LOSS_WINDOW = image_loss.SIDE  # pixels per side of the windows of loss_ssim
 
@@ -26,6 +27,9 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
 
     Uniform windows of 7 x 7 pixels, zero beyond the border, population covariances, K1 = .01, K2 = .03.
     """
+    import torch
+    from torch.nn.functional import avg_pool2d
+
     stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
     mx, my, xx, yy, xy = avg_pool2d(stacked, LOSS_WINDOW, 1, LOSS_WINDOW // 2).permute(0, 2, 3, 1)
     c1, c2 = float(C1), float(C2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from gsmerge.render import contributions, plan_view, prepare
 from gsmerge.render.photos import Photos, photo_errors
@@ -54,10 +53,10 @@ def fit(
     """
     device = _device(options, photos[0])
     if device != "cpu":
-        from gsmerge.gpu.fit import fit_gaussians  # it stands above all stages, and is loaded where it is used alone
+        from gsmerge.gpu.fit import fit_gaussians  # torch; it stands above all stages, and is loaded for its use alone
 
         return fit_gaussians(
-            gaussians, photos, options, count, seed, progress, baseline_start, exact=exact, device=torch.device(device)
+            gaussians, photos, options, count, seed, progress, baseline_start, exact=exact, device=device
         )
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
@@ -90,7 +89,7 @@ def _device(options: FitOptions, photos: Photos) -> str:
     return chosen_device(options.device, len(photos) * photos.height * photos.width)
 
 
-def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> torch.Tensor:
+def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
     """``[n]`` mask of the Gaussians worth keeping.
 
     Args:
@@ -108,7 +107,7 @@ def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> tor
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
-    return torch.from_numpy(~inside | (peak >= min_weight))
+    return ~inside | (peak >= min_weight)
 
 
 def _better_of(

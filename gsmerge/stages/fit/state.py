@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.render import Splats
@@ -47,13 +46,13 @@ class State:
 def start_state(gaussians: Gaussians) -> State:
     """A fresh state at some Gaussians."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
-    opacities = gaussians.opacities.double().numpy().clip(0.004, 0.999)
-    x[:, :3] = gaussians.means.numpy()
-    x[:, SIZE:QUAT] = np.log(gaussians.scales.numpy().clip(1e-9))
-    x[:, QUAT:LOGIT] = gaussians.quats.numpy()
+    opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
+    x[:, :3] = gaussians.means
+    x[:, SIZE:QUAT] = np.log(gaussians.scales.clip(1e-9))
+    x[:, QUAT:LOGIT] = gaussians.quats
     x[:, LOGIT] = np.log(opacities / (1 - opacities))
-    x[:, COLOR:] = 0.5 + SH_C0 * gaussians.sh0[:, 0].numpy()
-    return state_of(x, gaussians.shN.numpy())
+    x[:, COLOR:] = 0.5 + SH_C0 * gaussians.sh0[:, 0]
+    return state_of(x, gaussians.shN)
 
 
 def state_of(x: np.ndarray, shN: np.ndarray) -> State:
@@ -75,12 +74,11 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:
     """The Gaussians that parameters ``[n,14]`` stand for."""
-    tensor = torch.from_numpy
     return Gaussians(
-        means=tensor(x[:, :3].copy()),
-        quats=tensor(x[:, QUAT:LOGIT].copy()),
-        scales=tensor(np.exp(x[:, SIZE:QUAT])),
-        opacities=tensor(1 / (1 + np.exp(-x[:, LOGIT]))),
-        sh0=tensor((x[:, COLOR:] - 0.5) / SH_C0).float()[:, None],
-        shN=tensor(shN.copy()),
+        means=x[:, :3].copy(),
+        quats=x[:, QUAT:LOGIT].copy(),
+        scales=np.exp(x[:, SIZE:QUAT]),
+        opacities=1 / (1 + np.exp(-x[:, LOGIT])),
+        sh0=((x[:, COLOR:] - 0.5) / SH_C0)[:, None],
+        shN=shN.copy(),
     )

@@ -7,8 +7,8 @@ with the kernels of segmentation and merging, this with those that come last. Bo
 from __future__ import annotations
 
 import numpy as np
-import torch
 
+from gsmerge.geometry import normalize
 from gsmerge.render.photos import EPS2D, Photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.fit import FitOptions, fit
@@ -17,14 +17,14 @@ from gsmerge.types import Gaussians
 
 def compile_fit_kernels() -> None:
     """Fit a handful of Gaussians to grey pictures."""
-    count, generator = 24, torch.Generator().manual_seed(0)
+    count, rng = 24, np.random.default_rng(0)
     gaussians = Gaussians(
-        means=torch.rand(count, 3, generator=generator) + torch.tensor([-0.5, -0.5, 1.5]),
-        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1),
-        scales=torch.full((count, 3), 0.1),
-        opacities=torch.full((count,), 0.5),
-        sh0=torch.zeros(count, 1, 3),
-        shN=torch.zeros(count, 0, 3),
+        means=rng.random((count, 3), np.float32) + np.array([-0.5, -0.5, 1.5], np.float32),
+        quats=normalize(rng.standard_normal((count, 4), np.float32)),
+        scales=np.full((count, 3), 0.1, np.float32),
+        opacities=np.full(count, 0.5, np.float32),
+        sh0=np.zeros((count, 1, 3), np.float32),
+        shN=np.zeros((count, 0, 3), np.float32),
     )
     K = np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]])
     photos = tuple(
@@ -36,7 +36,7 @@ def compile_fit_kernels() -> None:
         )
         for size in (32, 16)
     )
-    with use_threads(1), torch.no_grad():
+    with use_threads(1):
         fit(gaussians, (photos[0], photos[1]), FitOptions(), count=2 * count)
 
 

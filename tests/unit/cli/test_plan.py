@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 
 from gsmerge import Cameras, CompactOptions, Gaussians, PixelScene
 from gsmerge.cli.plan import plan_document, plan_lines
@@ -19,10 +19,10 @@ def plan(*, photos: bool = True, views: int = 12, **settings: Any) -> dict[str, 
     n = views * HEIGHT * WIDTH
     sizes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, 0, 3))
     scene = PixelScene(
-        gaussians=Gaussians(*(torch.zeros(size) for size in sizes)),
-        cameras=Cameras(torch.eye(4).expand(views, 4, 4), torch.eye(3).expand(views, 3, 3), WIDTH, HEIGHT),
-        images=torch.zeros(*shape, 3) if photos else None,
-        valid=torch.ones(shape, dtype=torch.bool),
+        gaussians=Gaussians(*(np.zeros(size, np.float32) for size in sizes)),
+        cameras=Cameras(np.tile(np.eye(4), (views, 1, 1)), np.tile(np.eye(3), (views, 1, 1)), WIDTH, HEIGHT),
+        images=np.zeros((*shape, 3), np.float32) if photos else None,
+        valid=np.ones(shape, bool),
         names=tuple(map(str, range(views))),
     )
     options = CompactOptions().with_settings({"superpixels": 800, "threads": 2} | settings)

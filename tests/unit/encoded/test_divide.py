@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 from learned import Made, made
 
 from gsmerge.encoded.divide import divide_all, pick_children
@@ -22,7 +21,7 @@ MOST = 8
 @pytest.fixture(scope="module")
 def scene() -> Made:
     actual = made()
-    backing = torch.arange(len(actual.features)) % 7 == 3
+    backing = np.arange(len(actual.features)) % 7 == 3
     return replace(actual, features=replace(actual.features, backing=backing))
 
 
@@ -34,7 +33,7 @@ def division(scene: Made) -> Division:
 def picked(features: FeatureGaussians, division: Division, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     rows, parents = pick_children(division, counts)
     every = Gaussians.concat([feature_to_gaussians(features), division.children])
-    return every[torch.from_numpy(rows)], parents
+    return every[rows], parents
 
 
 @pytest.mark.parametrize("k", range(1, MOST + 1))
@@ -55,12 +54,12 @@ def test_any_counts_give_the_stage_s_children(seed: int, scene: Made, division: 
 
 @pytest.mark.parametrize("extra", [0, 1, 17, 10_000])
 def test_deals_are_those_of_a_budget(extra: int, scene: Made, division: Division) -> None:
-    dealt = np.bincount(division.growth_order.numpy()[:extra], minlength=len(scene.features))
+    dealt = np.bincount(division.growth_order[:extra], minlength=len(scene.features))
     np.testing.assert_array_equal(1 + dealt, split_counts(scene.features, scene.members, extra))
 
 
 def test_groups_that_cannot_be_divided_are_whole(scene: Made, division: Division) -> None:
-    single = np.flatnonzero((np.diff(scene.features.starts.numpy()) == 1) & ~scene.features.backing.numpy())
+    single = np.flatnonzero((np.diff(scene.features.starts) == 1) & ~scene.features.backing)
     assert len(single) > 3
     assert set(single) <= set(division.uniform.tolist())
     assert not division.splits[division.uniform].any()
@@ -83,7 +82,7 @@ def test_no_groups(scene: Made) -> None:
 
 
 def test_a_backing_layer_alone(scene: Made) -> None:
-    features = replace(scene.features, backing=torch.ones(len(scene.features), dtype=torch.bool))
+    features = replace(scene.features, backing=np.ones(len(scene.features), dtype=bool))
     division = divide_all(features, scene.members, MOST, "depth")
     rows, _ = pick_children(division, np.full(len(features), 4))
     np.testing.assert_array_equal(rows, np.arange(len(features)))

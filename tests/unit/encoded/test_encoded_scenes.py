@@ -57,6 +57,12 @@ def test_one_encoding_gives_every_k(k: int, pixels: PixelScene, encoded: Encoded
     assert scenes.identical(decode_scene(encoded, k=k), unfitted(pixels, k=k))
 
 
+def test_tensors_too(pixels: PixelScene, encoded: Encoded) -> None:
+    given = replace(pixels, gaussians=pixels.gaussians.to("cpu"), cameras=pixels.cameras.to("cpu"))
+    actual = encode_scene(given, superpixels=SHARE)
+    assert scenes.identical(decode_scene(actual), decode_scene(encoded))
+
+
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_one_encoding_gives_every_k_without_photos(k: int, bare: PixelScene, encoded_bare: Encoded) -> None:
     assert encoded_bare.settings.min_contribution == 0

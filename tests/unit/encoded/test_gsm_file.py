@@ -7,12 +7,12 @@ import pickle
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import scenes
-import torch
 from learned import noisy, written
-from safetensors.torch import load_file, save_file
-from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
+from safetensors.numpy import load_file, save_file
+from spoils import Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
 
 from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
 from gsmerge.encoded.gsm_file import ENCODED
@@ -32,7 +32,7 @@ def path(encoded: Encoded, tmp_path: Path) -> Path:
     return tmp_path / "scene.gsm"
 
 
-TENSORS = (
+ARRAYS = (
     *(f"features.{name}" for name in ("means", "covars", "masses", "latents", "views", "backing", "sh0", "shN")),
     *("division.splits", "division.slots", "division.whole", "division.deals", "division.quats", "division.shN"),
     *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "heads.views", "heads.group"),
@@ -71,26 +71,26 @@ DAMAGED: dict[str, Spoil] = {
     "a share that is none": with_settings(prune=float("nan")),
     "a negative number": with_settings(wanted=-1),
     "a knee of words": with_settings(knee="knee"),
-    "slots beyond the children": with_tensor("division.slots", lambda t: t + 8),
-    "more splits than slots": with_tensor("division.splits", lambda t: t + 1),
-    "fewer slots": with_tensor("division.slots", lambda t: t[1:].clone()),
-    "deals to nobody": with_tensor("division.deals", filled(10_000_000)),
-    "deals to one": with_tensor("division.deals", torch.zeros_like),
-    "negative deals": with_tensor("division.deals", filled(-1)),
-    "wholes beyond": with_tensor("division.whole", lambda t: torch.full((1,), 10_000_000, dtype=torch.int32)),
-    "wholes that are split": with_tensor("division.whole", lambda t: torch.zeros(1, dtype=torch.int32)),
-    "views beyond": with_tensor("heads.views", filled(3)),
-    **{f"no {name}": with_tensor(name, None) for name in TENSORS},
+    "slots beyond the children": with_array("division.slots", lambda a: a + 8),
+    "more splits than slots": with_array("division.splits", lambda a: a + 1),
+    "fewer slots": with_array("division.slots", lambda a: a[1:]),
+    "deals to nobody": with_array("division.deals", filled(10_000_000)),
+    "deals to one": with_array("division.deals", np.zeros_like),
+    "negative deals": with_array("division.deals", filled(-1)),
+    "wholes beyond": with_array("division.whole", lambda _: np.full(1, 10_000_000, np.int32)),
+    "wholes that are split": with_array("division.whole", lambda _: np.zeros(1, np.int32)),
+    "views beyond": with_array("heads.views", filled(3)),
+    **{f"no {name}": with_array(name, None) for name in ARRAYS},
     **{
-        f"{name} of doubles": with_tensor(name, lambda t: t.float() if t.dtype == torch.float64 else t.double())
-        for name in TENSORS
+        f"{name} of doubles": with_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64))
+        for name in ARRAYS
     },
-    **{f"{name} of another shape": with_tensor(name, lambda t: t[None].clone()) for name in TENSORS},
+    **{f"{name} of another shape": with_array(name, lambda a: a[None]) for name in ARRAYS},
     **{
-        f"NaN in {name}": with_tensor(name, filled(float("nan")))
+        f"NaN in {name}": with_array(name, filled(float("nan")))
         for name in ("features.covars", "division.means", "cameras.Ks", "frame.origin", "heads.group")
     },
-    "infinity in features.means": with_tensor("features.means", filled(float("inf"))),
+    "infinity in features.means": with_array("features.means", filled(float("inf"))),
 }
 
 
@@ -101,8 +101,8 @@ def test_everything_comes_back(path: Path, encoded: Encoded) -> None:
     assert actual.about == json.loads(json.dumps(encoded.about))
     assert len(actual) == len(encoded)
     assert actual.heads is not None
-    for name, tensor in vars(encoded.features).items():
-        assert torch.equal(getattr(actual.features, name), tensor), name
+    for name, column in vars(encoded.features).items():
+        np.testing.assert_array_equal(getattr(actual.features, name), column, name)
     for k in (1, 2, 4):
         assert scenes.identical(decode_scene(actual, k=k), decode_scene(encoded, k=k))
 
@@ -128,11 +128,11 @@ def test_the_source_is_told(encoded: Encoded, tmp_path: Path) -> None:
 
 
 def test_what_is_not_known_is_not_looked_at(path: Path, encoded: Encoded) -> None:
-    said, tensors = header(path), load_file(path)
-    tensors["features.moods"], tensors["state.views"] = torch.full((7,), float("nan")), torch.zeros(3)
+    said, arrays = header(path), load_file(path)
+    arrays["features.moods"], arrays["state.views"] = np.full(7, np.nan), np.zeros(3)
     said |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # older versions wrote a precision
     said["settings"]["mood"] = "better"
-    save_file(tensors, path, {ENCODED: json.dumps(said), "mood": "best"})
+    save_file(arrays, path, {ENCODED: json.dumps(said), "mood": "best"})
     assert scenes.identical(decode_scene(load_encoded(path)), decode_scene(encoded))
 
 

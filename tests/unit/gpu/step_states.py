@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from gsmerge.gpu.adam import FitState, Gradients, _step_in_torch, state_of
+from gsmerge.gpu.adam import FitState, Gradients, state_of, step_in_torch
 from gsmerge.stages.fit.full import step_sizes
 from gsmerge.stages.fit.options import FitOptions, LearningRates
 
@@ -58,7 +58,7 @@ def compare_triton() -> None:
     other, gradients = deepcopy(state), gradients_of(state)
     for step in (1, 2, 3):
         rates = torch.from_numpy(step_sizes(options.rates, 0.3, 8))
-        _step_in_torch(state, gradients, options, rates, step)
+        step_in_torch(state, gradients, options, rates, step)
         adam_kernel.launch(other, gradients, options, rates, step)
         for name in ("x", "m", "v", "means", "quats", "scales", "opacities", "colors"):
             torch.testing.assert_close(getattr(other, name), getattr(state, name), rtol=1e-4, atol=1e-5, msg=name)

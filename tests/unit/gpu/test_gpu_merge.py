@@ -15,7 +15,7 @@ from gsmerge.gpu import match as gpu_match
 from gsmerge.gpu import pool as gpu_pool
 from gsmerge.gpu.axes import features_to_shapes, principal_axes
 from gsmerge.gpu.runs import group_rows, middle_of_runs, smallest_by_part
-from gsmerge.gpu.scene import Features, download_features, download_gaussians, upload_features, upload_members
+from gsmerge.gpu.scene import Features, download_features, download_gaussians, to_device, upload_members
 from gsmerge.kernels.gaussians.cluster import leader_clusters
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
 from gsmerge.moments import principal_axes as axes_of
@@ -36,11 +36,11 @@ CPU = torch.device("cpu")
 def scene() -> PixelScene:
     """Four views of which some pixels have no Gaussian, with harmonics."""
     made = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30, span=0.2), noise=0.004, degree=1)
-    valid = made.valid.clone()
+    valid = made.valid.copy()
     valid[0, :9, :11] = False
-    opacities = made.gaussians.opacities.clone()
+    opacities = made.gaussians.opacities.copy()
     opacities[1300:1420] = 0.0
-    quats = made.gaussians.quats.clone()
+    quats = made.gaussians.quats.copy()
     quats[77] = 0.0
     gaussians = replace(made.gaussians, opacities=opacities, quats=quats)
     return canonicalise(replace(made, valid=valid, gaussians=gaussians))[0]
@@ -60,6 +60,11 @@ def groups(scene: PixelScene) -> Groups:
 @pytest.fixture(scope="module")
 def features(scene: PixelScene, members: Members, groups: Groups) -> FeatureGaussians:
     return encode(scene, members, groups, EncodeOptions())
+
+
+def upload(features: FeatureGaussians) -> Features:
+    """What a stage of the CPU made, for the functions of a device."""
+    return Features(*(to_device(getattr(features, f.name), CPU) for f in fields(Features)))
 
 
 def same(ours: Features, expected: FeatureGaussians, rtol: float = 1e-5) -> None:
@@ -133,13 +138,13 @@ def test_neighbours_are_the_nearest(features: FeatureGaussians, monkeypatch: pyt
 )
 def test_clusters_are_the_kernels(features: FeatureGaussians, options: dict) -> None:
     settings = MatchOptions(**options)
-    clusters, count = gpu_match.match(upload_features(features, CPU), settings)
+    clusters, count = gpu_match.match(upload(features), settings)
     expected = match(features, settings)
     assert count == expected.count
     np.testing.assert_array_equal(clusters, expected.clusters)
     if settings.method != "none":
         assert count < len(features) * 0.9
-        same(gpu_match.merge(upload_features(features, CPU), clusters, count), merge(features, expected), rtol=1e-4)
+        same(gpu_match.merge(upload(features), clusters, count), merge(features, expected), rtol=1e-4)
 
 
 def test_rounds_of_leaders_are_the_greedy_order() -> None:
@@ -167,9 +172,7 @@ def merged(features: FeatureGaussians) -> FeatureGaussians:
 @pytest.mark.parametrize("k", [1, 2, 3, 8])
 def test_children_are_the_stages(merged: FeatureGaussians, members: Members, k: int) -> None:
     options = DecodeOptions(k=k)
-    ours = download_gaussians(
-        gpu_decode.decode(upload_features(merged, CPU), upload_members(members, CPU), options, None)
-    )
+    ours = download_gaussians(gpu_decode.decode(upload(merged), upload_members(members, CPU), options, None))
     expected = decode(merged, members, options)
     assert len(ours) == len(expected)
     for name in ("means", "scales", "opacities", "sh0", "shN"):
@@ -178,7 +181,7 @@ def test_children_are_the_stages(merged: FeatureGaussians, members: Members, k: 
 
 
 def test_more_gaussians_go_where_the_stage_spends_them(merged: FeatureGaussians, members: Members) -> None:
-    device = upload_features(merged, CPU), upload_members(members, CPU)
+    device = upload(merged), upload_members(members, CPU)
     for extra in (0, 1, 40, 10_000):
         np.testing.assert_array_equal(gpu_decode.split_counts(*device, extra), split_counts(merged, members, extra))
     count = len(merged) + 40
@@ -187,20 +190,20 @@ def test_more_gaussians_go_where_the_stage_spends_them(merged: FeatureGaussians,
 
 def test_members_that_are_alike_are_not_divided(merged: FeatureGaussians, members: Members) -> None:
     alike = replace(members, means=np.zeros_like(members.means), sh0=np.zeros_like(members.sh0))
-    few = upload_features(merged, CPU)
+    few = upload(merged)
     counts = torch.full((len(few),), 4)
     assert len(gpu_decode.divide(few, upload_members(alike, CPU), counts)) == len(few)
 
 
 def test_one_gaussian_each(merged: FeatureGaussians) -> None:
-    ours, expected = features_to_shapes(upload_features(merged, CPU)), feature_to_gaussians(merged)
+    ours, expected = features_to_shapes(upload(merged)), feature_to_gaussians(merged)
     torch.testing.assert_close(ours.scales, torch.as_tensor(expected.scales), rtol=1e-5, atol=0)
     torch.testing.assert_close(ours.opacities, torch.as_tensor(expected.opacities), rtol=1e-5, atol=1e-7)
 
 
 def test_there_and_back(merged: FeatureGaussians) -> None:
-    back = download_features(upload_features(merged, CPU))
-    same(upload_features(back, CPU), merged, rtol=0)
+    back = download_features(upload(merged))
+    same(upload(back), merged, rtol=0)
 
 
 def test_nothing_to_do() -> None:

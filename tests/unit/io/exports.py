@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms
 
@@ -44,9 +43,9 @@ def smooth_scene(width: int, height: int) -> Smooth:
     n = 3 * width * height
     gaussians = replace(
         tiny.gaussians,
-        means=torch.from_numpy(np.concatenate(means)).float(),
-        scales=torch.tensor([0.03, 0.03, 0.03]).repeat(n, 1),
-        sh0=(torch.from_numpy(np.stack(images).reshape(n, 1, 3) / 255.0).float() - 0.5) / SH_C0,
+        means=np.concatenate(means).astype(np.float32),
+        scales=np.full((n, 3), 0.03, np.float32),
+        sh0=((np.stack(images).reshape(n, 1, 3) / 255.0).astype(np.float32) - 0.5) / SH_C0,
     )
     return Smooth(c2w, tiny.K, width, height, np.stack(images), gaussians, tiny.names, np.stack(depths))
 
@@ -54,11 +53,11 @@ def smooth_scene(width: int, height: int) -> Smooth:
 def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
     """The same pixels and depths, seen through another lens."""
     means = []
-    for pose, points in zip(tiny.c2w, tiny.gaussians.means.double().numpy().reshape(3, -1, 3), strict=True):
+    for pose, points in zip(tiny.c2w, tiny.gaussians.means.astype(np.float64).reshape(3, -1, 3), strict=True):
         camera = (points - pose[:3, 3]) @ pose[:3, :3]
         rays = camera @ tiny.K.T @ np.linalg.inv(K).T
         means.append(rays @ pose[:3, :3].T + pose[:3, 3])
-    moved = torch.from_numpy(np.concatenate(means)).float()
+    moved = np.concatenate(means).astype(np.float32)
     return replace(tiny, K=K, gaussians=replace(tiny.gaussians, means=moved))
 
 
@@ -73,18 +72,18 @@ def depth_map_mask(depth: np.ndarray) -> np.ndarray:
 
 def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, normals: str = "f4") -> np.ndarray:
     """The scene's Gaussians, those of ``index`` in its order, as the 17 columns of nearly all exporters."""
-    g = tiny.gaussians if index is None else tiny.gaussians[torch.from_numpy(np.ascontiguousarray(index))]
+    g = tiny.gaussians if index is None else tiny.gaussians[np.ascontiguousarray(index)]
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest)),
              "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
     names = [name for name in names if normals or name[0] != "n"]
     rows = np.zeros(len(g), [(name, normals if name[0] == "n" else "f4") for name in names])
-    columns: dict[str, Any] = {"opacity": torch.logit(g.opacities)}
+    columns: dict[str, Any] = {"opacity": np.log(g.opacities / (1 - g.opacities))}
     columns |= {name: g.means[:, i] for i, name in enumerate("xyz")}
     columns |= {f"f_dc_{i}": g.sh0[:, 0, i] for i in range(3)}
-    columns |= {f"scale_{i}": g.scales[:, i].log() for i in range(3)}
+    columns |= {f"scale_{i}": np.log(g.scales[:, i]) for i in range(3)}
     columns |= {f"rot_{i}": g.quats[:, i] for i in range(4)}
     for name, values in columns.items():
-        rows[name] = values.numpy()
+        rows[name] = values
     return rows
 
 
@@ -104,7 +103,7 @@ def turned(
         out[f"scale_{i}"] = rows[f"scale_{i}"] + np.log(scale)
     if rotate_quats:
         quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
-        moved = wxyz_of(turn @ quat_to_rotmat(torch.from_numpy(quats)).double().numpy())
+        moved = wxyz_of(turn @ quat_to_rotmat(quats).astype(np.float64))
         for i in range(4):
             out[f"rot_{i}"] = moved[:, i]
     return out
@@ -124,7 +123,7 @@ def wxyz_of(matrices: np.ndarray) -> np.ndarray:
 def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> Tiny:
     """Discs that lie in the surface, with rotations to the world or to each view's camera."""
     h, w = tiny.height, tiny.width
-    grid = tiny.gaussians.means.double().numpy().reshape(3, h, w, 3)
+    grid = tiny.gaussians.means.astype(np.float64).reshape(3, h, w, 3)
     across, down = np.gradient(grid, axis=2), np.gradient(grid, axis=1)
     across = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in across])
     down = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in down])
@@ -135,8 +134,8 @@ def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> T
     frames = np.stack([first, np.cross(normal, first), normal], -1)
     if relative_to_camera:
         frames = tiny.c2w[:, None, None, :3, :3].swapaxes(-1, -2) @ frames
-    quats = torch.from_numpy(wxyz_of(frames.reshape(-1, 3, 3))).float()
-    scales = torch.tensor([0.04, 0.03, 0.005]).repeat(len(quats), 1)
+    quats = wxyz_of(frames.reshape(-1, 3, 3)).astype(np.float32)
+    scales = np.tile(np.array([0.04, 0.03, 0.005], np.float32), (len(quats), 1))
     return replace(tiny, gaussians=replace(tiny.gaussians, quats=quats, scales=scales))
 
 

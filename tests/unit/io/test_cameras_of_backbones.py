@@ -18,13 +18,13 @@ VIEWS = 3
 def truth() -> tuple[np.ndarray, np.ndarray]:
     """World-to-camera matrices and intrinsics."""
     cameras = scenes.arc(VIEWS, 28, 14)
-    return cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
+    return cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
 
 def assert_equal(path: Path, viewmats: np.ndarray, Ks: np.ndarray) -> None:
     actual = read_cameras(path)
-    np.testing.assert_allclose(actual.viewmats.numpy(), viewmats, atol=1e-9)
-    np.testing.assert_allclose(actual.Ks.numpy(), Ks, atol=1e-9)
+    np.testing.assert_allclose(actual.viewmats, viewmats, atol=1e-9)
+    np.testing.assert_allclose(actual.Ks, Ks, atol=1e-9)
 
 
 def entries(matrices: np.ndarray) -> list[dict[str, object]]:
@@ -85,7 +85,7 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path, truth: tuple[np.ndarr
     actual = read_cameras(path)
     point = np.array([0.2, -0.1, 3.0, 1.0])
     moved = np.append(1.35 * (move @ point)[:3], 1.0)
-    for view, viewmat in zip((2, 0), actual.viewmats.numpy(), strict=True):
+    for view, viewmat in zip((2, 0), actual.viewmats, strict=True):
         seen, truly = (viewmat @ moved)[:3], (viewmats[view] @ point)[:3]
         np.testing.assert_allclose(seen, 1.35 * truly, atol=1e-9)
     assert actual.names == ("2.png", "0.png")

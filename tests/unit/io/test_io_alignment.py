@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge.io import check_alignment
@@ -14,12 +13,12 @@ from gsmerge.types import Cameras
 
 
 def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
-    w2c = torch.from_numpy(tiny.w2c if viewmats is None else viewmats)
-    return Cameras(w2c, torch.from_numpy(np.tile(tiny.K, (3, 1, 1))), tiny.width, tiny.height)
+    w2c = tiny.w2c if viewmats is None else viewmats
+    return Cameras(w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
 
 
-def valid_of(tiny: Tiny) -> torch.Tensor:
-    return torch.ones(3, tiny.height, tiny.width, dtype=torch.bool)
+def valid_of(tiny: Tiny) -> np.ndarray:
+    return np.ones((3, tiny.height, tiny.width), bool)
 
 
 def test_a_scene_aligned_with_jitter(tiny: Tiny) -> None:
@@ -33,7 +32,7 @@ def test_a_scene_aligned_with_jitter(tiny: Tiny) -> None:
 
 def test_a_known_shift_is_measured(tiny: Tiny) -> None:
     moved = cameras_of(tiny)
-    Ks = moved.Ks.clone()
+    Ks = moved.Ks.copy()
     Ks[1, 0, 2] += 3
     actual = check_alignment(tiny.gaussians, replace(moved, Ks=Ks), valid_of(tiny))
     assert not actual.ok
@@ -43,7 +42,7 @@ def test_a_known_shift_is_measured(tiny: Tiny) -> None:
 
 
 def test_rows_that_are_set_aside_do_not_count(tiny: Tiny) -> None:
-    means, valid = tiny.gaussians.means.clone(), valid_of(tiny).reshape(-1)
+    means, valid = tiny.gaussians.means.copy(), valid_of(tiny).reshape(-1)
     means[: len(means) // 2] += 100
     valid[: len(means) // 2] = False
     actual = check_alignment(replace(tiny.gaussians, means=means), cameras_of(tiny), valid)
@@ -63,7 +62,7 @@ def test_large_views_are_sampled_in_all_columns() -> None:
     tiny = make_tiny(200, 250)
     actual = check_alignment(tiny.gaussians, cameras_of(tiny), valid_of(tiny))
     assert actual.ok
-    means = tiny.gaussians.means.reshape(3, 250, 200, 3).clone()
+    means = tiny.gaussians.means.reshape(3, 250, 200, 3).copy()
     means[:, :, 1::2] += 50  # every other column: a step of two pixels would miss it
     odd = check_alignment(replace(tiny.gaussians, means=means.reshape(-1, 3)), cameras_of(tiny), valid_of(tiny))
     assert odd.share_within_1px == pytest.approx(0.5, abs=0.02)
@@ -72,7 +71,7 @@ def test_large_views_are_sampled_in_all_columns() -> None:
 def test_tiny_views_are_not_aligned_by_being_tiny(tiny: Tiny) -> None:
     small = make_tiny(6, 5)
     assert check_alignment(small.gaussians, cameras_of(small), valid_of(small)).ok
-    shuffled = small.gaussians[torch.randperm(len(small.gaussians), generator=torch.Generator().manual_seed(0))]
+    shuffled = small.gaussians[np.random.default_rng(0).permutation(len(small.gaussians))]
     assert not check_alignment(shuffled, cameras_of(small), valid_of(small)).ok
 
 
@@ -103,7 +102,7 @@ def test_conventions_are_inverse_to_each_other(tiny: Tiny) -> None:
 def test_other_readings_are_named(tiny: Tiny) -> None:
     good, valid, n = cameras_of(tiny), valid_of(tiny), len(tiny.gaussians)
 
-    def explain(cameras: Cameras = good, rows: torch.Tensor | None = None) -> str | None:
+    def explain(cameras: Cameras = good, rows: np.ndarray | None = None) -> str | None:
         gaussians = tiny.gaussians if rows is None else tiny.gaussians[rows]
         assert not check_alignment(gaussians, cameras, valid).ok
         return explain_misalignment(gaussians, cameras, valid, W2C_OPENCV)
@@ -123,8 +122,8 @@ def test_other_readings_are_named(tiny: Tiny) -> None:
     assert "rotations transposed" in explain(cameras_of(tiny, transposed))
     assert "width and height swapped" in explain(replace(good, width=tiny.height, height=tiny.width))
 
-    rows = torch.arange(n).reshape(3, tiny.height, tiny.width)
-    assert "view fastest" in explain(rows=rows.permute(1, 2, 0).reshape(-1))
-    assert "column-major" in explain(rows=rows.permute(0, 2, 1).reshape(-1))
-    assert "reverse order" in explain(rows=rows.flip(0).reshape(-1))
-    assert explain(rows=torch.randperm(n, generator=torch.Generator().manual_seed(0))) is None
+    rows = np.arange(n).reshape(3, tiny.height, tiny.width)
+    assert "view fastest" in explain(rows=rows.transpose(1, 2, 0).reshape(-1))
+    assert "column-major" in explain(rows=rows.transpose(0, 2, 1).reshape(-1))
+    assert "reverse order" in explain(rows=rows[::-1].reshape(-1))
+    assert explain(rows=np.random.default_rng(0).permutation(n)) is None

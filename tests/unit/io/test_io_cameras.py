@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from tiny_scene import (
     FLIP,
     Tiny,
@@ -25,7 +24,7 @@ from gsmerge.io import CameraFile, read_cameras, to_cameras
 
 
 def assert_same(actual: CameraFile, tiny: Tiny, *, K: np.ndarray | None = None, atol: float = 1e-9) -> None:
-    assert actual.viewmats.dtype == actual.Ks.dtype == torch.float64
+    assert actual.viewmats.dtype == actual.Ks.dtype == np.float64
     assert np.allclose(actual.viewmats, tiny.w2c, atol=atol)
     assert np.allclose(actual.Ks, tiny.K if K is None else K, atol=atol * 100)
     assert actual.widths.tolist() == [tiny.width] * 3
@@ -322,7 +321,7 @@ def test_axes_by_hand(tmp_path: Path) -> None:
     frame = {"file_path": "a", "transform_matrix": pose.tolist()}
     data = {"fl_x": 10, "cx": 5, "cy": 5, "w": 10, "h": 10, "frames": [frame]}
     cameras = to_cameras(read_cameras(save_json(tmp_path / "transforms.json", data)))
-    point = cameras.viewmats[0] @ torch.tensor([1.0, 2.0, 0.0, 1.0], dtype=torch.float64)
+    point = cameras.viewmats[0] @ np.array([1.0, 2.0, 0.0, 1.0], np.float64)
     assert point.tolist() == [1.0, -2.0, 5.0, 1.0]  # right stays right, up becomes -y, 5 in front
     assert np.allclose(cameras.viewmats[0], FLIP @ np.linalg.inv(pose))
-    assert cv2.Rodrigues(cameras.viewmats[0, :3, :3].numpy())[0][0, 0] == pytest.approx(np.pi)
+    assert cv2.Rodrigues(cameras.viewmats[0, :3, :3])[0][0, 0] == pytest.approx(np.pi)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from exports import Smooth, export_rows, save_export, smooth_scene, write_transforms
 from tiny_scene import make_tiny, write_images
 
@@ -20,9 +19,9 @@ from gsmerge.types import SH_C0, Cameras
 
 def clues_of(smooth: Smooth, images: np.ndarray | None, labellings: list[list[int]] | None = None) -> AlignmentInput:
     """Three cameras, the Gaussians and any photos."""
-    w2c, Ks = torch.from_numpy(smooth.w2c), torch.from_numpy(np.tile(smooth.K, (3, 1, 1)))
-    photos = None if images is None else torch.from_numpy(images).float() / 255
-    valid = torch.ones(len(smooth.gaussians), dtype=torch.bool)
+    w2c, Ks = smooth.w2c, np.tile(smooth.K, (3, 1, 1))
+    photos = None if images is None else images.astype(np.float32) / 255
+    valid = np.ones(len(smooth.gaussians), bool)
     cameras = Cameras(w2c, Ks, smooth.width, smooth.height)
     return AlignmentInput(smooth.gaussians, valid, cameras, photos, labellings or [[0, 1, 2]], lambda: None)
 
@@ -33,10 +32,10 @@ def twins() -> Smooth:
     tiny = smooth_scene(48, 36)
     c2w, size = tiny.c2w.copy(), 48 * 36
     c2w[1] = c2w[0]
-    means = tiny.gaussians.means.clone()
+    means = tiny.gaussians.means.copy()
     means[size : 2 * size] = means[:size]
     images = make_tiny(48, 36).images
-    colors = (torch.from_numpy(images.reshape(-1, 1, 3)).float() / 255 - 0.5) / SH_C0
+    colors = (images.reshape(-1, 1, 3).astype(np.float32) / 255 - 0.5) / SH_C0
     return replace(tiny, c2w=c2w, images=images, gaussians=replace(tiny.gaussians, means=means, sh0=colors))
 
 
@@ -76,7 +75,7 @@ def test_the_order_of_names_and_that_of_the_file(tmp_path: Path, twins: Smooth) 
     scene = load_scene(folder).pixel_scene()
     assert scene.names == ("images/a.png", "images/b.png", "images/c.png")
     base = 0.5 + SH_C0 * scene.gaussians.sh0.reshape(3, 36, 48, 3)
-    assert (base - scene.images).abs().max() < 0.01
+    assert np.abs(base - scene.images).max() < 0.01
 
 
 def test_colours_do_not_overrule_pixels() -> None:
@@ -91,7 +90,7 @@ def test_colours_do_not_overrule_pixels() -> None:
 def test_photos_that_agree_or_cannot_tell() -> None:
     tiny = smooth_scene(48, 36)
     flat = np.full_like(tiny.images, 128)
-    grey = replace(tiny, gaussians=replace(tiny.gaussians, sh0=torch.zeros_like(tiny.gaussians.sh0)))
+    grey = replace(tiny, gaussians=replace(tiny.gaussians, sh0=np.zeros_like(tiny.gaussians.sh0)))
     for scene, images, confirmed in ((tiny, tiny.images, True), (tiny, None, None), (grey, flat, None)):
         actual = recover(clues_of(scene, images))
         assert actual is not None
@@ -118,8 +117,8 @@ def test_a_plain_file_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     assert actual.runner_up is None
     assert actual.margin > SHUFFLED_MARGIN
     assert searched == []
-    order = torch.arange(len(tiny.gaussians)).reshape(3, -1).T.reshape(-1)
-    far = replace(plain.cameras, Ks=plain.cameras.Ks + torch.tensor([[0, 0, 0.7], [0, 0, 0], [0, 0, 0]]))
+    order = np.arange(len(tiny.gaussians)).reshape(3, -1).T.reshape(-1)
+    far = replace(plain.cameras, Ks=plain.cameras.Ks + np.array([[0, 0, 0.7], [0, 0, 0], [0, 0, 0]], np.float32))
     doubtful = (
         replace(plain, gaussians=plain.gaussians[order]),
         replace(plain, cameras=far),

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from tiny_scene import FLIP, Tiny, make_tiny, rotation
-from torch import Tensor
 
 from gsmerge.errors import SceneError
 from gsmerge.io import load_scene, read_cameras, read_held_out, views
@@ -57,8 +56,8 @@ def test_context_views_are_left_out_and_places_are_those_of_the_file(tiny: Tiny,
     targets = read_held_out(load, write_views(tmp_path / "all", poses, tiny))
     assert targets.names == ("images/held.png",)
     assert (targets.places, targets.context_places) == ((1,), (0, 2, 3))
-    assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0].numpy()), between(tiny), atol=1e-9)
-    assert np.allclose(targets.images[0].numpy(), 10 / 255)
+    assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0]), between(tiny), atol=1e-9)
+    assert np.allclose(targets.images[0], 10 / 255)
 
 
 def test_a_world_of_its_own_is_brought_to_the_scene_s(tiny: Tiny, tmp_path: Path) -> None:
@@ -74,7 +73,7 @@ def test_a_world_of_its_own_is_brought_to_the_scene_s(tiny: Tiny, tmp_path: Path
     poses["held"] = elsewhere(between(tiny))
     targets = read_held_out(load, write_views(tmp_path / "all", poses, tiny))
     assert targets.names == ("images/held.png",)
-    assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0].numpy()), between(tiny), atol=1e-6)
+    assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0]), between(tiny), atol=1e-6)
 
 
 def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, tmp_path: Path) -> None:
@@ -82,7 +81,7 @@ def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, tmp_path: Path) -> 
     targets = read_held_out(load, write_views(tmp_path / "held", {stems(tiny)[0]: between(tiny)}, tiny))
     assert len(targets) == 1
     assert targets.context_places is None
-    assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0].numpy()), between(tiny), atol=1e-9)
+    assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0]), between(tiny), atol=1e-9)
 
 
 @pytest.mark.parametrize("all_views", [False, True])
@@ -107,8 +106,8 @@ def flip_poses(path: Path) -> None:
     path.write_text(json.dumps(document))
 
 
-def assert_between(viewmat: Tensor, tiny: Tiny) -> None:
-    assert np.allclose(np.linalg.inv(viewmat.numpy()), between(tiny), atol=1e-6)
+def assert_between(viewmat: np.ndarray, tiny: Tiny) -> None:
+    assert np.allclose(np.linalg.inv(viewmat), between(tiny), atol=1e-6)
 
 
 def test_views_of_other_names_that_stand_in_the_same_place_are_no_targets(tiny: Tiny, tmp_path: Path) -> None:
@@ -123,7 +122,7 @@ def test_photos_of_another_size_bring_their_intrinsics(tiny: Tiny, tmp_path: Pat
     load = load_scene(tiny.save(tmp_path / "scene"))
     targets = read_held_out(load, write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (64, 48)))
     assert tuple(targets.images.shape) == (1, 48, 64, 3)
-    assert np.allclose(targets.cameras.Ks[0].numpy()[:2], 2 * tiny.K[:2])
+    assert np.allclose(targets.cameras.Ks[0][:2], 2 * tiny.K[:2])
 
 
 def test_photos_elsewhere(tiny: Tiny, tmp_path: Path) -> None:
@@ -193,5 +192,5 @@ def test_photos_beyond_all_memory_are_made_smaller(tiny: Tiny, tmp_path: Path, m
     monkeypatch.setattr(views, "_MAX_BYTES", 1 << 20)
     targets = read_held_out(load, cameras)
     assert targets.images.shape[2] == targets.cameras.width == 1200
-    assert np.allclose(targets.cameras.Ks[0].numpy()[:2], 1200 / tiny.width * tiny.K[:2])
+    assert np.allclose(targets.cameras.Ks[0][:2], 1200 / tiny.width * tiny.K[:2])
     assert "1600 x 1200" in targets.notes[0]

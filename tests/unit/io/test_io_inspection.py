@@ -4,8 +4,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-import torch
 from exports import smooth_scene
 from tiny_scene import Tiny
 
@@ -28,7 +28,7 @@ def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
     assert actual.alignment.ok
     assert actual.alignment_problem is None
     assert actual.notes == ()
-    low, high = (torch.quantile(tiny.gaussians.means, q, dim=0).tolist() for q in (0.01, 0.99))
+    low, high = (np.quantile(tiny.gaussians.means, q, axis=0).tolist() for q in (0.01, 0.99))
     assert actual.box_low == pytest.approx(low, abs=1e-4)
     assert actual.box_high == pytest.approx(high, abs=1e-4)
 
@@ -49,8 +49,7 @@ def test_a_ply_without_cameras(tmp_path: Path, tiny: Tiny) -> None:
 
 
 def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> None:
-    generator = torch.Generator().manual_seed(0)
-    some = torch.randperm(840, generator=generator)[:700]
+    some = np.random.default_rng(0).permutation(840)[:700]
     write_ply(tiny_folder / "scene.ply", tiny.gaussians[some], overwrite=True)
     actual = inspect(tiny_folder)
     assert actual.num_views == 3
@@ -63,7 +62,7 @@ def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> 
 
 
 def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
-    opacities, quats, scales = (getattr(tiny.gaussians, f).clone() for f in ("opacities", "quats", "scales"))
+    opacities, quats, scales = (getattr(tiny.gaussians, f).copy() for f in ("opacities", "quats", "scales"))
     opacities[:4], opacities[4:9] = 1, 0
     scales[3] = 1e14
     odd = replace(tiny.gaussians, opacities=opacities, quats=quats, scales=scales)
@@ -89,7 +88,7 @@ def test_an_unreadable_ply_is_an_error(tmp_path: Path) -> None:
 
 
 def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> None:
-    means, scales = tiny.gaussians.means.clone(), tiny.gaussians.scales.clone()
+    means, scales = tiny.gaussians.means.copy(), tiny.gaussians.scales.copy()
     means[:7] += 1000
     scales[:21, 1] = 50
     write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, means=means, scales=scales), overwrite=True)
@@ -98,8 +97,8 @@ def test_outliers_and_large_scales_are_shares(tiny_folder: Path, tiny: Tiny) -> 
     assert actual.share_huge == pytest.approx(21 / 840)
     assert actual.scale_max == pytest.approx(50)
     assert 0.01 < actual.scale_median < 0.11
-    low, high = (torch.tensor(side) for side in (actual.box_low, actual.box_high))
-    assert actual.diagonal == pytest.approx(float((high - low).norm()))
+    low, high = (np.array(side) for side in (actual.box_low, actual.box_high))
+    assert actual.diagonal == pytest.approx(float(np.linalg.norm(high - low)))
 
 
 def test_an_empty_or_single_point_has_extents(tiny: Tiny) -> None:
@@ -110,14 +109,14 @@ def test_an_empty_or_single_point_has_extents(tiny: Tiny) -> None:
 
 
 def test_coverage_per_view(tiny_folder: Path, tiny: Tiny) -> None:
-    opacities = tiny.gaussians.opacities.clone()
+    opacities = tiny.gaussians.opacities.copy()
     opacities[280:350] = 0
     write_ply(tiny_folder / "scene.ply", replace(tiny.gaussians, opacities=opacities), overwrite=True)
     actual = inspect(tiny_folder)
     assert [view.share_of_pixels for view in actual.coverage] == [1, 0.75, 1]
     assert [view.name for view in actual.coverage] == [f"images/{name}" for name in tiny.names]
     for view, w2c in zip(actual.coverage, tiny.w2c, strict=True):
-        image = (tiny.gaussians.means.double().numpy() @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
+        image = (tiny.gaussians.means.astype(np.float64) @ w2c[:3, :3].T + w2c[:3, 3]) @ tiny.K.T
         xy = image[:, :2] / image[:, 2:]
         inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < (20, 14)).all(1)
         assert view.share_of_gaussians == pytest.approx(inside.mean())
@@ -143,7 +142,7 @@ def test_what_compact_would_give(tiny_folder: Path, tmp_path: Path, tiny: Tiny) 
 
 def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     smooth = smooth_scene(40, 30)
-    some = torch.randperm(3600, generator=torch.Generator().manual_seed(0))[:2400]
+    some = np.random.default_rng(0).permutation(3600)[:2400]
     folder = replace(smooth, gaussians=smooth.gaussians[some]).save(tmp_path / "scene")
     actual = inspect(folder)
     assert actual.alignment_score is None

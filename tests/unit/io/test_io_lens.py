@@ -103,7 +103,7 @@ def test_photos_are_undistorted_and_it_is_said(tmp_path: Path, kind: str) -> Non
     assert np.allclose(scene.cameras.Ks, SMOOTH.K)
     inner = np.s_[:, 6:-6, 6:-6]
     before = np.abs(taken.images[inner].astype(float) - SMOOTH.images[inner]).mean()
-    after = np.abs(scene.images.numpy()[inner] * 255 - SMOOTH.images[inner]).mean()
+    after = np.abs(scene.images[inner] * 255 - SMOOTH.images[inner]).mean()
     assert after < 0.4 * before
 
 

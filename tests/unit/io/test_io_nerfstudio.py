@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from exports import smooth_scene
 from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text
 
@@ -23,11 +22,11 @@ NOTE = "the cameras are moved into the Gaussians' frame by dataparser_transforms
 
 def trained(folder: Path, *, move: bool = True) -> Tiny:
     """Some of the Gaussians in no order, where nerfstudio puts them: X' = s (T [X; 1]); photos beside them."""
-    some = torch.randperm(3600, generator=torch.Generator().manual_seed(0))[:2400]
+    some = np.random.default_rng(0).permutation(3600)[:2400]
     gaussians = SMOOTH.gaussians[some]
     if move:
-        means = SCALE * (gaussians.means.double().numpy() @ TURN.T + SHIFT)
-        gaussians = replace(gaussians, means=torch.from_numpy(means).float(), scales=SCALE * gaussians.scales)
+        means = SCALE * (gaussians.means.astype(np.float64) @ TURN.T + SHIFT)
+        gaussians = replace(gaussians, means=means.astype(np.float32), scales=SCALE * gaussians.scales)
     there = replace(SMOOTH, gaussians=gaussians)
     there.save(folder, cameras=False)
     write_dataparser(folder)
@@ -46,7 +45,7 @@ def assert_moved(folder: Path) -> None:
     centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
     assert np.allclose(loaded.scene.cameras.centres, centres)
     assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ TURN.T)
-    assert torch.equal(loaded.cameras.viewmats, loaded.scene.cameras.viewmats)
+    assert np.array_equal(loaded.cameras.viewmats, loaded.scene.cameras.viewmats)
 
 
 def test_cameras_of_the_capture_are_moved(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def beside(more: bytes) -> bytes:
 
 def read(path: Path, data: bytes) -> np.ndarray:
     path.write_bytes(data)
-    return (read_images([path], ["a"])[0].numpy() * 255).round().astype(np.uint8)
+    return (read_images([path], ["a"])[0] * 255).round().astype(np.uint8)
 
 
 @pytest.mark.parametrize(

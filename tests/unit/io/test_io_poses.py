@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from exports import smooth_scene
 from tiny_scene import Tiny, make_tiny
 
@@ -31,7 +30,7 @@ def rewrite_poses(folder: Path, tiny: Tiny, convention: tuple[str, str]) -> None
 
 def some_rows(tiny: Tiny) -> Tiny:
     """Two thirds of the Gaussians in a random order: no pixels."""
-    order = torch.randperm(len(tiny.gaussians), generator=torch.Generator().manual_seed(0))
+    order = np.random.default_rng(0).permutation(len(tiny.gaussians))
     return replace(tiny, gaussians=tiny.gaussians[order[: len(order) * 2 // 3]])
 
 
@@ -70,12 +69,12 @@ def test_a_tie_is_said() -> None:
     points = rng.normal(size=(4000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     tiny = make_tiny()
-    gaussians = replace(tiny.gaussians[torch.arange(4000) % 840], means=torch.from_numpy(points).float())
+    gaussians = replace(tiny.gaussians[np.arange(4000) % 840], means=points.astype(np.float32))
     c2w = tiny.c2w.copy()
     c2w[:, :3, 3] *= 0.1
     wide = np.array([[3.0, 0, 10], [0, 3, 7], [0, 0, 1]])
-    cameras = Cameras(torch.from_numpy(np.linalg.inv(c2w)), torch.from_numpy(wide).repeat(3, 1, 1), 20, 14)
-    poses, seen, said = choose_poses(gaussians, torch.ones(4000, dtype=torch.bool), cameras, None, W2C_OPENCV)
+    cameras = Cameras(np.linalg.inv(c2w), np.tile(wide, (3, 1, 1)), 20, 14)
+    poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, None, W2C_OPENCV)
     assert poses is None
     assert seen.ok
     assert said is not None

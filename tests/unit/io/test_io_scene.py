@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from tiny_scene import (
     Tiny,
     frames_of,
@@ -36,10 +35,10 @@ def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
     assert len(scene) == 3
     assert (scene.cameras.width, scene.cameras.height) == (20, 14)
     assert np.allclose(scene.cameras.viewmats, tiny.w2c)
-    assert np.array_equal((scene.images.numpy() * 255).round(), tiny.images)
+    assert np.array_equal((scene.images * 255).round(), tiny.images)
     assert scene.valid.all()
     assert scene.names == tuple(f"images/{n}" for n in tiny.names)
-    assert torch.allclose(scene.gaussians.means, tiny.gaussians.means)
+    assert np.allclose(scene.gaussians.means, tiny.gaussians.means)
 
 
 def test_what_was_found_on_the_way(tiny_folder: Path) -> None:
@@ -63,11 +62,11 @@ def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
     (tmp_path / "gs_ply" / "scene.ply").rename(tmp_path / "gs_ply" / "0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny)
     scene = read_scene(tmp_path / "gs_ply" / "0000.ply")
-    assert np.array_equal((scene.images.numpy() * 255).round(), tiny.images)
+    assert np.array_equal((scene.images * 255).round(), tiny.images)
     assert scene.names == ("view 0", "view 1", "view 2")
     other = tiny.save(tmp_path / "other", images=False)
     named = read_scene(other, images=tmp_path / "exports/npz/results.npz")
-    assert torch.equal(named.images, scene.images)
+    assert np.array_equal(named.images, scene.images)
 
 
 def test_a_scene_without_images(tmp_path: Path, tiny: Tiny) -> None:
@@ -79,7 +78,7 @@ def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path / "train", tiny)
     rewrite(tmp_path / "transforms.json", lambda d: [f.update(file_path=f["file_path"].replace("images", "train"))
                                                      for f in d["frames"]])  # fmt: skip
-    assert np.array_equal((read_scene(tmp_path).images.numpy() * 255).round(), tiny.images)
+    assert np.array_equal((read_scene(tmp_path).images * 255).round(), tiny.images)
     files = find_scene_files(tmp_path)
     assert files.images is None
     assert stored_photos(files, read_cameras(files.cameras)) is not None
@@ -105,7 +104,7 @@ def test_views_in_the_order_of_their_names(tiny_folder: Path, tiny: Tiny) -> Non
     assert loaded.scene.names == tuple(f"images/{n}" for n in tiny.names)  # 2, 10, 11: numbers, not letters
     assert loaded.cameras.names == loaded.scene.names
     assert np.allclose(loaded.scene.cameras.viewmats, tiny.w2c)
-    assert np.array_equal((loaded.scene.images.numpy() * 255).round(), tiny.images)
+    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
     assert loaded.notes == ("views are in the order of the image names, not of the camera file",)
 
 
@@ -132,8 +131,8 @@ def test_one_and_many_threads_read_alike(tiny_folder: Path) -> None:
         with use_threads(count):
             scenes.append(read_scene(tiny_folder))
     for scene in scenes[1:]:
-        assert torch.equal(scene.images, scenes[0].images)
-        assert torch.equal(scene.gaussians.quats, scenes[0].gaussians.quats)
+        assert np.array_equal(scene.images, scenes[0].images)
+        assert np.array_equal(scene.gaussians.quats, scenes[0].gaussians.quats)
 
 
 # What does not fit

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from exports import export_rows, save_export, smooth_scene
 from tiny_scene import Tiny, frames_of, write_colmap_text, write_npz
 
@@ -65,7 +64,7 @@ def test_photos_and_cameras_larger_than_the_grid(tmp_path: Path, size: tuple, ma
     assert np.allclose(scene.cameras.Ks, tiny.K)
     assert loaded.alignment.ok
     if map_photo is resize_to:
-        assert np.abs(scene.images.numpy() * 255 - tiny.images).mean() < 8
+        assert np.abs(scene.images * 255 - tiny.images).mean() < 8
     said = words.replace("36", str(tiny.height))
     assert loaded.notes == (f"photos and cameras of {size[0]} x {size[1]} are {said}, the Gaussian grid's size",)
 
@@ -80,7 +79,7 @@ def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
         write_npz(folder / "results.npz", SMOOTH, image=None, depth=np.ones((3, 36, 48), np.float32))
         loaded = load_scene(folder, images=folder / "images")
         scene = loaded.pixel_scene()
-        assert np.abs(scene.images.numpy() * 255 - SMOOTH.images).mean() < 8, name
+        assert np.abs(scene.images * 255 - SMOOTH.images).mean() < 8, name
         note = f"photos of 110 x 72 are {mapping.description}, the cameras' and the Gaussian grid's size"
         assert note in loaded.notes
 
@@ -165,8 +164,8 @@ def test_mappings_move_a_point_and_its_photo_alike() -> None:
         assert small.shape == (mapping.height, mapping.width, 3)
         y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
                 ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
-        K = torch.tensor([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], dtype=torch.float64)
-        (moved,) = mapping.cameras(Cameras(torch.eye(4)[None], K, 100, 60)).Ks
+        K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
+        (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
         assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
 
 

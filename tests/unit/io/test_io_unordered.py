@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from exports import export_rows, save_export, turned
 from tiny_scene import Tiny, make_tiny, rotation
 
@@ -38,10 +37,10 @@ def scene_on_rays(views: int, jitter: float = 0.0, size: tuple[int, int] = (64, 
         images.append((color * 255).round().astype(np.uint8).reshape(height, width, 3))
     n = views * width * height
     gaussians = replace(
-        tiny.gaussians[torch.arange(n) % len(tiny.gaussians)],
-        means=torch.from_numpy(np.concatenate(means)).float(),
-        opacities=torch.from_numpy(rng.permutation(np.linspace(0.02, 0.99, n))).float(),
-        sh0=(torch.from_numpy(np.stack(images).reshape(n, 1, 3) / 255.0).float() - 0.5) / SH_C0,
+        tiny.gaussians[np.arange(n) % len(tiny.gaussians)],
+        means=np.concatenate(means).astype(np.float32),
+        opacities=rng.permutation(np.linspace(0.02, 0.99, n)).astype(np.float32),
+        sh0=((np.stack(images).reshape(n, 1, 3) / 255.0).astype(np.float32) - 0.5) / SH_C0,
     )
     names = tuple(f"{i:02d}.png" for i in range(views))
     return replace(tiny, c2w=c2w, images=np.stack(images), gaussians=gaussians, names=names)
@@ -49,7 +48,7 @@ def scene_on_rays(views: int, jitter: float = 0.0, size: tuple[int, int] = (64, 
 
 def by_opacity(tiny: Tiny, dropped: float) -> np.ndarray:
     """Grid rows from the most opaque on, without the least opaque ones."""
-    opacities = tiny.gaussians.opacities.numpy()
+    opacities = tiny.gaussians.opacities
     return np.argsort(-opacities)[: round(len(opacities) * (1 - dropped))]
 
 
@@ -88,7 +87,7 @@ def test_colours_decide_between_near_views() -> None:
     tiny = scene_on_rays(8, 0.02)
     tiny = replace(tiny, images=np.random.default_rng(0).integers(0, 256, tiny.images.shape, np.uint8))
     kept = by_opacity(tiny, 0.2)
-    points, base = tiny.gaussians.means.double().numpy()[kept], tiny.images.reshape(-1, 3)[kept] / 255
+    points, base = tiny.gaussians.means.astype(np.float64)[kept], tiny.images.reshape(-1, 3)[kept] / 255
     photos = tiny.images.reshape(8, -1, 3) / 255
     Ks = np.tile(tiny.K, (8, 1, 1))
     projected = ProjectedRows(points, np.arange(len(points)), tiny.w2c, Ks, tiny.width, tiny.height)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
+from gsmerge.geometry import normalize
 from gsmerge.io import write_ply
 from gsmerge.types import Gaussians
 
@@ -64,14 +64,14 @@ def make_tiny(width: int = 20, height: int = 14) -> Tiny:
         means.append(camera.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3])
     n = 3 * width * height
     images = rng.integers(0, 256, (3, height, width, 3), np.uint8)
-    quats = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(n, 4))).float(), dim=1)
+    quats = normalize(rng.normal(size=(n, 4)).astype(np.float32))
     gaussians = Gaussians(
-        means=torch.from_numpy(np.concatenate(means)).float(),
+        means=np.concatenate(means).astype(np.float32),
         quats=quats,
-        scales=torch.from_numpy(rng.uniform(0.01, 0.1, (n, 3))).float(),
-        opacities=torch.from_numpy(rng.uniform(0.05, 0.95, n)).float(),
-        sh0=(torch.from_numpy(images.reshape(n, 1, 3) / 255.0).float() - 0.5) / 0.28209479,
-        shN=torch.zeros(n, 0, 3),
+        scales=rng.uniform(0.01, 0.1, (n, 3)).astype(np.float32),
+        opacities=rng.uniform(0.05, 0.95, n).astype(np.float32),
+        sh0=((images.reshape(n, 1, 3) / 255.0).astype(np.float32) - 0.5) / 0.28209479,
+        shN=np.zeros((n, 0, 3), np.float32),
     )
     return Tiny(c2w, K, width, height, images, gaussians, ("a b/2.png", "a b/10.png", "a b/11.png"))
 

@@ -42,8 +42,8 @@ def test_sizes_keep_the_view() -> None:
     cameras = scenes.arc(2, 48, 36)
     large = resized(cameras, 96)
     assert (large.width, large.height) == (96, 72)
-    assert np.allclose(large.Ks.numpy()[:, :2], 2 * cameras.Ks.numpy()[:, :2])
-    assert np.allclose(large.Ks.numpy()[:, 2], cameras.Ks.numpy()[:, 2])
+    assert np.allclose(large.Ks[:, :2], 2 * cameras.Ks[:, :2])
+    assert np.allclose(large.Ks[:, 2], cameras.Ks[:, 2])
     odd = resized(scenes.arc(1, 48, 36), 7)
     assert (odd.width, odd.height) == (7, 5)
     assert (resized(scenes.arc(1, 48, 2), 3).height) == 1
@@ -59,7 +59,7 @@ def test_every_scene_is_drawn_at_every_size(scene: PixelScene) -> None:
 def test_overdraw_counts_what_is_blended(scene: PixelScene) -> None:
     one = scenes.arc(1)
     plan = plan_view(
-        prepare(scene.gaussians), one.viewmats[0].double().numpy(), one.Ks[0].double().numpy(), 48, 36, near=0.01
+        prepare(scene.gaussians), one.viewmats[0].astype(np.float64), one.Ks[0].astype(np.float64), 48, 36, near=0.01
     )
     assert overdraw(scene.gaussians, one, 0.01) == len(view_weights(plan).lanes) / (48 * 36)
     assert overdraw(scene.gaussians[:0], one, 0.01) == 0

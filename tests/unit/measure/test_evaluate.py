@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
@@ -45,9 +46,9 @@ def actual(scene: PixelScene, half: Gaussians) -> Evaluation:
 
 def test_figures_are_scikit_image_s(actual: Evaluation, half: Gaussians) -> None:
     views = held_out()
-    images = gsmerge.render(half, views.cameras).images.clamp(0, 1).numpy()
+    images = gsmerge.render(half, views.cameras).images.clip(0, 1)
     scores = [s for s in actual.results[1].scores if s.split == "target"]
-    for score, image, photo in zip(scores, images, views.images.numpy(), strict=True):
+    for score, image, photo in zip(scores, images, views.images, strict=True):
         assert score.full.psnr == pytest.approx(peak_signal_noise_ratio(photo, image, data_range=1), abs=1e-5)
         options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
         expected = structural_similarity(photo, image, channel_axis=2, data_range=1, **options)
@@ -84,7 +85,7 @@ def test_without_photos_the_input_s_renders_are_the_reference(scene: PixelScene,
 
 def test_views_of_another_world_are_told(scene: PixelScene) -> None:
     away = held_out()
-    viewmats = away.cameras.viewmats.clone()
+    viewmats = away.cameras.viewmats.copy()
     viewmats[:, 0, 3] -= 50
     away = replace(away, cameras=replace(away.cameras, viewmats=viewmats))
     assert "of the same world?" in evaluate(scene, {}, away, PLAIN).notes[0]
@@ -156,6 +157,16 @@ def test_progress_is_told(scene: PixelScene, half: Gaussians) -> None:
     assert said == [("evaluate", 1, 2), ("evaluate", 2, 2)]
 
 
+def test_tensors_give_the_same(scene: PixelScene, half: Gaussians) -> None:
+    views = held_out()
+    tensors = Views(views.cameras.to("cpu"), torch.from_numpy(views.images), views.names)
+    actual, expected = (
+        evaluate(scene, {"half": gaussians}, targets, PLAIN).results[1].scores
+        for gaussians, targets in ((half.to("cpu"), tensors), (half, views))
+    )
+    assert actual == expected
+
+
 def test_pictures_too_small_for_ssim() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 6, 5))
     score = evaluate(scene, {}, None, PLAIN).results[0].scores[0]
@@ -165,7 +176,7 @@ def test_pictures_too_small_for_ssim() -> None:
 
 def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
-    monkeypatch.setitem(evaluate.__globals__, "lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
+    monkeypatch.setattr("gsmerge.measure.lpips.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
     score = evaluate(scene, {}, None, EvaluateOptions()).results[0].scores[0]
     assert (score.full.lpips_vgg, score.full.lpips_alex) == (0.5, None)

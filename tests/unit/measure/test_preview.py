@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from gsmerge.measure import preview
 from gsmerge.types import Cameras, Gaussians
@@ -11,18 +10,18 @@ from gsmerge.types import Cameras, Gaussians
 def blob(color: float) -> Gaussians:
     """One large opaque Gaussian two units in front of the camera."""
     return Gaussians(
-        means=torch.tensor([[0.0, 0, 2]]),
-        quats=torch.tensor([[1.0, 0, 0, 0]]),
-        scales=torch.full((1, 3), 5.0),
-        opacities=torch.tensor([0.95]),
-        sh0=torch.full((1, 1, 3), (color - 0.5) / 0.28209479),
-        shN=torch.zeros(1, 0, 3),
+        means=np.array([[0.0, 0, 2]], np.float32),
+        quats=np.array([[1.0, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), 5.0, np.float32),
+        opacities=np.array([0.95], np.float32),
+        sh0=np.full((1, 1, 3), (color - 0.5) / 0.28209479, np.float32),
+        shN=np.zeros((1, 0, 3), np.float32),
     )
 
 
 def cameras(count: int) -> Cameras:
-    K = torch.tensor([[20.0, 0, 10], [0, 20, 6], [0, 0, 1]], dtype=torch.float64)
-    return Cameras(torch.eye(4, dtype=torch.float64).repeat(count, 1, 1), K.repeat(count, 1, 1), 20, 12)
+    K = np.array([[20.0, 0, 10], [0, 20, 6], [0, 0, 1]], np.float64)
+    return Cameras(np.tile(np.eye(4), (count, 1, 1)), np.tile(K, (count, 1, 1)), 20, 12)
 
 
 @pytest.mark.parametrize(
@@ -33,7 +32,7 @@ def test_pick_views(views: int, most: int, ids: list[int]) -> None:
 
 
 def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
-    photos = torch.full((2, 12, 20, 3), 0.2)
+    photos = np.full((2, 12, 20, 3), 0.2, np.float32)
     sheet = preview.contact_sheet([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos, min_width=20)
     tile_height, tile_width = 12 + preview.BAND, 20
     assert sheet.shape == (2 * tile_height + preview.GAP, 3 * tile_width + 2 * preview.GAP, 3)
@@ -56,20 +55,20 @@ def test_labels_never_widen_a_tile() -> None:
 
 
 def test_draw_borders_marks_where_labels_change() -> None:
-    image, labels = torch.zeros(2, 4, 3), torch.tensor([[0, 0, 1, 1], [0, 0, 1, 1]])
+    image, labels = np.zeros((2, 4, 3), np.float32), np.array([[0, 0, 1, 1], [0, 0, 1, 1]])
     drawn = preview.draw_borders(image, labels).any(-1)
     assert drawn.tolist() == [[False, False, True, False]] * 2
 
 
 def test_draw_means() -> None:
-    image = torch.tensor([[0.0, 1.0, 0.2]])[..., None].expand(1, 3, 3)
-    drawn = preview.draw_means(image, torch.tensor([[0, 0, 1]]))
+    image = np.repeat(np.array([[0.0, 1.0, 0.2]], np.float32)[..., None], 3, 2)
+    drawn = preview.draw_means(image, np.array([[0, 0, 1]]))
     assert drawn[0, :, 0].tolist() == [128, 128, 51]
 
 
 def test_draw_heat_of_nothing_is_even() -> None:
-    assert len(np.unique(preview.draw_heat(torch.zeros(3, 4)).reshape(-1, 3), axis=0)) == 1
+    assert len(np.unique(preview.draw_heat(np.zeros((3, 4), np.float32)).reshape(-1, 3), axis=0)) == 1
 
 
 def test_to_picture_clamps() -> None:
-    assert preview.to_picture(torch.tensor([[[-1.0, 0.5, 2.0]]])).tolist() == [[[0, 128, 255]]]
+    assert preview.to_picture(np.array([[[-1.0, 0.5, 2.0]]], np.float32)).tolist() == [[[0, 128, 255]]]

@@ -18,7 +18,7 @@ from gsmerge.views import subset
 def slow_mask(points: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
     mask = np.zeros((cameras.height, cameras.width), bool)
     for point in points:
-        x, y, z = cameras.Ks[view].numpy() @ (cameras.viewmats[view].numpy() @ np.append(point, 1))[:3]
+        x, y, z = cameras.Ks[view] @ (cameras.viewmats[view] @ np.append(point, 1))[:3]
         if z <= 0.01:
             continue
         column, row = int(np.floor(x / z)), int(np.floor(y / z))
@@ -57,7 +57,7 @@ def test_input_views_see_themselves_whole() -> None:
 
 def test_pixels_without_a_gaussian_give_no_sample() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
-    valid = scene.valid.clone()
+    valid = scene.valid.copy()
     valid[0, :, 12:] = False
     masks = visible_pixels(context_points(replace(scene, valid=valid), 0.01), scene.cameras, 0.01)
     assert masks[0, :, :13].all()  # a column more than there are samples: every sample marks its neighbours
@@ -66,7 +66,7 @@ def test_pixels_without_a_gaussian_give_no_sample() -> None:
 
 def test_what_lies_behind_the_camera_is_not_seen() -> None:
     camera = scenes.arc(1, 24, 18)
-    behind = np.linalg.inv(camera.viewmats[0].numpy())[:3] @ np.array([0, 0, -2.0, 1.0])
+    behind = np.linalg.inv(camera.viewmats[0])[:3] @ np.array([0, 0, -2.0, 1.0])
     assert not visible_pixels(behind[None], camera, 0.01).any()
 
 

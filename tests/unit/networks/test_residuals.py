@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 from scenes import make_features
 
-from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge import geometry
+from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks.options import Bounds
 from gsmerge.networks.residuals import (
@@ -21,20 +23,26 @@ from gsmerge.networks.residuals import (
     gaussian_sizes,
     move_features,
     move_gaussians,
+    quat_to_rotmat,
     residual_limits,
     rotate_quats,
     rotation_matrices,
 )
-from gsmerge.types import SH_C0, FeatureGaussians
+from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 
 def some(count: int = 20) -> FeatureGaussians:
     rng = np.random.default_rng(0)
     features = make_features(rng.normal(size=(count, 3)), opacities=0.6)
-    half = torch.from_numpy(rng.normal(size=(count, 3, 3)).astype(np.float32))
-    covars = half @ half.transpose(1, 2)
-    scales = torch.linalg.eigvalsh(covars).clamp_min(1e-6).sqrt()
-    return replace(features, covars=covars, extinctions=-np.log(0.4) * scales[:, 1] * scales[:, 2])
+    half = rng.normal(size=(count, 3, 3)).astype(np.float32)
+    covars = half @ half.swapaxes(1, 2)
+    scales = np.sqrt(np.linalg.eigvalsh(covars).clip(1e-6))
+    return replace(features, covars=covars, extinctions=-math.log(0.4) * scales[:, 1] * scales[:, 2])
+
+
+def base_of(features: FeatureGaussians) -> Gaussians:
+    """The Gaussian of each, tensors."""
+    return feature_to_gaussians(features).to("cpu")
 
 
 def frames(count: int = 20, seed: int = 1) -> torch.Tensor:
@@ -43,17 +51,18 @@ def frames(count: int = 20, seed: int = 1) -> torch.Tensor:
 
 def test_zero_changes_no_bit() -> None:
     features = some()
-    base, zero = feature_to_gaussians(features), torch.zeros(20, RESIDUAL)
+    base, zero = base_of(features), torch.zeros(20, RESIDUAL)
     for before, after in (
         (base, move_gaussians(base, zero, frames())),
         (features, move_features(features, base, zero, frames())),
     ):
         for f in fields(before):
-            assert torch.equal(getattr(before, f.name), getattr(after, f.name)), f.name
+            assert np.array_equal(getattr(before, f.name), getattr(after, f.name)), f.name
+            assert type(getattr(before, f.name)) is type(getattr(after, f.name)), f.name
 
 
 def test_gaussians_move_as_told() -> None:
-    base = feature_to_gaussians(some())
+    base = base_of(some())
     residuals = torch.zeros(20, RESIDUAL)
     residuals[:, MEAN], residuals[:, SIZE] = torch.tensor([1.0, 0, 0]), torch.tensor([0.1, 0.2, -0.3])
     residuals[:, LOGIT], residuals[:, COLOR] = 0.7, torch.tensor([0.1, -0.1, 0.2])
@@ -66,7 +75,7 @@ def test_gaussians_move_as_told() -> None:
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-6, 1.0])
 def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
-    base = replace(feature_to_gaussians(some()), opacities=torch.full((20,), opacity))
+    base = replace(base_of(some()), opacities=torch.full((20,), opacity))
     for logit in (-3.0, 3.0):
         residuals = torch.zeros(20, RESIDUAL)
         residuals[:, LOGIT] = logit
@@ -77,6 +86,7 @@ def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
 def test_rotations_agree_with_each_other() -> None:
     vectors = torch.randn(20, 3, generator=torch.Generator().manual_seed(3))
     quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=torch.Generator().manual_seed(4)), dim=1)
+    np.testing.assert_allclose(quat_to_rotmat(quats), geometry.quat_to_rotmat(quats.numpy()), atol=1e-6)
     turned = quat_to_rotmat(rotate_quats(vectors, quats))
     torch.testing.assert_close(turned, rotation_matrices(vectors) @ quat_to_rotmat(quats), atol=1e-5, rtol=0)
     quarter = rotation_matrices(torch.tensor([[0, 0, torch.pi / 2]]))[0]
@@ -86,18 +96,18 @@ def test_rotations_agree_with_each_other() -> None:
 def test_feature_gaussians_move_like_gaussians() -> None:
     """Means, covariances and colours alike; opacity stays with scales and follows its own column."""
     features = some()
-    base = feature_to_gaussians(features)
+    base = base_of(features)
     residuals = 0.3 * torch.randn(20, RESIDUAL, generator=torch.Generator().manual_seed(5))
     residuals[:, LOGIT] = 0
     residuals[:, SIZE] = residuals[:, SIZE].sort(1).values * 0.1  # scales still rise
-    moved, one = move_features(features, base, residuals, frames()), move_gaussians(base, residuals, frames())
-    torch.testing.assert_close(moved.means, one.means, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(moved.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
-    decoded = feature_to_gaussians(moved)
+    moved, one = move_features(features, base, residuals, frames()), move_gaussians(base, residuals, frames()).numpy()
+    np.testing.assert_allclose(moved.means, one.means, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(moved.covars, covariances(one.quats, one.scales), atol=1e-4, rtol=1e-4)
+    decoded = base_of(moved)
     torch.testing.assert_close(decoded.opacities, base.opacities, atol=1e-4, rtol=0)
     residuals = torch.zeros(20, RESIDUAL)
     residuals[:, LOGIT] = np.log(2)
-    doubled = feature_to_gaussians(move_features(features, base, residuals, frames()))
+    doubled = base_of(move_features(features, base, residuals, frames()))
     torch.testing.assert_close(doubled.opacities, 1 - (1 - base.opacities) ** 2, atol=1e-4, rtol=0)
 
 

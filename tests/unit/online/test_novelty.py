@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 from arriving import random_gaussians, room
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +26,7 @@ def features_of(gaussians: Gaussians) -> FeatureGaussians:
 
 def corner_distances(cameras: Cameras, view: int, point: np.ndarray) -> list[float]:
     """How far inside the planes between rays through the picture's corners, and before the eye, a point is."""
-    viewmat, K = cameras.viewmats[view].numpy(), cameras.Ks[view].numpy()
+    viewmat, K = cameras.viewmats[view], cameras.Ks[view]
     place = viewmat[:3, :3] @ point + viewmat[:3, 3]
     w, h, m = cameras.width, cameras.height, MARGIN
     corners = [
@@ -50,10 +49,10 @@ def test_in_view_of_a_ball_about_each(seed: int) -> None:
     actual = groups_in_view(features, cameras)
     assert actual.shape == (3, 300)
     assert 0.1 < actual.mean() < 0.9
-    radii = REACH * np.sqrt(np.trace(features.covars.double().numpy(), axis1=1, axis2=2))
+    radii = REACH * np.sqrt(np.trace(features.covars.astype(np.float64), axis1=1, axis2=2))
     for view in range(3):
         for g in range(300):
-            distances = np.array(corner_distances(cameras, view, features.means[g].double().numpy()))
+            distances = np.array(corner_distances(cameras, view, features.means[g].astype(np.float64)))
             assert actual[view, g] == (distances > -radii[g]).all()
 
 
@@ -96,10 +95,10 @@ def test_pixel_errors_by_hand() -> None:
     scene = room(2)
     gaussians = scene.gaussians[:400]  # a part of the first view
     assert scene.images is not None
-    pictures = photos_of(scene.images.numpy(), scene.cameras)
+    pictures = photos_of(scene.images, scene.cameras)
     actual = pixel_errors(gaussians, pictures, 24, 36)
     images, alphas = scenes.images_of(gaussians, scene.cameras)
-    expected = ((images.clip(0, 1) - scene.images.double().numpy()) ** 2).mean(-1) + (1 - alphas) ** 2
+    expected = ((images.clip(0, 1) - scene.images.astype(np.float64)) ** 2).mean(-1) + (1 - alphas) ** 2
     np.testing.assert_allclose(actual, expected, atol=1e-4)
     assert actual.dtype == np.float32
     assert (actual[0, -4:] >= 1 - 1e-4).all()  # nothing is there
@@ -109,7 +108,7 @@ def test_pixel_errors_by_hand() -> None:
 def test_pixel_errors_of_another_size_repeat() -> None:
     scene = room(2)
     assert scene.images is not None
-    pictures = photos_of(scene.images.numpy(), scene.cameras, 2)
+    pictures = photos_of(scene.images, scene.cameras, 2)
     small, large = (pixel_errors(scene.gaussians, pictures, h, w) for h, w in ((12, 18), (24, 36)))
     np.testing.assert_array_equal(small.repeat(2, 1).repeat(2, 2), large)
 
@@ -117,15 +116,15 @@ def test_pixel_errors_of_another_size_repeat() -> None:
 def test_nothing_shows_nothing() -> None:
     scene = room(1)
     assert scene.images is not None
-    actual = pixel_errors(scene.gaussians[:0], photos_of(scene.images.numpy(), scene.cameras), 24, 36)
+    actual = pixel_errors(scene.gaussians[:0], photos_of(scene.images, scene.cameras), 24, 36)
     assert (actual >= 1).all()
 
 
 def grouped(sizes: list[int], rows: np.ndarray) -> FeatureGaussians:
     """Groups of given sizes."""
-    starts = torch.from_numpy(np.concatenate([[0], np.cumsum(sizes)]))
+    starts = np.concatenate([[0], np.cumsum(sizes)])
     features = scenes.make_features(np.zeros((len(sizes), 3)))
-    return replace(features, starts=starts, members=torch.from_numpy(rows))
+    return replace(features, starts=starts, members=rows)
 
 
 def test_group_errors_against_a_loop() -> None:
@@ -158,11 +157,11 @@ def test_groups_of_a_scene_show_their_own_pixels() -> None:
     """The errors of what is there are small, of half a scene large on the other half."""
     scene = room(2)
     assert scene.images is not None
-    pictures = photos_of(scene.images.numpy(), scene.cameras)
+    pictures = photos_of(scene.images, scene.cameras)
     whole = pixel_errors(scene.gaussians, pictures, 24, 36)
     half = pixel_errors(scene.gaussians[(scene.gaussians.means[:, 0] < 0)], pictures, 24, 36)
     rows = np.arange(2 * 864)
-    right = rows[scene.gaussians.means[:, 0].numpy() > 0.4]
+    right = rows[scene.gaussians.means[:, 0] > 0.4]
     features = grouped([len(right)], right)
     members = scene_members(scene)
     assert group_errors(features, members, whole)[0] < 0.05

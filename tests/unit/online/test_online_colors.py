@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 from arriving import fed, room, same_group, state_of
 
 from gsmerge import Gaussians, PixelScene
@@ -33,8 +32,8 @@ def scene() -> PixelScene:
 def groups(scene: PixelScene) -> GroupSet:
     """Groups of all views, their colours off by a little."""
     actual = state_of(fed([scene], fit="none")).groups
-    rng = torch.Generator().manual_seed(0)
-    sh0 = actual.features.sh0 + 0.1 / SH_C0 * torch.randn(actual.features.sh0.shape, generator=rng)
+    noise = np.random.default_rng(0).normal(0, 0.1 / SH_C0, actual.features.sh0.shape).astype(np.float32)
+    sh0 = actual.features.sh0 + noise
     return replace(actual, features=replace(actual.features, sh0=sh0), fitted_sh0=sh0)
 
 
@@ -44,16 +43,16 @@ def batch_photos(scene: PixelScene) -> BatchPhotos:
     state = state_of(fed([scene], fit="none"))
     assert scene.images is not None
     rng = np.random.default_rng(0)
-    images = scene.images.numpy() + rng.normal(0, 0.15, scene.images.shape).astype(np.float32)
+    images = scene.images + rng.normal(0, 0.15, scene.images.shape).astype(np.float32)
     return BatchPhotos(images.clip(0, 1), state.cameras)
 
 
 def some(batch_photos: BatchPhotos, *views: int) -> BatchPhotos:
-    return BatchPhotos(batch_photos.images[list(views)], batch_photos.cameras[torch.tensor(views)])
+    return BatchPhotos(batch_photos.images[list(views)], batch_photos.cameras[list(views)])
 
 
-def rms(one: torch.Tensor, other: torch.Tensor) -> float:
-    return float((SH_C0 * (one - other)).square().mean().sqrt())
+def rms(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.sqrt(((SH_C0 * (one - other)) ** 2).mean()))
 
 
 # what the solver itself makes of it
@@ -108,8 +107,8 @@ def test_the_solution_is_where_the_gradient_vanishes(drawn: tuple[Gaussians, Pho
     residuals = [(p - i).reshape(-1, 3) for p, i in zip(photos.images, views.images, strict=True)]
     weights, right = np.concatenate(rows), np.concatenate(residuals)
     offsets = np.linalg.solve(weights.T @ weights + np.diag(precision), weights.T @ right)
-    inside = np.abs(0.5 + SH_C0 * gaussians.sh0[:, 0].numpy() + offsets - 0.5) < 0.5  # colours are kept in range
-    np.testing.assert_allclose(SH_C0 * (actual.sh0 - gaussians.sh0)[:, 0].numpy()[inside], offsets[inside], atol=2e-3)
+    inside = np.abs(0.5 + SH_C0 * gaussians.sh0[:, 0] + offsets - 0.5) < 0.5  # colours are kept in range
+    np.testing.assert_allclose(SH_C0 * (actual.sh0 - gaussians.sh0)[:, 0][inside], offsets[inside], atol=2e-3)
 
 
 def dense(view: object, column: int, count: int) -> np.ndarray:
@@ -123,7 +122,7 @@ def dense(view: object, column: int, count: int) -> np.ndarray:
 
 
 def test_only_colours_in_view_and_what_holds_them_change(groups: GroupSet, batch_photos: BatchPhotos) -> None:
-    one, means = some(batch_photos, 0), groups.features.means.clone()
+    one, means = some(batch_photos, 0), groups.features.means.copy()
     means[[3, 50]] += 30
     groups = replace(groups, features=replace(groups.features, means=means))
     actual, report = fit_batch_colors(groups, one, FEW)
@@ -132,9 +131,9 @@ def test_only_colours_in_view_and_what_holds_them_change(groups: GroupSet, batch
     assert 0 < seen.sum() < len(groups)
     for row in np.flatnonzero(~seen):
         assert same_group(actual, int(row), groups, int(row))
-    assert torch.equal(actual.features.sh0, groups.features.sh0)
+    np.testing.assert_array_equal(actual.features.sh0, groups.features.sh0)
     assert scenes.identical(actual.children, groups.children)
-    assert (actual.color_precision[torch.from_numpy(seen)] >= groups.color_precision[torch.from_numpy(seen)]).all()
+    assert (actual.color_precision[seen] >= groups.color_precision[seen]).all()
     assert float(actual.color_precision.sum()) > 0
 
 
@@ -163,7 +162,7 @@ def test_one_batch_after_the_other_is_near_all_at_once(
     for batch in (some(tinted, 0, 2, 4), some(tinted, 1, 3, 5)):
         after, report = fit_batch_colors(after, batch, steady)
         assert report.accepted
-        unknown = torch.zeros_like(groups.color_precision)
+        unknown = np.zeros_like(groups.color_precision)
         forgetful, _ = fit_batch_colors(replace(forgetful, color_precision=unknown), batch, steady)
     assert rms(after.fitted_sh0, joint.fitted_sh0) < 0.8 * rms(forgetful.fitted_sh0, joint.fitted_sh0)
     assert rms(after.fitted_sh0, joint.fitted_sh0) < 0.7 * rms(joint.fitted_sh0, groups.fitted_sh0)
@@ -177,15 +176,15 @@ def test_the_threads_do_not_matter(groups: GroupSet, batch_photos: BatchPhotos) 
     for threads in (1, 3):
         with use_threads(threads):
             actual.append(fit_batch_colors(groups, batch_photos, FEW)[0])
-    assert torch.equal(actual[0].fitted_sh0, actual[1].fitted_sh0)
-    assert torch.equal(actual[0].color_precision, actual[1].color_precision)
+    np.testing.assert_array_equal(actual[0].fitted_sh0, actual[1].fitted_sh0)
+    np.testing.assert_array_equal(actual[0].color_precision, actual[1].color_precision)
 
 
 def test_views_that_see_nothing_say_nothing(groups: GroupSet, batch_photos: BatchPhotos) -> None:
     away = batch_photos.cameras[:1]
-    turn = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+    turn = np.diag([-1.0, 1, -1, 1])
     away = replace(away, viewmats=turn @ away.viewmats)
     actual, report = fit_batch_colors(groups, BatchPhotos(batch_photos.images[:1], away), FEW)
     assert not report.accepted
-    assert torch.equal(actual.fitted_sh0, groups.fitted_sh0)
-    assert torch.equal(actual.color_precision, groups.color_precision)
+    np.testing.assert_array_equal(actual.fitted_sh0, groups.fitted_sh0)
+    np.testing.assert_array_equal(actual.color_precision, groups.color_precision)

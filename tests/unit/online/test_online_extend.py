@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-import torch
 from arriving import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
 from learned import noisy, written
 from loose import NO_CAMERAS, far_behind, loosened, shuffled
@@ -118,6 +117,11 @@ def test_the_old_state_is_left_as_it_is(pairs: list[PixelScene], first: OnlineSt
     assert after is not first
     assert len(after) > len(first)
     same_state(first, before)
+
+
+def test_tensors_too(scene: PixelScene) -> None:
+    given = replace(scene, gaussians=scene.gaussians.to("cpu"), cameras=scene.cameras.to("cpu"))
+    same_state(state_of(fed([given])), state_of(fed([scene])))
 
 
 def test_the_same_batch_twice_adds_nothing(scene: PixelScene) -> None:
@@ -244,7 +248,7 @@ def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
     assert (report.num_covered, report.num_joined) == (0, 0)
     assert len(state) == len(first) + report.num_new - report.num_hidden
     before = replace(state, groups=first.groups)
-    select_groups = torch.arange(len(first))
+    select_groups = np.arange(len(first))
     from gsmerge.online.state import select_groups as picked
 
     same_groups(picked(state.groups, select_groups), picked(before.groups, select_groups))
@@ -252,7 +256,7 @@ def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
 
 def test_a_batch_without_a_valid_gaussian(pairs: list[PixelScene], first: OnlineState) -> None:
     """Its photos count all the same."""
-    nothing = replace(pairs[1], valid=torch.zeros_like(pairs[1].valid))
+    nothing = replace(pairs[1], valid=np.zeros_like(pairs[1].valid))
     state, report = extend(first, nothing, options())
     assert (report.num_new, len(state)) == (0, len(first))
     assert len(state.replay) == 4

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-import torch
 from arriving import group, random_gaussians, same_group, same_groups
 from learned import SMALL, Made, made, noisy, written
 from loose import far_behind, shuffled, voxels
@@ -47,25 +46,24 @@ def uneven(some: Made) -> FeatureGaussians:
     """Groups with gains and spreads of their own, as the photos leave them."""
     rng = np.random.default_rng(0)
     gains, spreads = rng.uniform(0.3, 3.0, (2, len(some.features)))
-    return replace(some.features, gains=torch.from_numpy(gains).float(), spreads=torch.from_numpy(spreads).float())
+    return replace(some.features, gains=gains.astype(np.float32), spreads=spreads.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
 def groups(some: Made, uneven: FeatureGaussians) -> GroupSet:
     actual = bake(uneven, some.members, None, 4)
-    rng = torch.Generator().manual_seed(1)
-    fitted_sh0 = actual.fitted_sh0 + 0.1 * torch.randn(actual.fitted_sh0.shape, generator=rng)
-    return replace(actual, fitted_sh0=fitted_sh0, color_precision=torch.rand(len(actual), generator=rng))
+    rng = np.random.default_rng(1)
+    fitted_sh0 = actual.fitted_sh0 + rng.normal(0, 0.1, actual.fitted_sh0.shape).astype(np.float32)
+    return replace(actual, fitted_sh0=fitted_sh0, color_precision=rng.random(len(actual), np.float32))
 
 
 def assert_close(one: Gaussians, other: Gaussians, rtol: float = 1e-4) -> None:
     """Row by row, whatever the order and signs of the axes."""
     assert len(one) == len(other)
-    a, b = (covariances(g.quats.double(), g.scales.double()) for g in (one, other))
-    size = b.diagonal(dim1=1, dim2=2).sum(1)
-    assert float(((a - b).abs().amax((1, 2)) / size).max()) <= rtol
-    largest = size.sqrt()
-    assert float(((one.means - other.means).double().norm(dim=1) / largest).max()) <= rtol
+    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64)) for g in (one, other))
+    size = np.trace(b, axis1=1, axis2=2)
+    assert (np.abs(a - b).max((1, 2)) / size).max() <= rtol
+    assert (np.linalg.norm(one.means - other.means, axis=1) / np.sqrt(size)).max() <= rtol
     for name in ("opacities", "sh0", "shN"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=rtol)
 
@@ -89,7 +87,7 @@ def test_baked_is_what_the_stages_decode(most: int, some: Made, uneven: FeatureG
     expected = decode(uneven, some.members, replace(ALL, k=most)) if most > 1 else feature_to_gaussians(uneven)
     assert scenes.identical(actual.children, expected)
     assert_same_children(children, expected)
-    assert int(actual.features.starts.diff().max()) <= most
+    assert int(np.diff(actual.features.starts).max()) <= most
 
 
 def test_heads_are_in_what_is_baked(some: Made) -> None:
@@ -104,22 +102,22 @@ def test_heads_are_in_what_is_baked(some: Made) -> None:
     expected = decode(features, some.members, replace(ALL, k=4), networks=networks)
     assert_same_children(children, expected)
     plain = bake(features, some.members, None, 4)
-    assert not torch.equal(plain.children.sh0, actual.children.sh0)
+    assert not np.array_equal(plain.children.sh0, actual.children.sh0)
 
 
 def test_baked_groups_are_plain(groups: GroupSet, uneven: FeatureGaussians) -> None:
     f = groups.features
     assert bool((f.gains == 1).all())
     assert bool((f.spreads == 1).all())
-    assert torch.equal(f.members, torch.arange(len(groups.children)))
+    np.testing.assert_array_equal(f.members, np.arange(len(groups.children)))
     for name in ("weights", "masses", "footprints", "views", "backing"):
-        assert torch.equal(getattr(f, name), getattr(uneven, name)), name
+        np.testing.assert_array_equal(getattr(f, name), getattr(uneven, name), name)
 
 
 def test_nothing_is_held_to_begin_with(some: Made, uneven: FeatureGaussians) -> None:
     actual = bake(uneven, some.members, None, 2)
     assert not actual.color_precision.any()
-    assert torch.equal(actual.fitted_sh0, actual.features.sh0)
+    np.testing.assert_array_equal(actual.fitted_sh0, actual.features.sh0)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -130,7 +128,7 @@ def test_moments_are_what_is_decoded_from_them(degree: int) -> None:
 
 
 def test_moments_of_the_faintest_and_the_most_solid() -> None:
-    gaussians = replace(random_gaussians(4, 5), opacities=torch.tensor([0.0, 1e-6, 0.999, 1.0]))
+    gaussians = replace(random_gaussians(4, 5), opacities=np.array([0.0, 1e-6, 0.999, 1.0], np.float32))
     features = replace(scenes.make_features(gaussians.means), **moments_of(gaussians))
     actual = feature_to_gaussians(features).opacities
     np.testing.assert_allclose(actual, [0, 1e-6, 0.999, 0.999], atol=1e-6)
@@ -138,35 +136,35 @@ def test_moments_of_the_faintest_and_the_most_solid() -> None:
 
 def test_moments_of_none() -> None:
     gaussians = random_gaussians(0, 0)
-    assert {name: len(tensor) for name, tensor in moments_of(gaussians).items()} == dict.fromkeys(
+    assert {name: len(column) for name, column in moments_of(gaussians).items()} == dict.fromkeys(
         ("means", "covars", "extinctions", "sh0", "shN"), 0
     )
 
 
 def test_pick_takes_groups_with_their_children(groups: GroupSet) -> None:
-    rows = torch.tensor([5, 0, 17, 5])
+    rows = np.array([5, 0, 17, 5])
     actual = select_groups(groups, rows)
     assert len(actual) == 4
     for place, row in enumerate(rows.tolist()):
         assert same_group(actual, place, groups, row)
-    assert torch.equal(actual.features.members, torch.arange(len(actual.children)))
+    np.testing.assert_array_equal(actual.features.members, np.arange(len(actual.children)))
 
 
 def test_pick_of_all_and_of_none(groups: GroupSet) -> None:
-    same_groups(select_groups(groups, torch.arange(len(groups))), groups)
-    none = select_groups(groups, torch.zeros(0, dtype=torch.int64))
+    same_groups(select_groups(groups, np.arange(len(groups))), groups)
+    none = select_groups(groups, np.zeros(0, np.int64))
     assert (len(none), len(none.children)) == (0, 0)
 
 
 def test_joined_keeps_all_in_order(groups: GroupSet) -> None:
-    rows = torch.arange(len(groups))
+    rows = np.arange(len(groups))
     halves = [select_groups(groups, rows[:7]), select_groups(groups, rows[7:7]), select_groups(groups, rows[7:])]
     same_groups(concat_groups(halves), groups)
 
 
 def test_swapped_groups_take_the_places_of_others(groups: GroupSet) -> None:
-    rows = torch.tensor([8, 2])
-    others = select_groups(groups, torch.tensor([20, 21]))
+    rows = np.array([8, 2])
+    others = select_groups(groups, np.array([20, 21]))
     actual = replace_groups(groups, rows, others)
     assert len(actual) == len(groups)
     for row in range(len(groups)):
@@ -176,19 +174,19 @@ def test_swapped_groups_take_the_places_of_others(groups: GroupSet) -> None:
 
 def test_thinned_pools_the_children_of_crowded_groups(groups: GroupSet) -> None:
     actual = limit_children(groups, 2)
-    sizes, before = actual.features.starts.diff(), groups.features.starts.diff()
+    sizes, before = np.diff(actual.features.starts), np.diff(groups.features.starts)
     assert int(sizes.max()) == 2
     assert int(before.max()) > 2
     for row in range(len(groups)):
         if before[row] <= 2:
             assert same_group(actual, row, groups, row)
             continue
-        crowded = select_groups(groups, torch.tensor([row]))
+        crowded = select_groups(groups, np.array([row]))
         expected = decode(crowded.features, child_members(crowded), replace(ALL, k=2))
         columns, children = group(actual, row)
         assert scenes.identical(children, expected)
         own, _ = group(groups, row)
-        assert all(torch.equal(columns[name], own[name]) for name in columns)
+        assert all(np.array_equal(columns[name], own[name]) for name in columns)
 
 
 def test_nothing_is_thinned_where_none_is_crowded(groups: GroupSet) -> None:
@@ -204,9 +202,9 @@ def test_children_of_one_member_each_are_left_as_they_are(groups: GroupSet) -> N
 def test_solved_colours_move_groups_and_children_alike(groups: GroupSet) -> None:
     """Real photos differ from what exports say, whatever the number of Gaussians."""
     actual = with_fitted_colors(groups)
-    assert torch.equal(actual.features.sh0, groups.fitted_sh0)
-    offsets, sizes = groups.fitted_sh0 - groups.features.sh0, groups.features.starts.diff()
-    expected = groups.children.sh0 + offsets.repeat_interleave(sizes, 0)
+    np.testing.assert_array_equal(actual.features.sh0, groups.fitted_sh0)
+    offsets, sizes = groups.fitted_sh0 - groups.features.sh0, np.diff(groups.features.starts)
+    expected = groups.children.sh0 + offsets.repeat(sizes, 0)
     np.testing.assert_allclose(actual.children.sh0, expected, atol=1e-6)
     same = replace(actual, features=groups.features, children=replace(actual.children, sh0=groups.children.sh0))
     same_groups(same, groups)
@@ -306,7 +304,7 @@ def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: PixelScene) ->
     state = from_encoded(encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False))
     state = replace(state, groups=replace(state.groups, fitted_sh0=state.groups.fitted_sh0 + 0.2 / SH_C0))
     as_came, fitted = to_encoded(state, fitted_colors=False), to_encoded(state)
-    assert torch.equal(as_came.features.sh0, state.groups.features.sh0)
-    assert torch.equal(fitted.features.sh0, state.groups.fitted_sh0)
+    np.testing.assert_array_equal(as_came.features.sh0, state.groups.features.sh0)
+    np.testing.assert_array_equal(fitted.features.sh0, state.groups.fitted_sh0)
     moved = fitted.division.children.sh0 - as_came.division.children.sh0
     np.testing.assert_allclose(moved, 0.2 / SH_C0, atol=1e-5)

@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-import torch
 from arriving import fed, parts_of, room, same_state, state_of
 from loose import far_behind, shuffled
-from safetensors.torch import load_file, save_file
-from spoils import Spoil, cut, filled, header, with_header, with_settings, with_tensor, with_text, without
+from safetensors.numpy import load_file, save_file
+from spoils import Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
 
 from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
 from gsmerge.encoded.gsm_file import STATE
@@ -33,13 +33,13 @@ def path(state: OnlineState, tmp_path: Path) -> Path:
     return tmp_path / "state.gsm"
 
 
-TENSORS = (
+ARRAYS = (
     *(f"features.{name}" for name in ("means", "covars", "weights", "masses", "extinctions", "latents", "footprints")),
     *("features.sh0", "features.shN", "features.views", "features.backing", "features.solved", "features.held"),
     *(f"children.{name}" for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "counts")),
     *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "replay.images", "replay.views"),
 )
-FLOATS = [name for name in TENSORS if name.split(".")[1] not in ("views", "backing", "counts", "images")]
+FLOATS = [name for name in ARRAYS if name.split(".")[1] not in ("views", "backing", "counts", "images")]
 FLOATS = [name for name in FLOATS if name not in ("features.latents", "kept.means")]  # nothing is in those
 DAMAGED: dict[str, Spoil] = {
     "missing": Path.unlink,
@@ -80,25 +80,25 @@ DAMAGED: dict[str, Spoil] = {
     "an opacity of two": with_settings(min_opacity=2.0),
     "a share that is none": with_settings(prune=float("nan")),
     "a negative number": with_settings(num_input=-1),
-    "a group without children": with_tensor("children.counts", filled(0)),
-    "a group with too many": with_tensor("children.counts", filled(9)),
-    "children of nobody": with_tensor("children.counts", lambda t: t.clamp(max=1)),
-    "fewer children": with_tensor("children.means", lambda t: t[1:].clone()),
-    "harmonics of another degree": with_tensor("children.shN", lambda t: t[:, :0].clone()),
-    "views beyond": with_tensor("replay.views", lambda t: t + 3),
-    "views before": with_tensor("replay.views", lambda t: t - 1),
-    "views twice": with_tensor("replay.views", torch.zeros_like),
-    "views in no order": with_tensor("replay.views", lambda t: t.flip(0).clone()),
-    "fewer photos": with_tensor("replay.images", lambda t: t[1:].clone()),
-    "photos of another size": with_tensor("replay.images", lambda t: t[:, 1:].clone()),
-    **{f"no {name}": with_tensor(name, None) for name in TENSORS},
+    "a group without children": with_array("children.counts", filled(0)),
+    "a group with too many": with_array("children.counts", filled(9)),
+    "children of nobody": with_array("children.counts", lambda a: a.clip(max=1)),
+    "fewer children": with_array("children.means", lambda a: a[1:]),
+    "harmonics of another degree": with_array("children.shN", lambda a: a[:, :0]),
+    "views beyond": with_array("replay.views", lambda a: a + 3),
+    "views before": with_array("replay.views", lambda a: a - 1),
+    "views twice": with_array("replay.views", np.zeros_like),
+    "views in no order": with_array("replay.views", lambda a: a[::-1]),
+    "fewer photos": with_array("replay.images", lambda a: a[1:]),
+    "photos of another size": with_array("replay.images", lambda a: a[:, 1:]),
+    **{f"no {name}": with_array(name, None) for name in ARRAYS},
     **{
-        f"{name} of doubles": with_tensor(name, lambda t: t.float() if t.dtype == torch.float64 else t.double())
-        for name in TENSORS
+        f"{name} of doubles": with_array(name, lambda a: a.astype(np.float32 if a.dtype == np.float64 else np.float64))
+        for name in ARRAYS
     },
-    **{f"{name} of another shape": with_tensor(name, lambda t: t[None].clone()) for name in TENSORS},
-    **{f"NaN in {name}": with_tensor(name, filled(float("nan"))) for name in FLOATS},
-    "infinity in features.means": with_tensor("features.means", filled(float("inf"))),
+    **{f"{name} of another shape": with_array(name, lambda a: a[None]) for name in ARRAYS},
+    **{f"NaN in {name}": with_array(name, filled(float("nan"))) for name in FLOATS},
+    "infinity in features.means": with_array("features.means", filled(float("inf"))),
 }
 
 
@@ -144,11 +144,11 @@ def test_without_photos(tmp_path: Path) -> None:
 
 
 def test_what_is_not_known_is_not_looked_at(path: Path, state: OnlineState) -> None:
-    said, tensors = header(path), load_file(path)
-    tensors["features.moods"], tensors["division.slots"] = torch.full((7,), float("nan")), torch.zeros(3)
+    said, arrays = header(path), load_file(path)
+    arrays["features.moods"], arrays["division.slots"] = np.full(7, np.nan), np.zeros(3)
     said |= {"minor": 7, "moods": ["good"]}
     said["settings"]["mood"] = "better"
-    save_file(tensors, path, {STATE: json.dumps(said), "mood": "best"})
+    save_file(arrays, path, {STATE: json.dumps(said), "mood": "best"})
     same_state(load_state(path), state)
 
 

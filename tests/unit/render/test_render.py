@@ -15,20 +15,20 @@ FOCAL = 100.0
 
 def camera(width: int = 21, height: int = 11, count: int = 1) -> Cameras:
     """At the origin, looking along z; the principal point is the centre of the middle pixel."""
-    K = torch.tensor([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return Cameras(torch.eye(4, dtype=torch.float64).expand(count, 4, 4), K.expand(count, 3, 3), width, height)
+    K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
+    return Cameras(np.stack([np.eye(4)] * count), np.stack([K] * count), width, height)
 
 
 def balls(*rows: tuple[float, float, float, float, float, float]) -> Gaussians:
     """Round grey Gaussians: x, y, z, standard deviation, opacity, grey."""
-    table = torch.tensor(rows, dtype=torch.float32).reshape(-1, 6)
-    n = len(table)
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
-    sh0 = ((table[:, 5] - 0.5) / SH_C0)[:, None, None].expand(n, 1, 3)
-    return Gaussians(table[:, :3], quats, table[:, 3:4].expand(n, 3), table[:, 4], sh0, torch.zeros(n, 0, 3))
+    means, sizes, opacities, greys = np.split(np.array(rows, np.float32).reshape(-1, 6), [3, 4, 5], axis=1)
+    n = len(means)
+    quats, scales = np.eye(1, 4, dtype=np.float32).repeat(n, 0), sizes.repeat(3, 1)
+    sh0 = ((greys - np.float32(0.5)) / np.float32(SH_C0)).repeat(3, 1)[:, None]
+    return Gaussians(np.ascontiguousarray(means), quats, scales, opacities[:, 0], sh0, np.zeros((n, 0, 3), np.float32))
 
 
-def value(image: torch.Tensor, x: int, y: int) -> float:
+def value(image: np.ndarray, x: int, y: int) -> float:
     return float(image[0, y, x, 0])
 
 
@@ -83,10 +83,10 @@ def test_depth_is_the_mean_of_what_was_blended() -> None:
 def test_no_gaussians_leave_the_background() -> None:
     rendering = render(balls(), camera(count=2), 0.5, with_depths=True)
     assert rendering.images.shape == (2, 11, 21, 3)
-    assert rendering.images.eq(0.5).all()
-    assert rendering.alphas.eq(0).all()
+    assert (rendering.images == 0.5).all()
+    assert (rendering.alphas == 0).all()
     assert rendering.depths is not None
-    assert rendering.depths.eq(0).all()
+    assert (rendering.depths == 0).all()
 
 
 def test_no_cameras_give_no_images() -> None:
@@ -102,8 +102,8 @@ def test_what_is_behind_or_too_faint_is_not_seen() -> None:
 
 def test_far_cuts() -> None:
     gaussians = balls((0, 0, 2, 1, 0.9, 1))
-    assert render(gaussians, camera(), far=1.5).alphas.eq(0).all()
-    assert render(gaussians, camera(), near=2.5).alphas.eq(0).all()
+    assert (render(gaussians, camera(), far=1.5).alphas == 0).all()
+    assert (render(gaussians, camera(), near=2.5).alphas == 0).all()
 
 
 def test_antialiasing_dims_what_is_small() -> None:
@@ -115,7 +115,7 @@ def test_antialiasing_dims_what_is_small() -> None:
 
 def test_colours_depend_on_the_viewing_direction() -> None:
     gaussians = balls((0, 0, 1, 0.02, 0.8, 0.5))
-    shN = torch.zeros(1, 3, 3)
+    shN = np.zeros((1, 3, 3), np.float32)
     shN[0, 1, 0] = 1  # along z
     turned = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh0, shN)
     image = render(turned, camera()).images
@@ -149,31 +149,60 @@ def test_left_out_ones_and_other_opacities() -> None:
 
 def test_geographic_coordinates_keep_their_detail() -> None:
     rows = balls((0.01, 0, 1, 0.02, 0.8, 1.0), (-0.03, 0.02, 1.3, 0.02, 0.8, 0.3))
-    shift = torch.tensor([500_000.0, 5_400_000.0, 300.0], dtype=torch.float64)
-    moved = Gaussians(rows.means.double() + shift, rows.quats, rows.scales, rows.opacities, rows.sh0, rows.shN)
-    viewmats = camera().viewmats.clone()
+    shift = np.array([500_000.0, 5_400_000.0, 300.0])
+    moved = Gaussians(rows.means + shift, rows.quats, rows.scales, rows.opacities, rows.sh0, rows.shN)
+    viewmats = camera().viewmats.copy()
     viewmats[:, :3, 3] = -shift
     there = Cameras(viewmats, camera().Ks, 21, 11)
-    torch.testing.assert_close(render(moved, there).images, render(rows, camera()).images, atol=1e-5, rtol=0)
+    np.testing.assert_allclose(render(moved, there).images, render(rows, camera()).images, atol=1e-5, rtol=0)
     plan = plan_view(prepare(moved), viewmats[0], camera().Ks[0], 21, 11)
     np.testing.assert_allclose(composite(plan)[0], render(rows, camera()).images[0], atol=1e-5)
 
 
 def test_nothing_is_copied_that_need_not_be() -> None:
     gaussians = balls((0, 0, 1, 0.02, 0.8, 1.0), (1, 1, 0, 0.02, 0.8, 1.0))
-    contiguous = Gaussians(*(getattr(gaussians, f).contiguous() for f in vars(gaussians)))
-    splats = prepare(contiguous)
-    assert np.shares_memory(splats.means, contiguous.means.numpy())
-    assert np.shares_memory(splats.sh0, contiguous.sh0.numpy())
+    for given in (gaussians, gaussians.to("cpu")):
+        splats = prepare(given)
+        assert np.shares_memory(splats.means, gaussians.means)
+        assert np.shares_memory(splats.sh0, gaussians.sh0)
+
+
+@pytest.mark.parametrize("with_depths", [False, True])
+@pytest.mark.parametrize("count", [0, 2])
+def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int) -> None:
+    """Of equal values, also where only the Gaussians or only the cameras are tensors."""
+    gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0), (0.01, 0, 1.2, 0.03, 0.5, 0.2)), camera(count=2)[:count]
+    options = {"antialiased": True, "near": 0.1, "far": 5.0, "with_depths": with_depths}
+    expected = render(gaussians, cameras, (0.1, 0.2, 0.3), **options)
+    assert (expected.depths is not None) == with_depths
+    under = torch.tensor([0.1, 0.2, 0.3])
+    for some, seen in (
+        (gaussians.to("cpu"), cameras.to("cpu")),
+        (gaussians.to("cpu"), cameras),
+        (gaussians, cameras.to("cpu")),
+    ):
+        actual = render(some, seen, under, **options)
+        for name, one in vars(expected).items():
+            tensor = getattr(actual, name)
+            if one is None:
+                assert tensor is None
+                continue
+            assert isinstance(one, np.ndarray)
+            assert isinstance(tensor, torch.Tensor)
+            assert one.dtype == np.float32
+            assert tensor.dtype == torch.float32
+            assert not tensor.requires_grad
+            np.testing.assert_array_equal(tensor.numpy(), one)
+    assert isinstance(render(gaussians, cameras, under).images, np.ndarray)
 
 
 def test_every_view_has_its_own_image() -> None:
     gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0)), camera(count=2)
-    viewmats = cameras.viewmats.clone()
+    viewmats = cameras.viewmats.copy()
     viewmats[1, 0, 3] = 0.05  # 5 px to the right
     images = render(gaussians, Cameras(viewmats, cameras.Ks, 21, 11)).images
-    torch.testing.assert_close(images[1, :, 5:], images[0, :, :-5], atol=2e-3, rtol=0)
-    assert (images[1] - images[0]).abs().max() > 0.5
+    np.testing.assert_allclose(images[1, :, 5:], images[0, :, :-5], atol=2e-3, rtol=0)
+    assert np.abs(images[1] - images[0]).max() > 0.5
 
 
 def test_messages() -> None:

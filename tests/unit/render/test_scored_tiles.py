@@ -8,7 +8,7 @@ import scenes
 
 from gsmerge import PixelScene
 from gsmerge.render.blend import composite
-from gsmerge.render.photos import NEAR, photo_psnr, quarter_psnr, scene_photos, scored_tiles
+from gsmerge.render.photos import NEAR, photo_psnr, scene_photos, scored_tiles
 from gsmerge.render.plan import plan_view, prepare
 
 
@@ -53,6 +53,6 @@ def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
 
 def test_quarter_is_near_the_whole(scene: PixelScene) -> None:
     photos, views = scene_photos(scene), range(len(scene))
-    whole, quarter = (score(scene.gaussians, photos, views, near=NEAR) for score in (photo_psnr, quarter_psnr))
+    whole, quarter = (photo_psnr(scene.gaussians, photos, views, near=NEAR, quarter=part) for part in (False, True))
     assert quarter == pytest.approx(whole, abs=0.5)
     assert quarter != whole

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
@@ -38,9 +37,9 @@ def offsets(scene: PixelScene) -> float:
     """Largest distance (pixels) of a Gaussian from its pixel."""
     pixels, _ = project(scene.gaussians.means, scene.cameras)
     v, h, w = scene.valid.shape
-    own = pixels.reshape(v, v, h * w, 2)[torch.arange(v), torch.arange(v)].reshape(v, h, w, 2)
-    y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
-    return float((own - torch.stack([x, y], -1)).abs().max())
+    own = pixels.reshape(v, v, h * w, 2)[np.arange(v), np.arange(v)].reshape(v, h, w, 2)
+    y, x = np.mgrid[:h, :w] + 0.5
+    return float(np.abs(own - np.stack([x, y], -1)).max())
 
 
 def pixel_scene(judged: StressScene) -> PixelScene:
@@ -53,9 +52,9 @@ def test_wrong_poses_keep_every_gaussian_on_its_pixel(degrees: float, scene: Pix
     turned = pixel_scene(cases.perturb_poses(StressScene(scene, None), degrees))
     assert offsets(turned) < 1e-3
     for old, new in zip(scene.cameras.viewmats, turned.cameras.viewmats, strict=True):
-        cosine = (torch.trace(new[:3, :3] @ old[:3, :3].T) - 1) / 2
-        assert float(torch.rad2deg(torch.arccos(cosine))) == pytest.approx(degrees, rel=1e-3)
-        assert torch.allclose(torch.linalg.inv(old)[:3, 3], torch.linalg.inv(new)[:3, 3], atol=1e-9)
+        cosine = (np.trace(new[:3, :3] @ old[:3, :3].T) - 1) / 2
+        assert np.rad2deg(np.arccos(cosine)) == pytest.approx(degrees, rel=1e-3)
+        np.testing.assert_allclose(np.linalg.inv(old)[:3, 3], np.linalg.inv(new)[:3, 3], rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize(("factor", "shift"), [(1e-4, (0, 0, 0)), (1e4, (0, 0, 0)), (1.0, (4e5, 5e6, 100))])
@@ -65,23 +64,23 @@ def test_moved_scenes_move_their_judges(factor: float, shift: tuple[float, ...],
     move = cases.move(StressScene(scene, views), factor, shift)
     assert offsets(pixel_scene(move)) < 1e-2
     assert move.views is not None
-    assert torch.allclose(move.views.cameras.viewmats, move.scene.cameras.viewmats)
+    np.testing.assert_allclose(move.views.cameras.viewmats, move.scene.cameras.viewmats)
 
 
 def test_exposure_changes_photos_and_colours_alike(scene: PixelScene) -> None:
     changed = pixel_scene(cases.change_exposure(StressScene(scene, None), 0.2))
     assert changed.images is not None
     assert scene.images is not None
-    assert torch.allclose(changed.images[0], 0.8 * scene.images[0])
+    np.testing.assert_allclose(changed.images[0], 0.8 * scene.images[0], rtol=1e-5)
     colors = (0.5 + 0.28209479 * changed.gaussians.sh0[:, 0]).reshape(changed.images.shape)
-    assert torch.allclose(colors[1].clamp(0, 1), changed.images[1], atol=1e-5)
+    np.testing.assert_allclose(colors[1].clip(0, 1), changed.images[1], rtol=1e-5, atol=1e-5)
 
 
 def test_rows_that_are_spoilt(scene: PixelScene) -> None:
     scene_in, n = StressScene(scene, None), len(scene.gaussians)
     broken = pixel_scene(cases.break_rows(scene_in))
     assert int((~broken.valid).sum()) == round(0.01 * n)
-    assert float(broken.gaussians.opacities[~broken.valid.reshape(-1)].max()) == 0
+    assert broken.gaussians.opacities[~broken.valid.reshape(-1)].max() == 0
     large = cases.enlarge(scene_in).scene.gaussians.scales / scene.gaussians.scales
     assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
     away = (cases.throw_away(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -39,6 +41,22 @@ def test_one_thread_is_the_callers() -> None:
 def test_other_libraries_are_held_to_one_thread() -> None:
     with use_threads(2):
         assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
+
+
+def test_torch_that_is_imported_later_is_held_too() -> None:
+    code = """
+from gsmerge.runtime.threads import parallel_map, use_threads
+import sys
+with use_threads(2):
+    assert "torch" not in sys.modules
+    import torch
+    torch.set_num_threads(2)
+    parallel_map(abs, [1, 2])
+    held = torch.get_num_threads()
+print(held, torch.get_num_threads())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "2"]
 
 
 def test_outer_block_wins() -> None:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import PixelScene
 from gsmerge.moments import Members, feature_to_gaussians, principal_axes, scene_members
@@ -83,18 +82,18 @@ def test_many_views_are_judged_by_some(
 
 def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
     options = RobustOptions()
-    wrong = torch.arange(len(features)) % 10 == 0
-    sh0 = features.sh0.clone()
+    wrong = np.arange(len(features)) % 10 == 0
+    sh0 = features.sh0.copy()
     sh0[wrong] = -sh0[wrong] + 1.5
     gains = weigh(replace(features, sh0=sh0), photos, options)
-    assert torch.isfinite(gains).all()
+    assert np.isfinite(gains).all()
     assert float(gains.min()) >= 0.05 * options.boost - 1e-6
     assert float(gains.max()) <= options.boost + 1e-6
-    assert float(gains[wrong].median()) < 0.5 * float(gains[~wrong].median())
+    assert np.median(gains[wrong]) < 0.5 * np.median(gains[~wrong])
 
 
 def test_unseen_ones_keep_the_boost(features: FeatureGaussians, photos: Photos) -> None:
-    lost = replace(features, means=torch.cat([features.means[:5] - 100, features.means[5:]]))
+    lost = replace(features, means=np.concatenate([features.means[:5] - 100, features.means[5:]]))
     assert weigh(lost, photos, RobustOptions())[:5].tolist() == pytest.approx([3.0] * 5)
 
 
@@ -104,8 +103,8 @@ def test_backing_lies_behind_and_covers_the_image(
     options = BackingOptions()
     assert backing.backing.all()
     assert len(backing) == 36
-    eyes = scene.cameras.centres.float()
-    distance = (backing.means - eyes[backing.views]).norm(dim=1)
+    eyes = scene.cameras.centres
+    distance = np.linalg.norm(backing.means - eyes[backing.views], axis=1)
     surface = scenes.trace(scenes.room(), scene.cameras)[1]
     assert float(distance.min()) > (1 + options.push) * surface.min() * 0.95
     gaussians = feature_to_gaussians(backing)
@@ -125,8 +124,8 @@ def test_backing_draws_no_curtain() -> None:
     front = encode(edge, members, groups, EncodeOptions())
     layer = encode_backing(edge, members, groups, BackingOptions(push=0.0), front)
     assert layer is not None
-    thickness = principal_axes(layer.covars.double().numpy())[0][:, 0]
-    depths = layer.means[:, 2].double().numpy()
+    thickness = principal_axes(layer.covars)[0][:, 0]
+    depths = layer.means[:, 2].astype(np.float64)
     assert (thickness < 0.3 * depths).all()
 
 
@@ -145,9 +144,9 @@ def test_few_views_differ_in_spread_alone(scene: PixelScene, members: Members, v
     assert list(scores) == ["plain", "wide", "wider"]
     assert scores[name] == max(scores.values())
     power = list(scores).index(name)
-    torch.testing.assert_close(chosen.features.spreads, torch.full((len(features),), 1.2**power))
+    np.testing.assert_allclose(chosen.features.spreads, np.full(len(features), 1.2**power), rtol=1e-6)
     for name in ("means", "covars", "gains", "extinctions"):
-        assert torch.equal(getattr(chosen.features, name), getattr(features, name))
+        assert np.array_equal(getattr(chosen.features, name), getattr(features, name))
     assert scores["plain"] == pytest.approx(merge_psnr(features, photos, left_out=False), abs=1e-9)
 
 
@@ -183,7 +182,7 @@ def test_holes_are_closed_by_what_shows_the_photos_best(
     features: FeatureGaussians, backing: FeatureGaussians, photos: Photos
 ) -> None:
     """A thinned layer: every candidate is tried, and the best is taken."""
-    thin = take(features, torch.arange(0, len(features), 2))
+    thin = take(features, np.arange(0, len(features), 2))
     chosen = close_holes(thin, before(backing, photos), RobustOptions())
     name, scores = chosen.choices["closed"], chosen.choices["closed_scores"]
     assert list(scores) == ["as it is", "wide", "back", "wide+back"]

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.geometry import covariances
@@ -40,7 +39,7 @@ def features(scene: PixelScene, members: Members) -> FeatureGaussians:
 def assert_alike(a: Gaussians, b: Gaussians) -> None:
     for name in ("means", "opacities", "sh0", "shN"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-4, atol=1e-6, err_msg=name)
-    one, two = (covariances(g.quats.double(), g.scales.double()) for g in (a, b))
+    one, two = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64)) for g in (a, b))
     np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-9)
 
 
@@ -57,11 +56,13 @@ def test_k_children(features: FeatureGaussians, members: Members, k: int) -> Non
 def test_children_keep_the_groups_moments(features: FeatureGaussians, members: Members, k: int) -> None:
     """Opacity, colour and place of a group's children average to the group's."""
     children = decode(features, members, DecodeOptions(k=k, min_opacity=0))
-    depths = -torch.log1p(-children.opacities.double()) * children.scales.double().sort(1).values[:, 1:].prod(1)
+    areas = np.sort(children.scales.astype(np.float64), 1)[:, 1:].prod(1)
+    depths = -np.log1p(-children.opacities.astype(np.float64)) * areas
     assert len(children) == 2 * COUNT * k
     np.testing.assert_allclose(depths.reshape(-1, k).sum(1), features.extinctions, rtol=0.1)
     for name in ("means", "sh0"):
-        low, high = getattr(children, name).reshape(2 * COUNT, k, 3).aminmax(dim=1)
+        of_groups = getattr(children, name).reshape(2 * COUNT, k, 3)
+        low, high = of_groups.min(1), of_groups.max(1)
         own = getattr(features, name).reshape(-1, 3)
         assert (own >= low - 1e-5).all()
         assert (own <= high + 1e-5).all()
@@ -78,7 +79,7 @@ def test_children_are_pooled_by_the_rule(scene: PixelScene, members: Members, k:
     assert len(actual) == 2 * COUNT * k
     np.testing.assert_allclose(actual.opacities, 0.5, rtol=1e-3)
     if k > 1:
-        assert (decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).abs().max() > 0.1
+        assert np.abs(decode(paper, even, DecodeOptions(k=k)).opacities - 0.5).max() > 0.1
 
 
 def test_mixed_k_goes_by_the_saliency(features: FeatureGaussians, members: Members) -> None:
@@ -86,7 +87,7 @@ def test_mixed_k_goes_by_the_saliency(features: FeatureGaussians, members: Membe
     saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
     options = DecodeOptions(k="mixed", k_low=50, k_high=80)
     counts = mixed_counts(features, members, saliency, options)
-    ids, starts = features.members.numpy(), features.starts.numpy()
+    ids, starts = features.members, features.starts
     means = [saliency[ids[a:b]].mean() for a, b in pairwise(starts)]
     ranks = np.argsort(np.argsort(means)) / (len(means) - 1) * 100
     assert counts.tolist() == [1 if rank <= 50 else 2 if rank <= 80 else 4 for rank in ranks]
@@ -104,7 +105,7 @@ def test_mixed_k_by_distortion_has_as_many(features: FeatureGaussians, members: 
 
 def test_mixed_k_of_the_backing_layer_is_one(features: FeatureGaussians, members: Members) -> None:
     saliency = np.random.default_rng(0).random(len(members.means)).astype(np.float32)
-    behind = replace(features, backing=torch.ones(len(features), dtype=torch.bool))
+    behind = replace(features, backing=np.ones(len(features), bool))
     assert (mixed_counts(behind, members, saliency, DecodeOptions(k="mixed")) == 1).all()
 
 
@@ -119,13 +120,13 @@ def test_identical_members_stay_one_child(scene: PixelScene, members: Members) -
         *(np.repeat(getattr(members, n)[:1], 10, axis=0) for n in members.__dataclass_fields__ if n != "pixels")
     )
     one = scenes.make_features(same.means[:1], sizes=0.01)
-    one = replace(one, starts=torch.tensor([0, 10]), members=torch.arange(10), shN=torch.zeros(1, 3, 3))
+    one = replace(one, starts=np.array([0, 10]), members=np.arange(10), shN=np.zeros((1, 3, 3), np.float32))
     assert len(decode(one, same, DecodeOptions(k=4))) == 1
 
 
 def test_single_members_stay_themselves(scene: PixelScene, members: Members) -> None:
     """Every pixel its own superpixel: K changes nothing."""
-    labels = torch.arange(scene.pixels_per_view, dtype=torch.int32).reshape(1, 18, 24).expand(2, -1, -1)
+    labels = np.stack([np.arange(scene.pixels_per_view, dtype=np.int32).reshape(18, 24)] * 2)
     features = encode(scene, members, Groups(labels, (432, 432)), EncodeOptions())
     assert_alike(decode(features, members, DecodeOptions(k=4)), decode(features, members, DecodeOptions(k=1)))
 
@@ -135,12 +136,12 @@ def test_gains_and_spreads_reach_the_children(features: FeatureGaussians, member
     stronger = replace(features, gains=2 * features.gains, spreads=1.5 * features.spreads)
     changed = decode(stronger, members, DecodeOptions(k=2, min_opacity=0))
     np.testing.assert_allclose(changed.scales, 1.5 * plain.scales, rtol=1e-5)
-    expected = 1 - (1 - plain.opacities.double()) ** 2
-    np.testing.assert_allclose(changed.opacities, expected.clamp(max=0.999), rtol=1e-4)
+    expected = 1 - (1 - plain.opacities.astype(np.float64)) ** 2
+    np.testing.assert_allclose(changed.opacities, expected.clip(max=0.999), rtol=1e-4)
 
 
 def test_merged_features_are_split_again(features: FeatureGaussians, members: Members) -> None:
-    clusters = torch.arange(2 * COUNT) % COUNT  # each of view 0 with one of view 1
+    clusters = np.arange(2 * COUNT) % COUNT  # each of view 0 with one of view 1
     merged = merge(features, Matches(clusters, COUNT))
     children = decode(merged, members, DecodeOptions(k=2, min_opacity=0))
     assert len(children) == 2 * COUNT
@@ -148,9 +149,7 @@ def test_merged_features_are_split_again(features: FeatureGaussians, members: Me
 
 @pytest.mark.parametrize("k", [1, 2])
 def test_backing_stays_at_one(features: FeatureGaussians, members: Members, k: int) -> None:
-    behind = replace(
-        features, backing=torch.ones(len(features), dtype=torch.bool), extinctions=2 * features.extinctions
-    )
+    behind = replace(features, backing=np.ones(len(features), bool), extinctions=2 * features.extinctions)
     both = FeatureGaussians.concat([features, behind])
     actual = decode(both, members, DecodeOptions(k=k, min_opacity=0))
     assert len(actual) == 2 * COUNT * (k + 1)
@@ -159,7 +158,7 @@ def test_backing_stays_at_one(features: FeatureGaussians, members: Members, k: i
 
 @pytest.mark.parametrize("k", [1, 2])
 def test_only_backing(features: FeatureGaussians, members: Members, k: int) -> None:
-    behind = replace(features, backing=torch.ones(len(features), dtype=torch.bool))
+    behind = replace(features, backing=np.ones(len(features), bool))
     assert len(decode(behind, members, DecodeOptions(k=k))) == 2 * COUNT
 
 
@@ -171,7 +170,7 @@ def test_nothing(members: Members, k: int) -> None:
 
 @pytest.mark.parametrize("k", [1, 4])
 def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
-    opacities = scene.gaussians.opacities.clone()
+    opacities = scene.gaussians.opacities.copy()
     opacities[: scene.pixels_per_view] = 0
     half = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
     own = scene_members(half)

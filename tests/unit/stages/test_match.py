@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scenes import make_features
 
 from gsmerge.stages.match import MatchOptions, match
@@ -15,10 +14,9 @@ METHODS = ["overlap", "aabb"]
 
 def sets(features: FeatureGaussians, **settings: object) -> set[frozenset[int]]:
     actual = match(features, MatchOptions(**settings))  # type: ignore[arg-type]
-    assert actual.clusters.dtype == torch.int64
+    assert actual.clusters.dtype == np.int64
     assert sorted(set(actual.clusters.tolist())) == list(range(actual.count))
-    clusters = actual.clusters.numpy()
-    return {frozenset(np.nonzero(clusters == c)[0].tolist()) for c in range(actual.count)}
+    return {frozenset(np.nonzero(actual.clusters == c)[0].tolist()) for c in range(actual.count)}
 
 
 def alone(count: int) -> set[frozenset[int]]:
@@ -61,11 +59,12 @@ def test_threshold_is_the_box_overlap() -> None:
 def test_threshold_is_the_cosine_of_the_latents() -> None:
     """With latents these decide in place of the colours, for boxes alone."""
     colors = np.array([[0.2, 0.2, 0.2], [0.9, 0.9, 0.9]])
-    pair = replace(make_features(np.zeros((2, 3)), colors=colors), latents=torch.tensor([[3.0, 0.0], [0.4, 0.3]]))
+    latents = np.array([[3.0, 0.0], [0.4, 0.3]], np.float32)
+    pair = replace(make_features(np.zeros((2, 3)), colors=colors), latents=latents)
     assert len(sets(pair, match="aabb", similarity=0.8 - 1e-3)) == 1
     assert len(sets(pair, match="aabb", similarity=0.8 + 1e-3)) == 2
     assert len(sets(pair, match="overlap", similarity=-1)) == 2
-    assert len(sets(replace(pair, latents=torch.zeros(2, 2)), match="aabb", similarity=0.1)) == 2
+    assert len(sets(replace(pair, latents=np.zeros((2, 2), np.float32)), match="aabb", similarity=0.1)) == 2
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -94,7 +93,7 @@ def test_one_view_is_left_alone(method: str) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_backing_is_matched_by_itself(method: str) -> None:
     features = make_features(np.zeros((4, 3)))
-    features = replace(features, backing=torch.tensor([False, True, False, True]))
+    features = replace(features, backing=np.array([False, True, False, True]))
     assert sets(features, match=method) == {frozenset([0, 2]), frozenset([1, 3])}
 
 

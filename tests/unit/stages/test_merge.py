@@ -13,17 +13,17 @@ from gsmerge.types import FeatureGaussians, Matches
 
 
 def matches(*clusters: int) -> Matches:
-    return Matches(torch.tensor(clusters, dtype=torch.int64), len(set(clusters)))
+    return Matches(np.array(clusters, np.int64), len(set(clusters)))
 
 
 def assert_equal(a: FeatureGaussians, b: FeatureGaussians) -> None:
     for f in fields(FeatureGaussians):
-        assert torch.equal(getattr(a, f.name), getattr(b, f.name)), f.name
+        assert np.array_equal(getattr(a, f.name), getattr(b, f.name)), f.name
 
 
 def with_members(features: FeatureGaussians, sizes: list[int]) -> FeatureGaussians:
-    starts = torch.tensor([0, *np.cumsum(sizes).tolist()])
-    return replace(features, starts=starts, members=torch.arange(int(starts[-1])) + 100)
+    starts = np.cumsum([0, *sizes])
+    return replace(features, starts=starts, members=np.arange(int(starts[-1])) + 100)
 
 
 def test_alone_pass_unchanged() -> None:
@@ -32,19 +32,19 @@ def test_alone_pass_unchanged() -> None:
 
 
 def test_no_features() -> None:
-    assert len(merge(make_features(np.zeros((0, 3))), Matches(torch.zeros(0, dtype=torch.int64), 0))) == 0
+    assert len(merge(make_features(np.zeros((0, 3))), Matches(np.zeros(0, np.int64), 0))) == 0
 
 
 def test_two_by_hand() -> None:
     features = make_features([[0, 0, 0], [7, 7, 7], [4, 0, 0]], sizes=1.0, opacities=[0.6, 0.5, 0.2], degree=1)
     features = replace(
         with_members(features, [2, 1, 3]),
-        shN=torch.tensor([0.0, 5.0, 1.0])[:, None, None].expand(3, 3, 3),
-        spreads=torch.tensor([1.0, 1.0, 1.2]),
+        shN=np.array([0.0, 5.0, 1.0], np.float32)[:, None, None] * np.ones((3, 3), np.float32),
+        spreads=np.array([1.0, 1.0, 1.2], np.float32),
     )
     merged = merge(features, matches(0, 1, 0))
     assert len(merged) == 2
-    assert_equal(take(merged, torch.tensor([0])), take(features, torch.tensor([1])))
+    assert_equal(take(merged, np.array([0])), take(features, np.array([1])))
     np.testing.assert_allclose(merged.means[1], [1, 0, 0], atol=1e-6)  # weights 3 to 1
     np.testing.assert_allclose(merged.covars[1], np.diag([4.0, 1, 1]), atol=1e-5)
     np.testing.assert_allclose(merged.shN[1], 0.25)
@@ -68,18 +68,32 @@ def test_stacked_ones_add_up_like_layers(count: int) -> None:
 def test_gains_weigh_and_carry_over() -> None:
     """A Gaussian that the photos distrust counts less in the mean; gained optical depths add up."""
     features = make_features([[0, 0, 0], [1, 0, 0]], opacities=0.5)
-    features = replace(features, gains=torch.tensor([3.0, 1.0]))
+    features = replace(features, gains=np.array([3.0, 1.0], np.float32))
     merged = merge(features, matches(0, 0))
     np.testing.assert_allclose(merged.means[0], [0.25, 0, 0], atol=1e-6)
     gained = (features.extinctions * features.gains).sum()
     assert float(merged.extinctions[0] * merged.gains[0]) == pytest.approx(float(gained), rel=1e-5)
 
 
+def test_latents_are_averaged_and_gradients_pass() -> None:
+    """With the weights of the means; those that are alone keep theirs. Arrays become tensors."""
+    features = make_features(np.zeros((3, 3)), opacities=[0.6, 0.5, 0.2])
+    latents = torch.tensor([[1.0, 2.0], [7.0, 8.0], [5.0, 0.0]], requires_grad=True)
+    merged = merge(replace(features, latents=latents), matches(0, 1, 0))
+    torch.testing.assert_close(merged.latents, torch.tensor([[7.0, 8.0], [2.0, 1.5]]))
+    merged.latents.sum().backward()
+    assert latents.grad is not None
+    np.testing.assert_allclose(latents.grad, [[0.75, 0.75], [1, 1], [0.25, 0.25]], rtol=1e-5)
+    again = merge(replace(features, latents=latents.detach().numpy()), matches(0, 1, 0))
+    assert torch.equal(again.latents, merged.latents)
+    assert isinstance(merge(features, matches(0, 1, 0)).latents, np.ndarray)
+
+
 def test_transparent_ones_merge_without_nan() -> None:
     features = make_features([[0, 0, 0], [1, 0, 0]], opacities=0.0)
     merged = merge(features, matches(0, 0))
     for f in fields(FeatureGaussians):
-        assert torch.isfinite(getattr(merged, f.name).double()).all(), f.name
+        assert np.isfinite(getattr(merged, f.name)).all(), f.name
     np.testing.assert_allclose(merged.means[0], [0.5, 0, 0], atol=1e-6)
     assert feature_to_gaussians(merged).opacities.tolist() == [0]
 
@@ -92,12 +106,12 @@ def test_far_from_the_origin_nothing_cancels() -> None:
 
 
 def test_backing_stays_backing() -> None:
-    features = replace(make_features(np.zeros((3, 3))), backing=torch.tensor([False, True, False]))
+    features = replace(make_features(np.zeros((3, 3))), backing=np.array([False, True, False]))
     assert merge(features, matches(0, 1, 0)).backing.tolist() == [True, False]
 
 
 def test_merged_backing_is_backing() -> None:
-    features = replace(make_features(np.zeros((5, 3))), backing=torch.tensor([True, False, True, False, True]))
+    features = replace(make_features(np.zeros((5, 3))), backing=np.array([True, False, True, False, True]))
     merged = merge(features, matches(0, 1, 0, 1, 2))
     assert merged.backing.tolist() == [True, True, False]
     assert merged.views.tolist() == [4, -1, -1]
@@ -108,7 +122,7 @@ def test_every_member_once_whatever_the_clusters() -> None:
     sizes = rng.integers(1, 5, 40).tolist()
     features = with_members(make_features(rng.normal(size=(40, 3))), sizes)
     labels = np.unique(rng.integers(0, 25, 40), return_inverse=True)[1]
-    actual = Matches(torch.from_numpy(labels.reshape(-1)), int(labels.max()) + 1)
+    actual = Matches(labels.reshape(-1), int(labels.max()) + 1)
     merged = merge(features, actual)
     assert len(merged) == actual.count
     assert sorted(merged.members.tolist()) == features.members.tolist()
@@ -118,8 +132,8 @@ def test_every_member_once_whatever_the_clusters() -> None:
 
 def test_take_brings_the_members() -> None:
     features = with_members(make_features(np.eye(3)), [1, 2, 3])
-    taken = take(features, torch.tensor([2, 0]))
+    taken = take(features, np.array([2, 0]))
     assert taken.starts.tolist() == [0, 3, 4]
     assert taken.members.tolist() == [103, 104, 105, 100]
     assert taken.means.tolist() == features.means[[2, 0]].tolist()
-    assert len(take(features, torch.zeros(0, dtype=torch.int64))) == 0
+    assert len(take(features, np.zeros(0, np.int64))) == 0

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import PixelScene
 from gsmerge.baselines.baseline import most_important
@@ -28,27 +27,27 @@ from gsmerge.types import SH_C0, FeatureGaussians, Groups
 HEIGHT, WIDTH = 40, 60
 
 
-def cut(images: torch.Tensor, count: int) -> Groups:
+def cut(images: np.ndarray, count: int) -> Groups:
     return segment(images, SegmentOptions(), count)
 
 
-def tree_of(images: torch.Tensor, depths: torch.Tensor, count: int = 200, **weights: float) -> RegionTree:
-    valid = torch.ones(depths.shape, dtype=torch.bool)
+def tree_of(images: np.ndarray, depths: np.ndarray, count: int = 200, **weights: float) -> RegionTree:
+    valid = np.ones(depths.shape, bool)
     return region_tree(images, depths, cut(images, count), valid, AllocateOptions(**weights))
 
 
-def grey(num_views: int = 1) -> torch.Tensor:
-    return torch.full((num_views, HEIGHT, WIDTH, 3), 0.5)
+def grey(num_views: int = 1) -> np.ndarray:
+    return np.full((num_views, HEIGHT, WIDTH, 3), 0.5, np.float32)
 
 
-def noise(num_views: int = 1) -> torch.Tensor:
-    return torch.rand((num_views, HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(0))
+def noise(num_views: int = 1) -> np.ndarray:
+    return np.random.default_rng(2).random((num_views, HEIGHT, WIDTH, 3), dtype=np.float32)
 
 
-def slanted(num_views: int = 1) -> torch.Tensor:
+def slanted(num_views: int = 1) -> np.ndarray:
     """Depths of a wall that is not parallel to the image."""
-    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
-    return (1 / (1 + 0.01 * x - 0.008 * y)).expand(num_views, -1, -1).clone()
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    return np.stack([(1 / (1 + 0.01 * x - 0.008 * y)).astype(np.float32)] * num_views)
 
 
 # ---------------------------------------------------------------- merging regions
@@ -56,7 +55,7 @@ def slanted(num_views: int = 1) -> torch.Tensor:
 
 def test_wall_is_cheap_and_texture_is_not() -> None:
     """One view of a plain wall and one of noise: nearly all regions go to the noise."""
-    images = torch.cat([grey(), noise()])
+    images = np.concatenate([grey(), noise()])
     groups = cut_tree(tree_of(images, slanted(2), max_extent=0.5), 200)
     assert groups.counts[0] + groups.counts[1] == 200
     assert groups.counts[0] < 15
@@ -67,16 +66,16 @@ def test_depth_edges_are_kept() -> None:
     depths = slanted()
     depths[:, :, WIDTH // 2 :] *= 0.7
     images = grey()
-    labels = torch.arange(HEIGHT * WIDTH // 4, dtype=torch.int32).reshape(1, HEIGHT // 2, WIDTH // 2)
-    fine = labels.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    labels = np.arange(HEIGHT * WIDTH // 4, dtype=np.int32).reshape(1, HEIGHT // 2, WIDTH // 2)
+    fine = labels.repeat(2, 1).repeat(2, 2)
     tree = region_tree(
         images,
         depths,
         Groups(fine, (HEIGHT * WIDTH // 4,)),
-        torch.ones_like(depths, dtype=torch.bool),
+        np.ones_like(depths, dtype=bool),
         AllocateOptions(max_extent=1.0),
     )
-    coarse = cut_tree(tree, 20).labels[0].numpy()
+    coarse = cut_tree(tree, 20).labels[0]
     assert not set(np.unique(coarse[:, : WIDTH // 2])) & set(np.unique(coarse[:, WIDTH // 2 :]))
     assert tree.distortions[-1] > 10 * tree.distortions[-20]
     without = tree_of(images, depths, depth_weight=0.0)
@@ -88,12 +87,12 @@ def test_regions_keep_below_the_largest_extent_until_there_is_no_other_way(portr
     """A quarter of the longer side, whichever that is."""
     images, depths = grey(), slanted()
     if portrait:
-        images, depths = images.transpose(1, 2), depths.transpose(1, 2)
+        images, depths = images.swapaxes(1, 2), depths.swapaxes(1, 2)
     tree = tree_of(images, depths, max_extent=1 / 4)
     side = WIDTH / 4
 
     def extents(count: int) -> np.ndarray:
-        labels = cut_tree(tree, count).labels[0].numpy()
+        labels = cut_tree(tree, count).labels[0]
         boxes = [np.nonzero(labels == i) for i in range(count)]
         return np.array([max(np.ptp(y), np.ptp(x)) for y, x in boxes])
 
@@ -110,27 +109,27 @@ def test_distortions_are_those_of_the_cuts(depth_weight: float) -> None:
     for count in (100, 60, 20, 2):
         groups, error = cut_tree(tree, count), 0.0
         for view in range(2):
-            labels, pixels = groups.labels[view].numpy(), images[view].double().numpy()
+            labels, pixels = groups.labels[view], images[view].astype(np.float64)
             error += sum(
                 ((pixels[labels == i] - pixels[labels == i].mean(0)) ** 2).sum() for i in range(groups.counts[view])
             )
-        assert tree.distortions[100 - count] == pytest.approx(error / images.numel(), rel=1e-3)
+        assert tree.distortions[100 - count] == pytest.approx(error / images.size, rel=1e-3)
 
 
 def test_regions_without_valid_pixels_go_first() -> None:
     images, depths = noise(), slanted()
-    valid = torch.ones_like(depths, dtype=torch.bool)
+    valid = np.ones_like(depths, dtype=bool)
     valid[:, :, : WIDTH // 2] = False
     groups = cut(images, 100)
-    filled = len(torch.unique(groups.labels[valid]))
+    filled = len(np.unique(groups.labels[valid]))
     coarse = cut_tree(region_tree(images, depths, groups, valid), filled)
-    assert len(torch.unique(coarse.labels[valid])) == filled
+    assert len(np.unique(coarse.labels[valid])) == filled
 
 
 def test_strange_depths_do_no_harm() -> None:
     depths = slanted(3)
-    depths[0, :5], depths[0, 5:10], depths[0, 10:15], depths[0, 15:20] = 0, -1, torch.nan, torch.inf
-    depths[1], depths[2] = -1, torch.nan
+    depths[0, :5], depths[0, 5:10], depths[0, 10:15], depths[0, 15:20] = 0, -1, np.nan, np.inf
+    depths[1], depths[2] = -1, np.nan
     tree = tree_of(noise(3), depths)
     assert np.isfinite(tree.distortions).all()
     assert len(cut_tree(tree, 100)) == 100
@@ -145,8 +144,8 @@ def test_a_single_superpixel_cannot_be_merged() -> None:
 def test_pixel_depths() -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 8, 6))
     depths = pixel_depths(scene)
-    eyes = scene.cameras.centres.repeat_interleave(48, 0)
-    forward = scene.cameras.viewmats[:, 2, :3].repeat_interleave(48, 0)
+    eyes = scene.cameras.centres.repeat(48, 0)
+    forward = scene.cameras.viewmats[:, 2, :3].repeat(48, 0)
     expected = ((scene.gaussians.means - eyes) * forward).sum(1)
     np.testing.assert_allclose(depths.reshape(-1), expected, rtol=1e-5)
 
@@ -154,11 +153,11 @@ def test_pixel_depths() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"images": torch.zeros(1, HEIGHT, WIDTH)}, r"images: expected shape \[1, 40, 60, 3\]"),
-        ({"depths": torch.zeros(2, HEIGHT, WIDTH)}, r"depths: expected shape \[1, 40, 60\]"),
-        ({"valid": torch.zeros(1, 3, 3)}, r"valid: expected shape"),
-        ({"groups": Groups(torch.zeros(1, HEIGHT, WIDTH, dtype=torch.int32), (2,))}, "expected 2 superpixels"),
-        ({"groups": Groups(torch.ones(1, HEIGHT, WIDTH, dtype=torch.int32), (1,))}, "expected 1 superpixels"),
+        ({"images": np.zeros((1, HEIGHT, WIDTH))}, r"images: expected shape \[1, 40, 60, 3\]"),
+        ({"depths": np.zeros((2, HEIGHT, WIDTH))}, r"depths: expected shape \[1, 40, 60\]"),
+        ({"valid": np.zeros((1, 3, 3))}, r"valid: expected shape"),
+        ({"groups": Groups(np.zeros((1, HEIGHT, WIDTH), np.int32), (2,))}, "expected 2 superpixels"),
+        ({"groups": Groups(np.ones((1, HEIGHT, WIDTH), np.int32), (1,))}, "expected 1 superpixels"),
     ],
 )
 def test_arguments_that_do_not_fit(change: dict[str, object], message: str) -> None:
@@ -190,7 +189,7 @@ def test_knee_of_a_wall_and_of_a_texture() -> None:
 def test_auto_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
     assert auto_count(wall) == wall.min_regions < 150
-    labels = cut_tree(wall, wall.min_regions).labels[0].numpy()
+    labels = cut_tree(wall, wall.min_regions).labels[0]
     boxes = [np.nonzero(labels == i) for i in range(wall.min_regions)]
     assert max(max(np.ptp(y), np.ptp(x)) for y, x in boxes) < WIDTH / 8
     assert auto_count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
@@ -251,7 +250,7 @@ def test_splits_stop_where_members_give_no_more(features: FeatureGaussians, memb
 
 def test_splits_go_to_the_uneven_groups(features: FeatureGaussians, members: Members) -> None:
     """Group 5 gets many colours, all others one each, on a plane."""
-    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]].numpy()
+    sh0, own = np.zeros_like(members.sh0), features.members[features.starts[5] : features.starts[6]]
     sh0[own, 0] = np.random.default_rng(0).normal(size=(len(own), 3))
     means = members.means.copy()
     means[:, 2] = 0
@@ -268,10 +267,10 @@ def test_a_first_step_that_only_pays_with_the_second() -> None:
 
 
 def test_splits_leave_the_backing_alone(features: FeatureGaussians, members: Members) -> None:
-    backing = torch.arange(24) % 2 == 0
+    backing = np.arange(24) % 2 == 0
     counts = split_counts(replace(features, backing=backing), members, 1000)
     assert counts.tolist() == [1, 8] * 12
-    assert split_counts(replace(features, backing=torch.ones(24, dtype=torch.bool)), members, 5).tolist() == [1] * 24
+    assert split_counts(replace(features, backing=np.ones(24, bool)), members, 5).tolist() == [1] * 24
 
 
 def test_splits_of_nothing(members: Members) -> None:
@@ -290,7 +289,7 @@ def test_children_stand_in_the_order_of_their_groups(features: FeatureGaussians,
     children = decode(features, members, DecodeOptions(min_opacity=0), counts)
     one = decode(features, members, DecodeOptions(min_opacity=0))
     for group, (first, last) in enumerate(itertools.pairwise(np.append(0, np.cumsum(counts)))):
-        low, high = children.means[first:last].aminmax(dim=0)
+        low, high = children.means[first:last].min(0), children.means[first:last].max(0)
         assert (one.means[group] >= low - 1e-5).all()
         assert (one.means[group] <= high + 1e-5).all()
     whole = counts == 1
@@ -307,11 +306,11 @@ def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Memb
 
 
 def test_most_important_keeps_the_most_important() -> None:
-    importance = torch.tensor([3.0, 1.0, 3.0, float("nan"), 0.0, 5.0])
+    importance = np.array([3.0, 1.0, 3.0, np.nan, 0.0, 5.0])
     assert most_important(importance, 3).tolist() == [0, 2, 5]
     assert most_important(importance, 2).tolist() == [0, 5]
     assert most_important(importance, 5).tolist() == [0, 1, 2, 4, 5]
-    assert most_important(importance.numpy(), 9).tolist() == [0, 1, 2, 3, 4, 5]
+    assert most_important(importance, 9).tolist() == [0, 1, 2, 3, 4, 5]
     assert most_important(importance, 0).tolist() == []
     with pytest.raises(ValueError, match="count: expected at least 0, got -1"):
         most_important(importance, -1)
@@ -326,5 +325,5 @@ def test_colours_of_sh_and_of_photos_weigh_the_same() -> None:
         np.ones(4, np.float32), np.array([0, 0, 1, 1], np.float32)[:, None, None] * np.full(3, 0.2 / SH_C0, np.float32),
         np.zeros((4, 0, 3), np.float32), np.ones(4, np.float32),
     )  # fmt: skip
-    one = replace(scenes.make_features(np.zeros((1, 3))), starts=torch.tensor([0, 4]), members=torch.arange(4))
+    one = replace(scenes.make_features(np.zeros((1, 3))), starts=np.array([0, 4]), members=np.arange(4))
     np.testing.assert_allclose(_child_errors(one, same, np.array([0]), 3), [[0.12, 0, np.nan]], atol=1e-7)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.errors import SceneError
@@ -50,9 +49,9 @@ def made(noise: Noise, given: TrueView | None = None, seed: int = 0) -> Gaussian
 
 def seen_again(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Pixel positions and depths of means."""
-    viewmats = torch.from_numpy(np.linalg.inv(POSE))[None]
-    pixels, depths = project(gaussians.means, Cameras(viewmats, torch.from_numpy(LENS.intrinsics)[None], W, H))
-    return pixels[0].numpy(), depths[0].numpy().reshape(H, W)
+    cameras = Cameras(np.linalg.inv(POSE)[None], LENS.intrinsics[None], W, H)
+    pixels, depths = project(gaussians.means, cameras)
+    return pixels[0], depths[0].reshape(H, W)
 
 
 def test_without_noise_every_gaussian_is_where_its_pixel_looks() -> None:
@@ -68,10 +67,10 @@ def test_without_noise_every_gaussian_is_where_its_pixel_looks() -> None:
 
 def test_thin_axes_are_the_normals() -> None:
     turns = quat_to_rotmat(made(replace(CLEAN, flatness=0.2)).quats)
-    np.testing.assert_allclose(np.abs(turns[:, :, 2].numpy() @ POSE[:3, 2]), 1, atol=1e-5)
+    np.testing.assert_allclose(np.abs(turns[:, :, 2] @ POSE[:3, 2]), 1, atol=1e-5)
     normals = np.random.default_rng(0).normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    axis = quat_to_rotmat(torch.from_numpy(quats_facing(normals)))[:, :, 2].numpy()
+    axis = quat_to_rotmat(quats_facing(normals))[:, :, 2]
     np.testing.assert_allclose(np.abs((axis * normals).sum(1)), 1, atol=1e-6)
 
 
@@ -124,7 +123,7 @@ def test_shares_are_met() -> None:
     gaussians = made(noise)
     ratio = seen_again(gaussians)[1] / seen().depth
     assert (ratio < 0.96).mean() == pytest.approx(0.1, abs=0.025)
-    sizes = gaussians.scales[:, 0].numpy().reshape(H, W) / (seen_again(gaussians)[1] / LENS.focal)
+    sizes = gaussians.scales[:, 0].reshape(H, W) / (seen_again(gaussians)[1] / LENS.focal)
     assert (sizes > 1.5).mean() == pytest.approx(0.1, abs=0.025)
     patches = np.log(seen_again(made(replace(CLEAN, patches=0.2, patch_error=0.3)))[1] / seen().depth)
     assert (np.abs(patches) > 1e-4).mean() == pytest.approx(0.2, abs=0.02)
@@ -135,7 +134,7 @@ def test_harmonics_show_the_photo_to_their_own_camera(degree: int) -> None:
     gaussians = made(replace(CLEAN, sh_degree=degree, harmonics=0.05))
     assert gaussians.shN.shape[1] == (degree + 1) ** 2 - 1
     assert gaussians.shN.std() == pytest.approx(0.05, rel=0.5)
-    parts = (gaussians.means.numpy(), gaussians.sh0.numpy(), gaussians.shN.numpy())
+    parts = (gaussians.means, gaussians.sh0, gaussians.shN)
     actual = np.empty((W * H, 3), np.float32)
     view_colors(*parts, np.arange(W * H, dtype=np.int32), POSE[:3, 3].astype(np.float32), 0, W * H, actual)
     np.testing.assert_allclose(actual, seen().image.reshape(-1, 3), atol=1e-4)

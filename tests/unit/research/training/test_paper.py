@@ -13,8 +13,9 @@ from learned import noisy
 from scenes import arc, make_scene, room
 from training_runs import PAPER, TINY, written
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry import rotmat_to_quat
 from gsmerge.networks import Networks, load_checkpoint
+from gsmerge.networks.residuals import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options, train
 from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
@@ -70,18 +71,18 @@ def test_some_views_of_an_example_are_an_example_of_some_views(example: Example)
     part = select_views(example, [1, 3])
     pixels = 48 * 36
     assert (len(part.cameras), len(part.photos), part.covers.shape[:2]) == (2, 4, (2, 4))
-    torch.testing.assert_close(part.cameras.viewmats, example.cameras.viewmats[[1, 3]])
+    np.testing.assert_array_equal(part.cameras.viewmats, example.cameras.viewmats[[1, 3]])
     np.testing.assert_array_equal(part.members.means[:pixels], example.members.means[pixels : 2 * pixels])
     np.testing.assert_array_equal(part.images, example.images[[1, 3, 0, 2]])
     np.testing.assert_array_equal(part.covers[1, 2], example.covers[3, 0])
-    rows = torch.isin(example.features.views, torch.tensor([1, 3]))
-    torch.testing.assert_close(part.base.means, example.base.means[rows])
+    rows = np.isin(example.features.views, [1, 3])
+    np.testing.assert_array_equal(part.base.means, example.base.means[rows])
     assert set(part.features.views.tolist()) == {0, 1}
     for row in range(0, len(part.features), 17):
         own = part.features.members[part.features.starts[row] : part.features.starts[row + 1]]
         assert set((own // pixels).tolist()) == {int(part.features.views[row])}
-        weights = part.members.opacities[own.numpy()]
-        mean = (weights[:, None] * part.members.means[own.numpy()]).sum(0) / weights.sum()
+        weights = part.members.opacities[own]
+        mean = (weights[:, None] * part.members.means[own]).sum(0) / weights.sum()
         np.testing.assert_allclose(part.features.means[row], mean, atol=1e-4)
     assert part.mask(2).sum() <= example.mask(0).sum()
     assert select_views(example, range(4)) is example
@@ -91,9 +92,9 @@ def test_the_preset_s_examples_have_clusters(example: Example) -> None:
     """Boxes of one surface that is seen from two places hardly ever share 0.7, which was their limit once."""
     crop = whole_photo(example, 0).crop
     paper = preset_options("paper")
-    sizes = torch.bincount(match_crop(crop, example.features, paper).clusters)
+    sizes = np.bincount(match_crop(crop, example.features, paper).clusters)
     assert float(sizes[sizes > 1].sum()) > 0.1 * len(example.features)
-    strict = torch.bincount(match_crop(crop, example.features, replace(paper, iou=0.7)).clusters)
+    strict = np.bincount(match_crop(crop, example.features, replace(paper, iou=0.7)).clusters)
     assert int(strict[strict > 1].sum()) < 0.5 * int(sizes[sizes > 1].sum())
     shares = [predict(window.crop, noisy(TINY), PAPER, 0).matched for window in windows(example, 12)]
     assert max(shares) > 0.1
@@ -135,26 +136,21 @@ def teacher_of(example: Example) -> Prediction:
     merged = merge(example.features, match_crop(crop, example.features, PAPER))
     means, covars = [], []
     for first, last in zip(merged.starts[:-1].tolist(), merged.starts[1:].tolist(), strict=True):
-        ids = merged.members[first:last].numpy()
+        ids = merged.members[first:last]
         weights, points = m.opacities[ids].astype(float)[:, None], m.means[ids].astype(float)
         means.append((weights * points).sum(0) / weights.sum())  # eq. teacher_mean
         offsets = points - means[-1]
         covars.append((weights * offsets).T @ offsets / weights.sum())  # eq. teacher_cov
-    floor = (0.1 * merged.footprints.double())[:, None, None] ** 2 * torch.eye(3)  # one pixel has no spread
-    values, axes = torch.linalg.eigh(torch.from_numpy(np.stack(covars)) + floor)
-    axes[:, :, 0] *= torch.linalg.det(axes)[:, None]
+    floor = (0.1 * merged.footprints.astype(float))[:, None, None] ** 2 * np.eye(3)  # one pixel has no spread
+    values, axes = np.linalg.eigh(np.stack(covars) + floor)
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]
     count = len(merged)
+    columns = np.stack(means), rotmat_to_quat(axes), np.sqrt(values)
     gaussians = Gaussians(
-        torch.from_numpy(np.stack(means)).float(), rotations_to_quats(axes), values.sqrt().float(),
+        *(torch.from_numpy(column).float() for column in columns),
         torch.full((count,), 0.5), torch.zeros(count, 1, 3), torch.zeros(count, 0, 3),
     )  # fmt: skip
     return Prediction(gaussians, torch.arange(count), merged, torch.zeros(count, 13), 0.0)
-
-
-def rotations_to_quats(rotations: torch.Tensor) -> torch.Tensor:
-    from gsmerge.geometry import rotmat_to_quat
-
-    return rotmat_to_quat(rotations).float()
 
 
 def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:
@@ -182,8 +178,8 @@ def turn(quats: torch.Tensor, angle: float) -> torch.Tensor:
 def test_axes_in_another_order_are_the_same_gaussian(example: Example) -> None:
     exact = teacher_of(example)
     g = exact.gaussians
-    cycled = quat_to_rotmat(g.quats)[:, :, [1, 2, 0]]
-    other = replace(exact, gaussians=replace(g, quats=rotations_to_quats(cycled), scales=g.scales[:, [1, 2, 0]]))
+    cycled = torch.from_numpy(rotmat_to_quat(quat_to_rotmat(g.quats)[:, :, [1, 2, 0]].numpy()))
+    other = replace(exact, gaussians=replace(g, quats=cycled, scales=g.scales[:, [1, 2, 0]]))
     assert float(teacher_loss(other, example.members)) < 0.02
 
 

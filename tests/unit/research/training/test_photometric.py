@@ -71,7 +71,7 @@ def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Examp
     photos = full.photos()
     images = scene().images
     assert images is not None
-    np.testing.assert_array_equal(photos.images, images.numpy()[[0, 3, 1, 2]])
+    np.testing.assert_array_equal(photos.images, images[[0, 3, 1, 2]])
     assert (len(example.cameras), len(example.photos)) == (2, 4)
     assert example.images.shape[1:3] == example.photos.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2)
     assert example.photo_ids(novel=False) == [0, 1]
@@ -81,28 +81,28 @@ def test_photos_of_the_views_come_first_and_all_look_at_one_world(example: Examp
     assert coverage(whole).shape == (4, 4, HEIGHT, WIDTH)
     assert make_training_scene(scene(), range(4)).photos(1.5).images.shape == (4, 24, 32, 3)
     canonical = whole.cameras.viewmats[[0, 3, 1, 2]]
-    ratio = full.cameras.centres.diff(dim=0) / whole.cameras.centres[[0, 3, 1, 2]].diff(dim=0)
-    torch.testing.assert_close(full.cameras.viewmats[:, :3, :3], canonical[:, :3, :3])
-    torch.testing.assert_close(ratio[:, 0], ratio[:1, 0].expand(3))
+    ratio = np.diff(full.cameras.centres[:, 0]) / np.diff(whole.cameras.centres[[0, 3, 1, 2], 0])
+    np.testing.assert_allclose(full.cameras.viewmats[:, :3, :3], canonical[:, :3, :3], rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-7, atol=1e-7)
 
 
 def test_held_out_photos_of_another_size_fit_in() -> None:
     part = scene()
     assert part.images is not None
-    small = torch.nn.functional.avg_pool2d(part.images[1:2].permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
-    Ks = part.cameras.Ks[1:2].clone()
+    small = part.images[1:2].reshape(1, HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((2, 4))
+    Ks = part.cameras.Ks[1:2].copy()
     Ks[:, :2] /= 2
     held_out = Views(Cameras(part.cameras.viewmats[1:2], Ks, WIDTH // 2, HEIGHT // 2), small, ("one",))
     training_scene = make_training_scene(part, [0, 1, 2, 3], held_out)
-    torch.testing.assert_close(training_scene.cameras.Ks[4], training_scene.cameras.Ks[1], check_dtype=False)
-    torch.testing.assert_close(training_scene.cameras.viewmats[4], training_scene.cameras.viewmats[1])
+    np.testing.assert_allclose(training_scene.cameras.Ks[4], training_scene.cameras.Ks[1])
+    np.testing.assert_allclose(training_scene.cameras.viewmats[4], training_scene.cameras.viewmats[1])
     assert np.abs(training_scene.images[4] - training_scene.images[1]).mean() < 0.05
 
 
 def test_masks_leave_out_what_the_views_have_not_seen() -> None:
     part = scene()
-    turned = part.cameras.viewmats.clone()
-    turned[3] = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=turned.dtype)) @ turned[3]  # looks the other way
+    turned = part.cameras.viewmats.copy()
+    turned[3] = np.diag([-1.0, 1, -1, 1]) @ turned[3]  # looks the other way
     covers = coverage(make_training_scene(replace(part, cameras=replace(part.cameras, viewmats=turned)), [0, 1]))
     masks = covered_pixels(covers)
     assert masks[:2].mean() > 0.95
@@ -131,7 +131,7 @@ def test_windows_lie_in_the_photo_and_hold_what_can_be_seen(example: Example) ->
         whole = whole_photo(example, window.photo, window.crop.k)
         camera = Cameras(whole.camera.viewmats, whole.camera.Ks, WIDTH // 2, HEIGHT // 2)
         parts = [analytic_gaussians(crop, PHOTO) for crop in (window.crop, whole.crop)]
-        drawn = [render(part, camera, near=0.01).images[0].numpy() for part in parts]
+        drawn = [render(part, camera, near=0.01).images[0] for part in parts]
         inside = [image[box.top : box.top + box.height, box.left : box.left + box.width] for image in drawn]
         np.testing.assert_allclose(inside[0], inside[1], atol=1e-5)
 
@@ -276,9 +276,9 @@ def test_what_is_rendered_is_what_the_stages_make(example: Example, outputs: str
     options = DecodeOptions(k=k, min_opacity=0)
     expected = decode(refine_features(merged, learned), example.members, options, networks=learned)
     with torch.no_grad():
-        real = predict(whole_photo(example, 0, k).crop, networks, PHOTO, 0).gaussians
+        real = predict(whole_photo(example, 0, k).crop, networks, PHOTO, 0).gaussians.numpy()
     for name in ("means", "scales", "opacities", "sh0"):
-        torch.testing.assert_close(getattr(real, name), getattr(expected, name), atol=1e-4, rtol=1e-3)
+        np.testing.assert_allclose(getattr(real, name), getattr(expected, name), atol=1e-4, rtol=1e-3)
 
 
 def boxes(means: list[list[float]], sizes: list[float], opacities: list[float]) -> Gaussians:

@@ -59,8 +59,8 @@ def shard(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Shard:
 
 
 def everything(example: Example, k: int) -> Crop:
-    rows = torch.arange(len(example.features))
-    return Crop(example, k, rows, torch.ones(len(rows), dtype=torch.bool))
+    rows = np.arange(len(example.features))
+    return Crop(example, k, rows, np.ones(len(rows), bool))
 
 
 def files(out: Path) -> dict[str, bytes]:
@@ -71,14 +71,14 @@ def test_targets_lead_from_the_start_to_the_fit(example: Example) -> None:
     """Each analytic child has one, in the order that children come in."""
     for k, targets in example.targets.items():
         assert len(analytic_gaussians(everything(example, k), OPTIONS)) == len(targets.parents) == len(targets.mask)
-        assert bool(targets.mask.any())
-        assert bool(targets.corrections[targets.mask].any(1).all())
-        assert not bool(targets.corrections[~targets.mask].any())
-        assert int(torch.bincount(targets.parents).max()) == k
+        assert targets.mask.any()
+        assert targets.corrections[targets.mask].any(1).all()
+        assert not targets.corrections[~targets.mask].any()
+        assert np.bincount(targets.parents).max() == k
 
 
 def test_differences_undo_corrections(example: Example) -> None:
-    start = analytic_gaussians(everything(example, 1), OPTIONS)
+    start = analytic_gaussians(everything(example, 1), OPTIONS).to("cpu")
     start = replace(start, opacities=start.opacities.clamp(0.1, 0.9))
     raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
     frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
@@ -98,24 +98,24 @@ def test_untrained_networks_predict_nothing(example: Example) -> None:
 def test_rows_after_merging(example: Example) -> None:
     assert example.matches is not None
     rows, merged = merged_rows(example.matches), merge(example.features, example.matches)
-    weights = torch.zeros(len(merged)).index_add(0, rows, example.features.weights)
-    torch.testing.assert_close(weights, merged.weights)
+    weights = np.bincount(rows, example.features.weights)
+    np.testing.assert_allclose(weights, merged.weights, rtol=1.3e-6, atol=1e-5)
     assert len(merged) < len(example.features)
 
 
 def test_crops_hold_whole_clusters_and_their_targets(example: Example) -> None:
     assert example.matches is not None
-    sizes = torch.bincount(example.matches.clusters)
+    sizes = np.bincount(example.matches.clusters)
     rows = merged_rows(example.matches)
     for seed in range(4):
         crop = sample_crop(example, (2,), 40, 0.5, np.random.default_rng(seed))
-        inside = torch.bincount(example.matches.clusters[crop.rows], minlength=len(sizes))
-        assert bool(((inside == 0) | (inside == sizes)).all())
+        inside = np.bincount(example.matches.clusters[crop.rows], minlength=len(sizes))
+        assert ((inside == 0) | (inside == sizes)).all()
         corrections, scored = crop_targets(crop)
         prediction = predict(crop, Networks(TINY), OPTIONS, 0)
         assert len(prediction.gaussians) == len(corrections) == len(scored)
-        expected = torch.isin(example.targets[2].parents, rows[crop.rows])
-        torch.testing.assert_close(corrections, example.targets[2].corrections[expected])
+        expected = np.isin(example.targets[2].parents, rows[crop.rows])
+        np.testing.assert_array_equal(corrections, example.targets[2].corrections[expected])
         assert 0 < int(scored.sum()) < int(example.targets[2].mask[expected].sum())
 
 
@@ -130,13 +130,14 @@ def test_what_is_trained_is_what_runs(example: Example) -> None:
         real = predict(everything(example, 2), networks, OPTIONS, 5).corrections
     group_features = learned.describe(refined)
     children, parents = divide(refined, example.members, np.full(len(refined), 2))
-    expected = run_heads(children, parents, refined, group_features, learned)
+    expected = run_heads(children.to("cpu"), parents, refined, group_features, learned)
     torch.testing.assert_close(real, expected, atol=1e-5, rtol=1e-5)
     with torch.no_grad():
         total = predict(everything(example, 1), networks, OPTIONS, 5).corrections
     final = decode(refined, example.members, DecodeOptions(min_opacity=0), networks=learned)
     start = analytic_gaussians(everything(example, 1), OPTIONS)
-    made = corrections_between(start, final, learned.describe(merge(example.features, example.matches)).frames)
+    frames = learned.describe(merge(example.features, example.matches)).frames
+    made = corrections_between(start.to("cpu"), final.to("cpu"), frames)
     for columns in (MEAN, SIZE, slice(LOGIT, LOGIT + 1)):  # later stages stand in other frames and sizes
         pair = torch.stack([total[:, columns].reshape(-1), made[:, columns].reshape(-1)])
         assert float(torch.corrcoef(pair)[0, 1]) > 0.8
@@ -150,8 +151,8 @@ def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> No
         some = predict(small, networks, OPTIONS, 0)
     assert example.matches is not None
     rows = merged_rows(example.matches)
-    kept = torch.unique(rows[small.rows])
-    inner = torch.isin(kept, rows[small.rows[small.inner]])
+    kept = np.unique(rows[small.rows])
+    inner = np.isin(kept, rows[small.rows[small.inner]])
     torch.testing.assert_close(some.corrections[inner], whole.corrections[kept][inner], atol=1e-5, rtol=1e-4)
 
 
@@ -175,7 +176,7 @@ def test_a_trained_checkpoint_works(shard: Shard, tmp_path: Path) -> None:
     chosen = {"fit": "none", "superpixels": "10%", "robust": False}
     plain = gsmerge.compact(scene(), **chosen)
     learned = gsmerge.compact(scene(), **chosen, checkpoint=str(done.last), require_checkpoint=True)
-    assert not torch.equal(plain.gaussians.means, learned.gaussians.means)
+    assert not np.array_equal(plain.gaussians.means, learned.gaussians.means)
     assert learned.report.choices["networks"]["training"]["step"] == 4
 
 

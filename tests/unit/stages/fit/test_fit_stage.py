@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.render.photos import Photos
@@ -60,12 +59,12 @@ def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch
     assert (report.method, report.accepted) == ("color", True)
     colored, _ = fit(start, photos, replace(QUICK, fit="color"))
     assert scenes.identical(result, colored)
-    assert torch.equal(result.means, start.means)
-    assert not torch.equal(result.sh0, start.sh0)
+    assert np.array_equal(result.means, start.means)
+    assert not np.array_equal(result.sh0, start.sh0)
 
 
 def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
-    grey = replace(truth, sh0=torch.zeros_like(truth.sh0))
+    grey = replace(truth, sh0=np.zeros_like(truth.sh0))
     options = replace(LONG, prior_weight=1e-6, iterations=60, huber=10.0)
     result, report = fit(grey, noise, options, count=2 * len(grey))
     assert report is not None
@@ -75,7 +74,7 @@ def test_stage_refuses_both_on_noise(truth: Gaussians, noise: Pair) -> None:
 
 def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None:
     """Hidden ones go, those outside all photos stay, nothing else changes."""
-    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
     behind = replace(truth[:3], means=truth.means[:3] - 100)
     start = Gaussians.concat([opaque, hidden, behind])
@@ -90,7 +89,7 @@ def test_stage_without_a_fit_only_prunes(truth: Gaussians, photos: Pair) -> None
 
 
 def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
-    opaque = replace(truth, opacities=torch.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
+    opaque = replace(truth, opacities=np.full_like(truth.opacities, 0.98), scales=2 * truth.scales)
     hidden = replace(truth[:3], means=4 * truth.means[:3], scales=0.2 * truth.scales[:3])
     for method in ("color", "full"):
         options = replace(QUICK, fit=method)  # type: ignore[arg-type]
@@ -122,11 +121,11 @@ def test_settings_out_of_range_are_refused(setting: dict[str, Any]) -> None:
 def test_shown(photos: Pair) -> None:
     """In sight, hidden behind an opaque sheet, and outside all photos."""
     sheet = [[x, y, 2.0] for x in np.linspace(-2, 2, 41) for y in np.linspace(-2, 2, 41)]
-    means = torch.tensor([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]])
+    means = np.array([*sheet, [0.0, 0, 2.5], [0, 0, -5], [0, 0, 1.0]], np.float32)
     n = len(means)
     made = Gaussians(
-        means, torch.tensor([1.0, 0, 0, 0]).expand(n, 4), torch.full((n, 3), 0.1), torch.full((n,), 0.99),
-        torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
+        means, np.tile(np.eye(1, 4, dtype=np.float32), (n, 1)), np.full((n, 3), 0.1, np.float32),
+        np.full(n, 0.99, np.float32), np.zeros((n, 1, 3), np.float32), np.zeros((n, 0, 3), np.float32),
     )  # fmt: skip
     made.scales[-3:] = 0.02
     assert visible_mask(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import torch
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.geometry import covariances
@@ -22,7 +21,7 @@ from gsmerge.stages.fit.state import State, gaussians_of, start_state
 def make(degree: int) -> tuple[PixelScene, Gaussians]:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     actual = scenes.plain(scene, superpixels="8%")
-    return scene, replace(actual, means=actual.means.float())
+    return scene, replace(actual, means=actual.means.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +52,8 @@ def used(gaussians: Gaussians) -> State:
 
 
 def covars_of(x: np.ndarray) -> np.ndarray:
-    made = torch.from_numpy(x).double()
-    return covariances(made[:, QUAT:LOGIT], made[:, SIZE:QUAT].exp()).numpy()
+    made = x.astype(np.float64)
+    return covariances(made[:, QUAT:LOGIT], np.exp(made[:, SIZE:QUAT]))
 
 
 # the state
@@ -68,14 +67,14 @@ def test_state_and_back(degree: int) -> None:
     assert state.x.dtype == np.float32
     actual = gaussians_of(state.x, state.splats.shN)
     assert actual.sh_degree == degree
-    torch.testing.assert_close(actual.means, gaussians.means, rtol=0, atol=0)
-    torch.testing.assert_close(actual.quats, gaussians.quats, rtol=0, atol=0)
-    torch.testing.assert_close(actual.shN, gaussians.shN, rtol=0, atol=0)
-    torch.testing.assert_close(actual.scales, gaussians.scales, rtol=1e-5, atol=0)
-    torch.testing.assert_close(actual.opacities, gaussians.opacities, rtol=0, atol=1e-6)
-    torch.testing.assert_close(actual.sh0, gaussians.sh0, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(actual.means, gaussians.means)
+    np.testing.assert_array_equal(actual.quats, gaussians.quats)
+    np.testing.assert_array_equal(actual.shN, gaussians.shN)
+    np.testing.assert_allclose(actual.scales, gaussians.scales, rtol=1e-5, atol=0)
+    np.testing.assert_allclose(actual.opacities, gaussians.opacities, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(actual.sh0, gaussians.sh0, rtol=0, atol=1e-6)
     for name in scenes.FIELDS:
-        assert getattr(actual, name).dtype == torch.float32
+        assert getattr(actual, name).dtype == np.float32
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -88,22 +87,21 @@ def test_state_is_drawn_like_its_gaussians(degree: int) -> None:
 
 
 def test_unit_is_the_mean_of_the_two_largest_scales(gaussians: Gaussians) -> None:
-    expected = gaussians.scales.sort(1).values[:, 1:].prod(1).sqrt()
+    expected = np.sort(gaussians.scales, 1)[:, 1:].prod(1) ** 0.5
     np.testing.assert_allclose(start_state(gaussians).units, expected, rtol=1e-5)
 
 
 def test_state_does_not_share_memory_with_the_gaussians(gaussians: Gaussians) -> None:
-    before = [getattr(gaussians, name).clone() for name in scenes.FIELDS]
+    before = [getattr(gaussians, name).copy() for name in scenes.FIELDS]
     state = start_state(gaussians)
     for array in (state.x, state.colors, state.splats.means, state.splats.scales, state.splats.opacities):
         array += 1
-    assert all(torch.equal(getattr(gaussians, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
+    assert all(np.array_equal(getattr(gaussians, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
 
 
 def test_ends_of_the_range_stay_finite(gaussians: Gaussians) -> None:
-    hard = replace(
-        gaussians[:4], opacities=torch.tensor([0.0, 1.0, 1e-9, 0.5]), scales=torch.tensor([[0.0, 1e-30, 1e6]] * 4)
-    )
+    opacities, scales = np.array([0.0, 1.0, 1e-9, 0.5], np.float32), np.array([[0.0, 1e-30, 1e6]] * 4, np.float32)
+    hard = replace(gaussians[:4], opacities=opacities, scales=scales)
     state = start_state(hard)
     assert np.isfinite(state.x).all()
     assert np.isfinite(state.units).all()
