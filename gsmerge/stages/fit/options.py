@@ -7,7 +7,7 @@ from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
-STEPS = {"draft": 12, "fast": 30, "default": 280, "best": 1000}  # of the full fit, by effort
+STEPS = {"draft": 12, "fast": 30, "default": 220, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
@@ -39,8 +39,8 @@ class LearningRates:
     opacities_lr: float = 0.3
     colors_lr: float = 0.03
     decay: float = 0.2
-    beta1: float = 0.7
-    beta2: float = 0.99
+    beta1: float = 0.5
+    beta2: float = 0.9
     max_mean_shift: float = 2.0
     max_scale_change: float = 2.5
     max_opacity_change: float = 4.0
@@ -90,7 +90,7 @@ class FitOptions:
     time_budget: float | None = None
     dropout: float | None = None
     half_res_share: float | None = None
-    average_share: float = 0.05
+    average_share: float = 0.1
     ssim_lambda: float = 0.2
     opacity_reg: float = 0.03
     scale_reg: float = 0.01
