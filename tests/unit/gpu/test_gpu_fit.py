@@ -35,6 +35,7 @@ from gsmerge.stages.fit import grow as stage_grow
 from gsmerge.stages.fit import holdout as stage_holdout
 from gsmerge.stages.fit.full import step_sizes
 from gsmerge.stages.fit.loss import image_gradient
+from gsmerge.stages.fit.options import LearningRates
 from gsmerge.stages.fit.state import start_state
 
 Pair = tuple[Photos, Photos]
@@ -43,7 +44,8 @@ ROOT = Path(__file__).resolve().parents[3]
 gpu = pytest.mark.skipif(
     not torch.cuda.is_available() or find_spec("gsplat") is None, reason="needs a CUDA device and gsplat"
 )
-PULLS = FitOptions(fit_steps=8, holdout=0.2)
+# A long memory: with a short one a difference in the last bit is a full step sooner.
+PULLS = FitOptions(fit_steps=8, holdout=0.2, rates=LearningRates(beta1=0.7, beta2=0.99))
 # Without the pulls: where they are the whole gradient, Adam turns its last bit into a full step.
 QUICK = replace(PULLS, opacity_reg=0.0, scale_reg=0.0)
 
