@@ -132,6 +132,6 @@ def test_a_second_pass_neither_blurs_nor_darkens(scene: PixelScene, settings: di
     once = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
     loose = UnalignedScene(once, scene.cameras, scene.images, scene.names)
     twice = compact(loose, budget=len(once), **settings).gaussians
-    assert 0.99 * len(once) <= len(twice) <= len(once)  # what no photo shows goes
+    assert 0.95 * len(once) <= len(twice) <= len(once)  # what the pull on opacities has faded goes
     assert scenes.psnr_of(twice, scene) > scenes.psnr_of(once, scene) - 0.2
     assert coverage(twice, scene)[1] == pytest.approx(coverage(once, scene)[1], abs=1 / 255)
