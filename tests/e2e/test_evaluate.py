@@ -36,6 +36,16 @@ def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callabl
         assert len(list(csv.DictReader(file))) == 2 * 9
 
 
+def test_other_sizes(scene_copy: Path, run: Run) -> None:
+    call = ("evaluate", scene_copy, "--targets", scene_copy / "targets", "--no-context", "--lpips", "none")
+    outcome = run(*call, "--zoom", ".5,1,2", "--compensated", "--json")
+    document = json.loads(outcome.out)
+    sizes = document["results"][0]["mean"]["target"]["zooms"]
+    assert [one["zoom"] for one in sizes] == [0.5, 1, 2]
+    assert sizes[1]["psnr"] == document["results"][0]["mean"]["target"]["psnr"]
+    assert "PSNR 0.5x" in run(*call, "--zoom", ".5").out
+
+
 def test_agrees_with_the_measuring_example(scene_copy: Path, small: Path, run: Run, target_psnr) -> None:
     outcome = run("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none", "--json")
     mean = json.loads(outcome.out)["results"][1]["mean"]["target"]
@@ -118,6 +128,9 @@ def test_a_scene_without_cameras(command: str, scene_copy: Path, run: Run) -> No
         (("--targets", "nowhere.json"), 3, "expected cameras of held-out views"),
         (("--targets", "transforms.json"), 3, "the scene was not made of"),
         (("--csv", "scene.ply"), 2, "other than the input"),
+        (("--zoom=a,2",), 2, "sizes such as .5,1,2,4"),
+        (("--zoom=0",), 2, "from 1/16 to 16"),
+        (("--zoom=2,2",), 2, "every size once"),
     ],
 )
 def test_bad_calls(arguments: tuple[str, ...], code: int, words: str, scene_copy: Path, run: Run) -> None:
