@@ -25,6 +25,11 @@ def parse_zoom(text: str) -> tuple[float, ...]:
         raise typer.BadParameter(f"expected sizes such as .5,1,2,4, got {text!r}") from None
 
 
+def parse_align(text: str) -> tuple[str, ...]:
+    """``--align``: names with commas between."""
+    return tuple(part.strip() for part in text.split(","))
+
+
 @opt.command(
     opt.SCENE,
     opt.argument("results", list[Path] | None, "[RESULTS]...", "Compact .ply files of that scene.", default=None),
@@ -36,6 +41,8 @@ def parse_zoom(text: str) -> tuple[float, ...]:
         opt.option("context", bool, "Also measure the input views.", "--context/--no-context", default=True),
         opt.option("zoom", str, "Also measure PSNR and SSIM at other sizes: rendered at these multiples of the photos' "
                    "pixels per side.", wording="1", metavar="LIST", parser=parse_zoom),
+        opt.option("align", str, "Also score held-out views after alignment with their photos: of the renders' colours "
+                   "(color), of the cameras (pose), or both (color,pose).", metavar="LIST", parser=parse_align),
         opt.switch("compensated", "Render with the opacity of small Gaussians compensated for the low-pass, as some "
                    "viewers do."),
     ),
@@ -47,6 +54,8 @@ def evaluate(args: opt.Args) -> None:
     """Measure compact scenes against photos: PSNR, SSIM, LPIPS, counts, sizes, render time."""
     if not args.context and args.targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
+    if args.align and args.targets is None:
+        raise UsageError("--align: expected held-out views, whose photos to align with; name them with --targets")
     from gsmerge.io import read_ply
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
@@ -60,7 +69,7 @@ def evaluate(args: opt.Args) -> None:
     with opt.usage_errors():
         options = EvaluateOptions(
             nets, args.lpips_views, args.context, threads=args.threads, compensated=args.compensated,
-            **args.given(("zoom",)),
+            **args.given(("zoom", "align")),
         )  # fmt: skip
     load = args.load(files)
     require_views(load)

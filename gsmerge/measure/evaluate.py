@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
+from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.measure.zoom import resize_mask, resize_photo, zoom_cameras
-from gsmerge.render import render
+from gsmerge.render import prepare, render
 from gsmerge.render.metrics import psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
@@ -22,6 +23,7 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene, as_arr
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
+ALIGNMENTS = ("color", "pose")
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
@@ -42,9 +44,13 @@ class EvaluateOptions:
             Gaussians are rendered at that size and compared with the photo resized to it.
         compensated: Render with the opacity lowered by what the rasterizer's low-pass adds to small Gaussians, as some
             viewers do (``antialiased`` of :func:`gsmerge.render`).
+        align: Also score held-out views after "color", the affine map of the render's colours that brings it closest
+            to the photo, and "pose", the camera moved to where the render is closest; with both also after one and
+            then the other.
 
     Raises:
-        ValueError: If a network is unknown, the number of views not positive, or a zoom given twice or out of range.
+        ValueError: If a name is unknown, the number of views not positive, or a zoom or a name given twice or out of
+            range.
     """
 
     lpips: tuple[str, ...] = NETS
@@ -54,6 +60,7 @@ class EvaluateOptions:
     threads: int | None = None
     zoom: tuple[float, ...] = (1,)
     compensated: bool = False
+    align: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         unknown = next((net for net in self.lpips if net not in NETS), None)
@@ -65,6 +72,14 @@ class EvaluateOptions:
             raise ValueError(f"zoom: expected numbers from 1/{MAX_ZOOM:g} to {MAX_ZOOM:g}, got {_listed(self.zoom)}")
         if len(set(self.zoom)) < len(self.zoom):
             raise ValueError(f"zoom: expected every size once, got {_listed(self.zoom)}")
+        if not set(self.align) <= set(ALIGNMENTS) or len(set(self.align)) < len(self.align):
+            raise ValueError(f"align: expected {' or '.join(ALIGNMENTS)}, or both, got {_listed(self.align)}")
+
+    @property
+    def alignments(self) -> tuple[str, ...]:
+        """Names of the aligned scores: of "color", "pose" and "both"."""
+        chosen = tuple(name for name in ALIGNMENTS if name in self.align)
+        return (*chosen, "both") if chosen == ALIGNMENTS else chosen
 
 
 def _listed(values: Sequence[object]) -> str:
@@ -106,6 +121,15 @@ class ZoomScore:
 
 
 @dataclass(frozen=True)
+class AlignedScore:
+    """One result in one held-out view after its colours, its camera, or both were aligned with the photo."""
+
+    align: str  # "color", "pose", or "both": the camera first
+    full: Quality  # over all pixels
+    masked: Quality  # over those that the input views have seen, which is what was aligned
+
+
+@dataclass(frozen=True)
 class ViewScore:
     """One result in one view."""
 
@@ -115,6 +139,8 @@ class ViewScore:
     full: Quality  # over all pixels
     masked: Quality  # over those that the input views have seen (supplement A)
     zooms: tuple[ZoomScore, ...] = ()  # one for each size that was asked for, where another one than 1 was
+    aligned: tuple[AlignedScore, ...] = ()  # of a held-out view, one for each way that was asked for
+    pose_change: PoseChange | None = None  # how far the camera was moved, where poses were aligned
 
 
 @dataclass(frozen=True)
@@ -127,12 +153,25 @@ class ResultScores:
     render_seconds: float  # mean wall time of one view, all threads
     scores: tuple[ViewScore, ...]  # one for each view
 
-    def mean(self, split: str, *, zoom: float | None = None) -> tuple[Quality, Quality]:
-        """Means over the views of a split, or over their scores at one size: of all pixels, and of the visible ones."""
-        mine: list[ViewScore | ZoomScore] = [score for score in self.scores if score.split == split]
+    def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> tuple[Quality, Quality]:
+        """Means over the views of a split, or over their scores at one size or after one alignment.
+
+        Over all pixels, and over the visible ones.
+        """
+        views = [score for score in self.scores if score.split == split]
+        mine: list[ViewScore | ZoomScore | AlignedScore] = [*views]
         if zoom is not None:
-            mine = [one for score in self.scores if score.split == split for one in score.zooms if one.zoom == zoom]
+            mine = [one for score in views for one in score.zooms if one.zoom == zoom]
+        if align is not None:
+            mine = [one for score in views for one in score.aligned if one.align == align]
         return _mean([score.full for score in mine]), _mean([score.masked for score in mine])
+
+    def mean_pose_change(self, split: str) -> PoseChange | None:
+        """Mean over the views of a split; None where no camera was aligned."""
+        moves = [score.pose_change for score in self.scores if score.split == split and score.pose_change]
+        if not moves:
+            return None
+        return PoseChange(float(np.mean([m.degrees for m in moves])), float(np.mean([m.shift for m in moves])))
 
 
 @dataclass(frozen=True)
@@ -164,12 +203,13 @@ class _Split:
     drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Look:
     """How pictures are drawn."""
 
     near: float  # near plane, world units
     compensated: bool  # whether small Gaussians keep their energy
+    centre: np.ndarray  # [3] the scene's middle in the world
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
         """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
@@ -192,7 +232,7 @@ def evaluate(
     ("evaluate", done, total) after each result.
 
     Raises:
-        UsageError: If the scene has no views, or a result is called "input".
+        UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
         GsmergeError: If LPIPS is asked for and its weights are not installed.
     """
     options = options or EvaluateOptions()
@@ -200,11 +240,13 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
+    if options.align and targets is None:
+        raise UsageError("align: expected held-out views, got none")
     own, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
     with use_threads(options.threads):
-        look = _Look(near_plane(scene), options.compensated)
+        look = _Look(near_plane(scene), options.compensated, scene_frame(scene).origin)
         splits = _splits(scene, own, targets, options, look)
         scores = []
         named = {INPUT: own, **results} if options.own else results
@@ -279,7 +321,10 @@ def _score_result(
                 _score_zoom(gaussians, split, i, zoom, look) if zoom != 1 else _without_lpips(*both)
                 for zoom in options.zoom
             )  # fmt: skip
-            scores.append(ViewScore(kind, view, float(seen.mean()), *both, zooms))
+            score = ViewScore(kind, view, float(seen.mean()), *both, zooms)
+            if options.align and kind == "target":
+                score = _align_score(score, gaussians, image, split, i, nets, options, look)
+            scores.append(score)
     ratio = len(gaussians) / max(num_input, 1)
     return ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
 
@@ -293,6 +338,32 @@ def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, loo
     else:
         photo = look.image(split.drawn, cameras, view)
     return ZoomScore(zoom, *_both(image, photo, resize_mask(split.visible[view], *size), ()))
+
+
+def _align_score(
+    score: ViewScore,
+    gaussians: Gaussians,
+    image: np.ndarray,
+    split: _Split,
+    view: int,
+    nets: Sequence[str],
+    options: EvaluateOptions,
+    look: _Look,
+) -> ViewScore:
+    """A score with those of the render ``image [h,w,3]`` after alignment."""
+    cameras, photo, seen = split.views.cameras[[view]], split.views.images[view], split.visible[view]
+    pictures, change = {"plain": image}, None
+    if "pose" in options.align:
+        cameras, change = refine_pose(
+            prepare(gaussians), cameras, photo, seen,
+            centre=look.centre, near=look.near, compensated=look.compensated,
+        )  # fmt: skip
+        pictures["pose"] = look.image(gaussians, cameras, 0)
+    if "color" in options.align:
+        after = {"plain": "color", "pose": "both"}
+        pictures |= {after[name]: fit_colors(picture, photo, seen) for name, picture in pictures.items()}
+    aligned = (AlignedScore(name, *_both(pictures[name], photo, seen, nets)) for name in options.alignments)
+    return replace(score, aligned=tuple(aligned), pose_change=change)
 
 
 def _without_lpips(full: Quality, masked: Quality) -> ZoomScore:

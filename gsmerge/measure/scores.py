@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from gsmerge.measure.evaluate import Evaluation, Quality, ResultScores, ZoomScore
+from gsmerge.measure.align import PoseChange
+from gsmerge.measure.evaluate import AlignedScore, Evaluation, Quality, ResultScores, ZoomScore
 from gsmerge.report import document_head, human_bytes
 
 ZOOMED = {"psnr": 2, "ssim": 3}  # what is measured at other sizes, with the decimals that people are shown
@@ -26,8 +27,9 @@ def evaluation_document(
     """An evaluation as plain JSON types, with what is known of each result's file (path, bytes, bytes by attribute).
 
     ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a score
-    for each view), notes. Means and scores have ``zooms`` where other sizes than the photos' own were asked for, and
-    ``compensated`` is there where it is true. Keys are only ever added within one schema version.
+    for each view), notes. Means and scores have ``zooms`` where other sizes than the photos' own were asked for,
+    those of held-out views ``aligned`` and ``pose_change`` where that was, and ``compensated`` is there where it is
+    true. Keys are only ever added within one schema version.
     """
     return {
         **document_head(),
@@ -48,15 +50,34 @@ def _result(one: ResultScores, evaluation: Evaluation, file: Mapping[str, Any]) 
         "render_seconds": round(one.render_seconds, 5),
         "mean": {split: _mean(one, split, evaluation) for split in evaluation.num_views},
         "views": [
-            {"split": s.split, "view": s.view, "visible_share": s.visible, **_flat(s.full, s.masked), **_zooms(s.zooms)}
+            {
+                "split": s.split,
+                "view": s.view,
+                "visible_share": s.visible,
+                **_flat(s.full, s.masked),
+                **_zooms(s.zooms),
+                **_aligned(s.aligned, s.pose_change),
+            }
             for s in one.scores
         ],
     }
 
 
 def _mean(one: ResultScores, split: str, evaluation: Evaluation) -> dict[str, Any]:
-    sizes = () if evaluation.options.zoom == (1,) else evaluation.options.zoom
-    return _flat(*one.mean(split)) | _zooms([ZoomScore(zoom, *one.mean(split, zoom=zoom)) for zoom in sizes])
+    options = evaluation.options
+    sizes = () if options.zoom == (1,) else options.zoom
+    ways = options.alignments if split == "target" else ()
+    return {
+        **_flat(*one.mean(split)),
+        **_zooms([ZoomScore(zoom, *one.mean(split, zoom=zoom)) for zoom in sizes]),
+        **_aligned([AlignedScore(way, *one.mean(split, align=way)) for way in ways], one.mean_pose_change(split)),
+    }
+
+
+def _aligned(scores: Sequence[AlignedScore], change: PoseChange | None) -> dict[str, Any]:
+    """``aligned`` by way and ``pose_change``, where there are any."""
+    ways = {"aligned": {one.align: _flat(one.full, one.masked) for one in scores}} if scores else {}
+    return ways | ({"pose_change": asdict(change)} if change else {})
 
 
 def _zooms(scores: Sequence[ZoomScore]) -> dict[str, Any]:
@@ -73,7 +94,8 @@ def _flat(full: Quality, masked: Quality) -> dict[str, float | None]:
 def evaluation_csv(document: Mapping[str, Any]) -> str:
     """One row for each result and view; empty where something was not measured.
 
-    Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured.
+    Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured, and such as
+    ``psnr_align_pose``, ``pose_degrees`` and ``pose_shift`` where held-out views were aligned.
     """
     rows = []
     for result in document["results"]:
@@ -89,11 +111,13 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
-    """The score of a view, with a column for each figure at another size."""
-    row = {key: value for key, value in view.items() if key != "zooms"}
+    """The score of a view, with a column for each figure at another size or after alignment."""
+    row = {key: value for key, value in view.items() if key not in ("zooms", "aligned", "pose_change")}
     for score in view.get("zooms", ()):
         row |= {f"{key}_zoom_{score['zoom']:g}": value for key, value in score.items() if key != "zoom"}
-    return row
+    for way, score in view.get("aligned", {}).items():
+        row |= {f"{key}_align_{way}": value for key, value in score.items()}
+    return row | {f"pose_{key}": value for key, value in view.get("pose_change", {}).items()}
 
 
 def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
@@ -112,7 +136,7 @@ def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
             line += f"  {size:>9}  {1000 * result['render_seconds']:>8.1f}  {split:<8}"
             line += f" {_number(mean['psnr' + MASKED], 2):>6}  {_number(mean['ssim' + MASKED], 3)}"
             lines.append(line + "".join(f"  {_number(mean[name + MASKED], 3):>10}" for name in nets))
-    return lines + _zoom_lines(document, width)
+    return lines + _zoom_lines(document, width) + _aligned_lines(document, width, nets)
 
 
 def _zoom_lines(document: Mapping[str, Any], width: int) -> list[str]:
@@ -129,6 +153,25 @@ def _zoom_lines(document: Mapping[str, Any], width: int) -> list[str]:
                 cells = [_number(one[name + MASKED], digits) for one in sizes for name, digits in ZOOMED.items()]
                 lines.append(f"{result['name']:{width}}  {split:<8}" + "".join(f" {cell:>11}" for cell in cells))
     return lines
+
+
+def _aligned_lines(document: Mapping[str, Any], width: int, nets: Sequence[str]) -> list[str]:
+    """Figures after alignment: a line for each result and way; empty without them."""
+    lines: list[str] = []
+    digits = {"psnr": 2, "ssim": 3, **dict.fromkeys(nets, 3)}
+    for result in document["results"]:
+        mean = result["mean"].get("target", {})
+        for way, scores in mean.get("aligned", {}).items():
+            cells = [f"  {_number(scores[name + MASKED], places):>10}" for name, places in digits.items()]
+            change = mean.get("pose_change") if way == "pose" else None
+            moved = f"  {change['degrees']:.2f} degrees, {100 * change['shift']:.2f}% of the depth" if change else ""
+            lines.append(f"{result['name']:{width}}  {way:<8}" + "".join(cells) + moved)
+    if not lines:
+        return []
+    names = (name.upper() if name in ZOOMED else name.replace("lpips_", "LPIPS ") for name in digits)
+    head = f"{'result':{width}}  {'aligned':<8}" + "".join(f"  {name:>10}" for name in names)
+    poses = any("pose_change" in result["mean"].get("target", {}) for result in document["results"])
+    return ["held-out views, aligned with their photos", head + ("  cameras moved by (mean)" if poses else ""), *lines]
 
 
 def _number(value: float | None, digits: int) -> str:
