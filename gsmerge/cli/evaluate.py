@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks, require_views
@@ -13,6 +15,19 @@ from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
     from gsmerge.io import PlyInfo
+
+
+def parse_zoom(text: str) -> tuple[float, ...]:
+    """``--zoom``: numbers with commas between."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"expected sizes such as .5,1,2,4, got {text!r}") from None
+
+
+def parse_align(text: str) -> tuple[str, ...]:
+    """``--align``: names with commas between."""
+    return tuple(part.strip() for part in text.split(","))
 
 
 @opt.command(
@@ -24,6 +39,12 @@ if TYPE_CHECKING:
         opt.option("views", int, "Use so many of the input views, at equal intervals, as the context, and the held-out "
                    "ones midway between them as targets.", wording="all", min=1),
         opt.option("context", bool, "Also measure the input views.", "--context/--no-context", default=True),
+        opt.option("zoom", str, "Also measure PSNR and SSIM at other sizes: rendered at these multiples of the photos' "
+                   "pixels per side.", wording="1", metavar="LIST", parser=parse_zoom),
+        opt.option("align", str, "Also score held-out views after alignment with their photos: of the renders' colours "
+                   "(color), of the cameras (pose), or both (color,pose).", metavar="LIST", parser=parse_align),
+        opt.switch("compensated", "Render with the opacity of small Gaussians compensated for the low-pass, as some "
+                   "viewers do."),
     ),
     "lpips lpips_views",
     *opt.panel(opt.OUTPUT, opt.option("csv", Path, "Write a row for each result and view to this file.")),
@@ -33,6 +54,8 @@ def evaluate(args: opt.Args) -> None:
     """Measure compact scenes against photos: PSNR, SSIM, LPIPS, counts, sizes, render time."""
     if not args.context and args.targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
+    if args.align and args.targets is None:
+        raise UsageError("--align: expected held-out views, whose photos to align with; name them with --targets")
     from gsmerge.io import read_ply
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
@@ -44,7 +67,10 @@ def evaluate(args: opt.Args) -> None:
     check_outputs((args.csv, args.report), inputs, overwrite=args.overwrite)
     nets, missing = lpips_networks(args.lpips)
     with opt.usage_errors():
-        options = EvaluateOptions(nets, args.lpips_views, args.context, threads=args.threads)
+        options = EvaluateOptions(
+            nets, args.lpips_views, args.context, threads=args.threads, compensated=args.compensated,
+            **args.given(("zoom", "align")),
+        )  # fmt: skip
     load = args.load(files)
     require_views(load)
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, args.views)

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
+from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.render import render
+from gsmerge.measure.zoom import resize_mask, resize_photo, zoom_cameras
+from gsmerge.render import prepare, render
 from gsmerge.render.metrics import psnr, ssim
 from gsmerge.render.photos import NEAR
 from gsmerge.runtime.threads import use_threads
@@ -21,8 +23,10 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene, as_arr
 from gsmerge.views import pick_views
 
 NETS = ("vgg", "alex")
+ALIGNMENTS = ("color", "pose")
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
+MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
 Progress = Callable[[str, int, int], None]
 
 
@@ -36,9 +40,17 @@ class EvaluateOptions:
         context: Also measure the input views.
         own: Also measure the input itself.
         threads: Threads to use; None: all processors. The figures do not depend on it.
+        zoom: Sizes, in units of the photos' own pixels per side, at which PSNR and SSIM are also measured: the
+            Gaussians are rendered at that size and compared with the photo resized to it.
+        compensated: Render with the opacity lowered by what the rasterizer's low-pass adds to small Gaussians, as some
+            viewers do (``antialiased`` of :func:`gsmerge.render`).
+        align: Also score held-out views after "color", the affine map of the render's colours that brings it closest
+            to the photo, and "pose", the camera moved to where the render is closest; with both also after one and
+            then the other.
 
     Raises:
-        ValueError: If a network is unknown or the number of views not positive.
+        ValueError: If a name is unknown, the number of views not positive, or a zoom or a name given twice or out of
+            range.
     """
 
     lpips: tuple[str, ...] = NETS
@@ -46,6 +58,9 @@ class EvaluateOptions:
     context: bool = True
     own: bool = True
     threads: int | None = None
+    zoom: tuple[float, ...] = (1,)
+    compensated: bool = False
+    align: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         unknown = next((net for net in self.lpips if net not in NETS), None)
@@ -53,6 +68,22 @@ class EvaluateOptions:
             raise ValueError(f"lpips: expected {' or '.join(NETS)}, got {unknown!r}")
         if self.lpips_views is not None and self.lpips_views < 1:
             raise ValueError(f"lpips_views: expected at least 1, got {self.lpips_views}")
+        if not all(1 / MAX_ZOOM <= zoom <= MAX_ZOOM for zoom in self.zoom) or not self.zoom:
+            raise ValueError(f"zoom: expected numbers from 1/{MAX_ZOOM:g} to {MAX_ZOOM:g}, got {_listed(self.zoom)}")
+        if len(set(self.zoom)) < len(self.zoom):
+            raise ValueError(f"zoom: expected every size once, got {_listed(self.zoom)}")
+        if not set(self.align) <= set(ALIGNMENTS) or len(set(self.align)) < len(self.align):
+            raise ValueError(f"align: expected {' or '.join(ALIGNMENTS)}, or both, got {_listed(self.align)}")
+
+    @property
+    def alignments(self) -> tuple[str, ...]:
+        """Names of the aligned scores: of "color", "pose" and "both"."""
+        chosen = tuple(name for name in ALIGNMENTS if name in self.align)
+        return (*chosen, "both") if chosen == ALIGNMENTS else chosen
+
+
+def _listed(values: Sequence[object]) -> str:
+    return ",".join(map(str, values)) or "none"
 
 
 @dataclass(frozen=True)
@@ -81,6 +112,24 @@ class Quality:
 
 
 @dataclass(frozen=True)
+class ZoomScore:
+    """One result in one view at another size; LPIPS is not measured there."""
+
+    zoom: float  # pixels per side, of the photo's
+    full: Quality  # over all pixels
+    masked: Quality  # over those of which the input views have seen every part
+
+
+@dataclass(frozen=True)
+class AlignedScore:
+    """One result in one held-out view after its colours, its camera, or both were aligned with the photo."""
+
+    align: str  # "color", "pose", or "both": the camera first
+    full: Quality  # over all pixels
+    masked: Quality  # over those that the input views have seen, which is what was aligned
+
+
+@dataclass(frozen=True)
 class ViewScore:
     """One result in one view."""
 
@@ -89,6 +138,9 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over those that the input views have seen (supplement A)
+    zooms: tuple[ZoomScore, ...] = ()  # one for each size that was asked for, where another one than 1 was
+    aligned: tuple[AlignedScore, ...] = ()  # of a held-out view, one for each way that was asked for
+    pose_change: PoseChange | None = None  # how far the camera was moved, where poses were aligned
 
 
 @dataclass(frozen=True)
@@ -101,10 +153,25 @@ class ResultScores:
     render_seconds: float  # mean wall time of one view, all threads
     scores: tuple[ViewScore, ...]  # one for each view
 
-    def mean(self, split: str) -> tuple[Quality, Quality]:
-        """Means over the views of a split: over all pixels, and over the visible ones."""
-        mine = [score for score in self.scores if score.split == split]
+    def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> tuple[Quality, Quality]:
+        """Means over the views of a split, or over their scores at one size or after one alignment.
+
+        Over all pixels, and over the visible ones.
+        """
+        views = [score for score in self.scores if score.split == split]
+        mine: list[ViewScore | ZoomScore | AlignedScore] = [*views]
+        if zoom is not None:
+            mine = [one for score in views for one in score.zooms if one.zoom == zoom]
+        if align is not None:
+            mine = [one for score in views for one in score.aligned if one.align == align]
         return _mean([score.full for score in mine]), _mean([score.masked for score in mine])
+
+    def mean_pose_change(self, split: str) -> PoseChange | None:
+        """Mean over the views of a split; None where no camera was aligned."""
+        moves = [score.pose_change for score in self.scores if score.split == split and score.pose_change]
+        if not moves:
+            return None
+        return PoseChange(float(np.mean([m.degrees for m in moves])), float(np.mean([m.shift for m in moves])))
 
 
 @dataclass(frozen=True)
@@ -117,12 +184,37 @@ class Evaluation:
             views" where there are none of those alone.
         num_views: Views by split.
         notes: Warnings, one sentence each.
+        options: What was measured.
     """
 
     results: tuple[ResultScores, ...]
     reference: str
     num_views: dict[str, int]
     notes: tuple[str, ...]
+    options: EvaluateOptions = EvaluateOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """Views of one kind, with what their scores need."""
+
+    views: Views
+    visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
+    drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """How pictures are drawn."""
+
+    near: float  # near plane, world units
+    compensated: bool  # whether small Gaussians keep their energy
+    centre: np.ndarray  # [3] the scene's middle in the world
+
+    def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
+        """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
+        drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.compensated)
+        return np.asarray(drawn.images[0].clip(0, 1))
 
 
 def evaluate(
@@ -140,7 +232,7 @@ def evaluate(
     ("evaluate", done, total) after each result.
 
     Raises:
-        UsageError: If the scene has no views, or a result is called "input".
+        UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
         GsmergeError: If LPIPS is asked for and its weights are not installed.
     """
     options = options or EvaluateOptions()
@@ -148,23 +240,23 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
+    if options.align and targets is None:
+        raise UsageError("align: expected held-out views, got none")
     own, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
     with use_threads(options.threads):
-        near = near_plane(scene)
-        points = context_points(scene, near)
-        splits = _splits(scene, own, targets, options, near)
-        visible = {name: visible_pixels(points, views.cameras, near, scene.cameras) for name, views in splits.items()}
+        look = _Look(near_plane(scene), options.compensated, scene_frame(scene).origin)
+        splits = _splits(scene, own, targets, options, look)
         scores = []
         named = {INPUT: own, **results} if options.own else results
-        _image(own[:1], scene.cameras, 0, near)  # loads the kernels, so that no result's time contains that
+        look.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
-            scores.append(_score_result(name, gaussians, len(own), splits, visible, options, near))
+            scores.append(_score_result(name, gaussians, len(own), splits, options, look))
             if progress:
                 progress("evaluate", i + 1, len(named))
-    counts = {name: len(views.names) for name, views in splits.items()}
-    return Evaluation(tuple(scores), _reference(scene, counts), counts, _notes(visible))
+    counts = {name: len(split.views.names) for name, split in splits.items()}
+    return Evaluation(tuple(scores), _reference(scene, counts), counts, _notes(splits), options)
 
 
 def _reference(scene: PixelScene | UnalignedScene, splits: Mapping[str, int]) -> str:
@@ -179,57 +271,111 @@ def near_plane(scene: PixelScene | UnalignedScene) -> float:
     return NEAR * scene_frame(scene).unit
 
 
-def _notes(visible: Mapping[str, NDArray[np.bool_]]) -> tuple[str, ...]:
-    if "target" not in visible:
+def _notes(splits: Mapping[str, _Split]) -> tuple[str, ...]:
+    if "target" not in splits:
         return ("no held-out views were given: input views flatter what was fitted to them",)
-    if visible["target"].mean() < MIN_SEEN_SHARE:
-        share = f"{100 * visible['target'].mean():.0f} %"
-        return (f"the input views have seen {share} of the held-out views: are those of the same world?",)
+    share = splits["target"].visible.mean()
+    if share < MIN_SEEN_SHARE:
+        return (f"the input views have seen {100 * share:.0f} % of the held-out views: are those of the same world?",)
     return ()
 
 
 def _splits(
-    scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, near: float
-) -> dict[str, Views]:
-    """The views by split, with their photos or the input's renders."""
-    target = {} if targets is None else {"target": targets}
+    scene: PixelScene | UnalignedScene, own: Gaussians, targets: Views | None, options: EvaluateOptions, look: _Look
+) -> dict[str, _Split]:
+    """The views by split, with their photos or the input's renders, and their visible pixels."""
+    points = context_points(scene, look.near)
+
+    def split(views: Views, drawn: Gaussians | None) -> _Split:
+        return _Split(views, visible_pixels(points, views.cameras, look.near, scene.cameras), drawn)
+
+    target = {} if targets is None else {"target": split(targets, None)}
     if targets is not None and not options.context:
         return target
-    images = scene.images
+    images, drawn = scene.images, own if scene.images is None else None
     if images is None:
-        images = np.stack([_image(own, scene.cameras, view, near) for view in range(len(scene))])
-    return {"context": Views(scene.cameras, images, scene.names), **target}
+        images = np.stack([look.image(own, scene.cameras, view) for view in range(len(scene))])
+    return {"context": split(Views(scene.cameras, images, scene.names), drawn), **target}
 
 
 def _score_result(
     name: str,
     gaussians: Gaussians,
     num_input: int,
-    splits: Mapping[str, Views],
-    visible: Mapping[str, NDArray[np.bool_]],
+    splits: Mapping[str, _Split],
     options: EvaluateOptions,
-    near: float,
+    look: _Look,
 ) -> ResultScores:
     scores: list[ViewScore] = []
-    seconds, count = 0.0, 0
-    for split, views in splits.items():
+    seconds = 0.0
+    for kind, split in splits.items():
+        views = split.views
         perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
         for i, view in enumerate(views.names):
             start = time.perf_counter()
-            image = _image(gaussians, views.cameras, i, near)
-            seconds, count = seconds + time.perf_counter() - start, count + 1
-            nets = options.lpips if i in perceptual else ()
-            photo, seen = views.images[i], visible[split][i]
-            full = _quality(image, photo, None, nets)
-            masked = full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()
-            scores.append(ViewScore(split, view, float(seen.mean()), full, masked))
+            image = look.image(gaussians, views.cameras, i)
+            seconds += time.perf_counter() - start
+            seen, nets = split.visible[i], options.lpips if i in perceptual else ()
+            both = _both(image, views.images[i], seen, nets)
+            zooms = () if options.zoom == (1,) else tuple(
+                _score_zoom(gaussians, split, i, zoom, look) if zoom != 1 else _without_lpips(*both)
+                for zoom in options.zoom
+            )  # fmt: skip
+            score = ViewScore(kind, view, float(seen.mean()), *both, zooms)
+            if options.align and kind == "target":
+                score = _align_score(score, gaussians, image, split, i, nets, options, look)
+            scores.append(score)
     ratio = len(gaussians) / max(num_input, 1)
-    return ResultScores(name, len(gaussians), ratio, seconds / max(count, 1), tuple(scores))
+    return ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
 
 
-def _image(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> np.ndarray:
-    """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
-    return render(gaussians, cameras[[view]], near=near).images[0].clip(0, 1)
+def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, look: _Look) -> ZoomScore:
+    cameras = zoom_cameras(split.views.cameras, zoom)
+    size = cameras.width, cameras.height
+    image = look.image(gaussians, cameras, view)
+    if split.drawn is None:
+        photo = resize_photo(split.views.images[view], *size)
+    else:
+        photo = look.image(split.drawn, cameras, view)
+    return ZoomScore(zoom, *_both(image, photo, resize_mask(split.visible[view], *size), ()))
+
+
+def _align_score(
+    score: ViewScore,
+    gaussians: Gaussians,
+    image: np.ndarray,
+    split: _Split,
+    view: int,
+    nets: Sequence[str],
+    options: EvaluateOptions,
+    look: _Look,
+) -> ViewScore:
+    """A score with those of the render ``image [h,w,3]`` after alignment."""
+    cameras, photo, seen = split.views.cameras[[view]], split.views.images[view], split.visible[view]
+    pictures, change = {"plain": image}, None
+    if "pose" in options.align:
+        cameras, change = refine_pose(
+            prepare(gaussians), cameras, photo, seen,
+            centre=look.centre, near=look.near, compensated=look.compensated,
+        )  # fmt: skip
+        pictures["pose"] = look.image(gaussians, cameras, 0)
+    if "color" in options.align:
+        after = {"plain": "color", "pose": "both"}
+        pictures |= {after[name]: fit_colors(picture, photo, seen) for name, picture in pictures.items()}
+    aligned = (AlignedScore(name, *_both(pictures[name], photo, seen, nets)) for name in options.alignments)
+    return replace(score, aligned=tuple(aligned), pose_change=change)
+
+
+def _without_lpips(full: Quality, masked: Quality) -> ZoomScore:
+    return ZoomScore(1, *(replace(one, lpips_vgg=None, lpips_alex=None) for one in (full, masked)))
+
+
+def _both(
+    image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]
+) -> tuple[Quality, Quality]:
+    """Over all pixels, and over those that the input views have seen."""
+    full = _quality(image, photo, None, nets)
+    return full, full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()
 
 
 def _quality(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_] | None, nets: Sequence[str]) -> Quality:

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels.raster.project_backward import add_rows
 from gsmerge.render.blend import view_colors
-from gsmerge.render.gradient import ColorGradients, color_gradients, gradients_of
+from gsmerge.render.gradient import ColorGradients, color_gradients, gradients_of, pose_gradient
 from gsmerge.render.images import Rendering, draw_views, prepare_views
 from gsmerge.render.plan import Array, ViewPlan, plan_view
 from gsmerge.types import Cameras, Gaussians
@@ -31,12 +31,7 @@ def _view_gradients(
     colors = view_colors(plan)
     shape = gradients_of(plan, colors, image, transmittance, grad_image, -grad_alpha, pose)
     shade = color_gradients(plan, shape.colors, colors, used=used)
-    viewmat = shape.viewmat
-    if viewmat is not None:
-        # the eye is -R^T t, and moves against the means
-        eye = -shade.means.sum(0, dtype=np.float64)
-        viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
-        viewmat[:3, 3] -= plan.viewmat[:3, :3] @ eye
+    viewmat = pose_gradient(plan, shape, shade) if pose else None
     rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
     return rows, viewmat, shade
 

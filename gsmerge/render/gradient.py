@@ -181,3 +181,21 @@ def color_gradients(
             pieces(m, threads),
         )
     return ColorGradients(plan.ids, sh0, shN, means)
+
+
+def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
+    """``[4,4]`` float64 gradient with respect to the world-to-camera matrix, of geometry and of the colours seen.
+
+    Args:
+        plan: The view.
+        gradients: With that through geometry, as ``with_viewmat`` asks for.
+        shade: Gradients through the colours, which change with the camera's place; None where they do not.
+    """
+    assert gradients.viewmat is not None
+    viewmat = gradients.viewmat.copy()
+    if shade is not None:
+        # the eye is -R^T t, and moves against the means
+        eye = -shade.means.sum(0, dtype=np.float64)
+        viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
+        viewmat[:3, 3] -= plan.viewmat[:3, :3] @ eye
+    return viewmat

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import pytest
 
 from .conftest import Run
@@ -34,6 +35,33 @@ def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callabl
     assert document["num_views"] == {"context": 5, "target": 4}
     with table.open() as file:
         assert len(list(csv.DictReader(file))) == 2 * 9
+
+
+def test_other_sizes(scene_copy: Path, run: Run) -> None:
+    call = ("evaluate", scene_copy, "--targets", scene_copy / "targets", "--no-context", "--lpips", "none")
+    outcome = run(*call, "--zoom", ".5,1,2", "--compensated", "--json")
+    document = json.loads(outcome.out)
+    sizes = document["results"][0]["mean"]["target"]["zooms"]
+    assert [one["zoom"] for one in sizes] == [0.5, 1, 2]
+    assert sizes[1]["psnr"] == document["results"][0]["mean"]["target"]["psnr"]
+    assert "PSNR 0.5x" in run(*call, "--zoom", ".5").out
+
+
+def test_alignment(scene_copy: Path, run: Run) -> None:
+    """Of held-out photos taken with another exposure and from a place that is not quite theirs."""
+    targets = scene_copy / "targets" / "transforms.json"
+    document = json.loads(targets.read_text())
+    for frame in document["frames"]:
+        frame["transform_matrix"][0][3] += 0.03
+        photo = targets.parent / frame["file_path"]
+        cv2.imwrite(str(photo), cv2.convertScaleAbs(cv2.imread(str(photo)), alpha=0.7, beta=10))
+    targets.write_text(json.dumps(document))
+    call = ("evaluate", scene_copy, "--targets", targets, "--no-context", "--lpips", "none", "--align", "color,pose")
+    mean = json.loads(run(*call, "--json").out)["results"][0]["mean"]["target"]
+    aligned = {name: scores["psnr_visible"] for name, scores in mean["aligned"].items()}
+    assert mean["psnr_visible"] + 2 < aligned["color"] < aligned["both"]
+    assert mean["pose_change"]["shift"] > 0
+    assert "cameras moved by" in run(*call).out
 
 
 def test_agrees_with_the_measuring_example(scene_copy: Path, small: Path, run: Run, target_psnr) -> None:
@@ -118,11 +146,19 @@ def test_a_scene_without_cameras(command: str, scene_copy: Path, run: Run) -> No
         (("--targets", "nowhere.json"), 3, "expected cameras of held-out views"),
         (("--targets", "transforms.json"), 3, "the scene was not made of"),
         (("--csv", "scene.ply"), 2, "other than the input"),
+        (("--align=color",), 2, "expected held-out views"),
+        (("--align=colour", "--targets", "targets"), 2, "color or pose"),
+        (("--zoom=a,2",), 2, "sizes such as .5,1,2,4"),
+        (("--zoom=0",), 2, "from 1/16 to 16"),
+        (("--zoom=2,2",), 2, "every size once"),
     ],
 )
 def test_bad_calls(arguments: tuple[str, ...], code: int, words: str, scene_copy: Path, run: Run) -> None:
     flag, *rest = arguments
-    outcome = run("evaluate", scene_copy, "--lpips", "none", flag, *(scene_copy / name for name in rest))
+    outcome = run(
+        "evaluate", scene_copy, "--lpips", "none", flag,
+        *(name if name.startswith("--") else scene_copy / name for name in rest),
+    )  # fmt: skip
     assert outcome.code == code
     assert words in outcome.err
     assert outcome.err.count("\n") == 1

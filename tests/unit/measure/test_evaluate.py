@@ -8,6 +8,7 @@ import json
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import scenes
@@ -131,6 +132,106 @@ def test_bad_arguments(scene: PixelScene, half: Gaussians) -> None:
     empty = UnalignedScene(half, scene.cameras[[]], None, ())
     with pytest.raises(ValueError, match="a scene with views"):
         evaluate(empty, {}, None, PLAIN)
+
+
+@pytest.mark.parametrize(
+    ("zoom", "words"), [((0.01,), "1/16 to 16"), ((), "got none"), ((1, 2, 2), "once"), ((math.nan,), "got nan")]
+)
+def test_bad_zooms(zoom: tuple[float, ...], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        EvaluateOptions(zoom=zoom)
+
+
+def test_zooms_are_renders_at_that_size(scene: PixelScene, half: Gaussians) -> None:
+    views, options = held_out(), replace(PLAIN, zoom=(0.5, 1, 2), context=False)
+    result = evaluate(scene, {"half": half}, views, options).results[1]
+    for score in result.scores:
+        assert [one.zoom for one in score.zooms] == [0.5, 1, 2]
+        assert score.zooms[1].masked == score.masked
+    photo = cv2.resize(views.images[1], (24, 18), interpolation=cv2.INTER_AREA)
+    Ks = views.cameras.Ks * np.array([[0.5], [0.5], [1]])
+    small = replace(views.cameras, Ks=Ks, width=24, height=18)[[1]]
+    image = gsmerge.render(half, small).images[0].clip(0, 1)
+    expected = peak_signal_noise_ratio(photo, image, data_range=1)
+    assert result.scores[1].zooms[0].full.psnr == pytest.approx(expected, abs=1e-4)
+    mean = np.mean([score.zooms[2].masked.ssim for score in result.scores])
+    assert result.mean("target", zoom=2)[1].ssim == pytest.approx(mean)
+
+
+def test_the_input_s_renders_are_the_reference_at_every_size(scene: PixelScene, half: Gaussians) -> None:
+    options = replace(PLAIN, zoom=(0.5, 2), compensated=True)
+    actual = evaluate(replace(scene, images=None), {"half": half}, None, options)
+    assert all(math.isinf(one.full.psnr or 0) for s in actual.results[0].scores for one in s.zooms)
+    assert all((one.full.psnr or 99) < 60 for s in actual.results[1].scores for one in s.zooms)
+
+
+def test_compensated_opacity(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+    views = held_out()
+    result = evaluate(scene, {"half": half}, views, replace(PLAIN, compensated=True, context=False)).results[1]
+    image = gsmerge.render(half, views.cameras[[0]], antialiased=True).images[0].clip(0, 1)
+    expected = peak_signal_noise_ratio(views.images[0], image, data_range=1)
+    assert result.scores[0].full.psnr == pytest.approx(expected, abs=1e-4)
+    assert result.mean("target") != actual.results[1].mean("target")
+
+
+def test_documents_have_zooms_where_they_were_asked_for(scene: PixelScene, actual: Evaluation) -> None:
+    plain = evaluation_document(actual, {})
+    assert "zooms" not in plain["results"][0]["views"][0]
+    assert "compensated" not in plain
+    zoomed = evaluate(scene, {}, held_out(), replace(PLAIN, zoom=(0.5, 2), compensated=True))
+    document = evaluation_document(zoomed, {})
+    assert document["compensated"]
+    sizes = document["results"][0]["mean"]["target"]["zooms"]
+    assert [tuple(one) for one in sizes] == [("zoom", "psnr", "ssim", "psnr_visible", "ssim_visible")] * 2
+    row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
+    assert float(row["psnr_visible_zoom_0.5"]) == zoomed.results[0].scores[-1].zooms[0].masked.psnr
+    lines = evaluation_lines(document)
+    assert len(lines) == 4 + 4
+    assert "PSNR 0.5x" in lines[5]
+    assert f"{sizes[0]['psnr_visible']:.2f}" in lines[-1]
+
+
+@pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
+def test_bad_alignments(align: tuple[str, ...], scene: PixelScene) -> None:
+    with pytest.raises(ValueError, match="color or pose"):
+        EvaluateOptions(align=align)
+    with pytest.raises(ValueError, match="held-out views"):
+        evaluate(scene, {}, None, replace(PLAIN, align=("color",)))
+
+
+def test_aligned_scores_stand_beside_the_plain_ones(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+    options = replace(PLAIN, align=("pose", "color"))
+    aligned = evaluate(scene, {"half": half}, held_out(), options)
+    for one, plain in zip(aligned.results[1].scores, actual.results[1].scores, strict=True):
+        assert replace(one, aligned=(), pose_change=None) == plain
+        if one.split == "context":
+            assert one.aligned == ()
+            continue
+        color, pose, both = one.aligned
+        assert [color.align, pose.align, both.align] == ["color", "pose", "both"]
+        assert (color.masked.psnr or 0) > (plain.masked.psnr or 0)
+        assert (pose.masked.psnr or 0) >= (plain.masked.psnr or 0) - 1e-3
+        assert (both.masked.psnr or 0) > (pose.masked.psnr or 0)
+    document = evaluation_document(aligned, {})
+    mean = document["results"][1]["mean"]["target"]
+    assert list(mean["aligned"]) == ["color", "pose", "both"]
+    assert set(mean["pose_change"]) == {"degrees", "shift"}
+    assert mean["aligned"]["both"]["psnr_visible"] == aligned.results[1].mean("target", align="both")[1].psnr
+    row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
+    assert float(row["psnr_visible_align_color"]) == aligned.results[1].scores[-1].aligned[0].masked.psnr
+    assert float(row["pose_degrees"]) == aligned.results[1].scores[-1].pose_change.degrees
+    lines = evaluation_lines(document)
+    assert len(lines) == 2 + 4 + 2 + 6
+    assert "degrees" in lines[-2]
+
+
+def test_colours_alone(scene: PixelScene) -> None:
+    views = held_out()
+    dimmed = replace(views, images=0.6 * views.images + 0.1)
+    actual = evaluate(scene, {}, dimmed, replace(PLAIN, align=("color",))).results[0]
+    assert actual.mean_pose_change("target") is None
+    assert actual.scores[-1].pose_change is None
+    assert (actual.mean("target", align="color")[1].psnr or 0) > (actual.mean("target")[1].psnr or 0) + 5
 
 
 def test_csv_has_a_row_for_each_result_and_view(actual: Evaluation) -> None:

@@ -1,0 +1,234 @@
+"""Renders aligned with photos whose exposure or pose is not quite that of the scene, so that the rest is measured.
+
+Colours: the affine map of colours that brings a render closest to its photo, as evaluations of photo collections use
+it (Martin-Brualla et al. 2021). Poses: the camera is moved to where its render is closest, as methods without known
+poses are scored (Lin et al. 2021), by Levenberg-Marquardt steps. Their slope is the rasterizer's own gradient; their
+curvature comes from how the picture would move, given its depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmerge.measure.zoom import resize_mask
+from gsmerge.render import Splats, ViewPlan, composite, plan_view
+from gsmerge.render.blend import blend
+from gsmerge.render.gradient import color_gradients, plan_gradients, pose_gradient
+from gsmerge.render.photos import photos_of
+from gsmerge.types import Cameras
+
+LEVELS = (4, 2, 1)  # what the sides of the photo are divided by, one after the other
+MIN_SIDE = 32  # pixels of a photo's shorter side below which it says little about a pose
+STEPS = 20  # most steps at each of these sizes
+FIRST_DAMPING, EASE, BRAKE, MAX_DAMPING = 1e-3, 0.25, 5.0, 1e4  # of the curvature: after a step that helps, or does not
+MAX_STEP = 0.2  # radians and median depths
+MIN_GAIN = 1e-5  # share of the error that a step must take away for another one to follow
+DOUBT = 3.0  # times the median residual at the given pose: beyond, a pixel is taken for something else than the pose
+MIN_RESIDUAL = 0.01  # the least that this median is taken for, sRGB in [0, 1]
+OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
+
+
+@dataclass(frozen=True)
+class PoseChange:
+    """How far a camera was moved."""
+
+    degrees: float  # that it turned
+    shift: float  # of its centre, as a share of the median depth of what it sees
+
+
+def fit_colors(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> np.ndarray:
+    """A render ``[h,w,3]`` after the affine map of its colours (3 x 4) that brings it closest to its photo.
+
+    Least squares over the pixels ``[h,w]`` of the mask, clipped to [0, 1]; the render itself where there are none.
+    """
+    if not mask.any():
+        return image
+    colors = np.concatenate([image[mask], np.ones((int(mask.sum()), 1))], 1, dtype=np.float64)
+    affine = np.linalg.lstsq(colors.T @ colors, colors.T @ photo[mask].astype(np.float64), rcond=1e-12)[0]
+    return np.asarray((image @ affine[:3] + affine[3]).clip(0, 1), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """A photo at one size, and how a pose is judged there."""
+
+    splats: Splats
+    photo: np.ndarray  # [h,w,3]
+    mask: NDArray[np.bool_]  # [h,w] pixels that count
+    K: np.ndarray  # [3,3] intrinsics at this size
+    eps2d: float  # low-pass, square pixels of this size
+    near: float  # near plane, world units
+    compensated: bool  # whether small Gaussians keep their energy
+    centre: np.ndarray  # [3] world point that the camera turns about
+
+    def try_pose(self, viewmat: np.ndarray) -> _Trial:
+        height, width = self.mask.shape
+        plan = plan_view(
+            self.splats, viewmat, self.K, width, height,
+            eps2d=self.eps2d, antialiased=self.compensated, near=self.near,
+        )  # fmt: skip
+        image, transmittance = composite(plan)
+        residual = np.where(self.mask[..., None], image.clip(0, 1) - self.photo, np.float32(0))
+        return _Trial(viewmat, plan, image, transmittance, residual, (residual**2).sum(2))
+
+    def doubt(self, trial: _Trial) -> float:
+        """Squared residual from which on a pixel counts less."""
+        median = float(np.sqrt(np.median(trial.squares[self.mask])))
+        return (DOUBT * max(median, MIN_RESIDUAL)) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What a camera sees."""
+
+    viewmat: np.ndarray  # [4,4] world to camera, float64
+    plan: ViewPlan
+    image: np.ndarray  # [h,w,3], not clipped
+    transmittance: np.ndarray  # [h,w]
+    residual: np.ndarray  # [h,w,3] clipped image less photo, 0 outside the mask
+    squares: np.ndarray  # [h,w] of it, summed over channels
+
+    def error(self, doubt: float) -> float:
+        """Sum of a robust error (Cauchy's), which grows as the squares do up to ``doubt`` and slowly beyond."""
+        return doubt * float(np.log1p(self.squares / doubt).sum(dtype=np.float64))
+
+    def weights(self, doubt: float) -> np.ndarray:
+        """``[h,w]`` derivatives of that error with respect to the squares."""
+        return np.asarray(1 / (1 + self.squares / doubt))
+
+    def depth(self) -> np.ndarray:
+        """``[h,w]`` mean depth of what is drawn, world units; 0 where little is."""
+        colors = np.repeat(self.plan.depths[:, None], 3, 1)
+        weighted = blend(self.plan, colors, np.zeros(3, np.float32))[0][..., 0]
+        alpha = 1 - self.transmittance
+        return np.divide(weighted, alpha, out=np.zeros_like(weighted), where=alpha > OPAQUE)
+
+
+def refine_pose(
+    splats: Splats,
+    camera: Cameras,
+    photo: np.ndarray,
+    mask: NDArray[np.bool_],
+    *,
+    centre: np.ndarray,
+    near: float,
+    compensated: bool = False,
+) -> tuple[Cameras, PoseChange]:
+    """The camera moved to where its render is closest to its photo; itself where the squared error does not fall.
+
+    At a quarter, at half and at the full size of the photo. Pixels whose error is large count less, so that the camera
+    is not moved to get a flaw of the scene out of the picture.
+
+    Args:
+        splats: The Gaussians, from :func:`gsmerge.render.prepare`.
+        camera: One camera.
+        photo: ``[h,w,3]`` sRGB in [0, 1].
+        mask: ``[h,w]`` pixels that count.
+        centre: ``[3]`` the scene's middle in the world.
+        near: Near plane, world units.
+        compensated: Whether the opacity of small Gaussians is lowered by what the low-pass adds to them.
+    """
+    start = camera.viewmats[0].astype(np.float64)
+    viewmat, unit = start, 0.0
+    ends: tuple[_Trial, _Trial] | None = None  # the given pose and the last, at the finest size
+    for level in LEVELS:
+        small = photos_of(photo[None], camera, level)
+        seen = resize_mask(mask, small.width, small.height)
+        if not seen.any() or (level > 1 and min(small.width, small.height) < MIN_SIDE):
+            continue
+        target = _Target(splats, small.images[0], seen, small.Ks[0], small.eps2d, near, compensated, centre)
+        first = target.try_pose(start)
+        depth = first.depth()[seen]
+        if not (depth > 0).any():
+            continue
+        unit = float(np.median(depth[depth > 0]))
+        doubt = target.doubt(first)
+        best = first if viewmat is start else min(first, target.try_pose(viewmat), key=lambda one: one.error(doubt))
+        ends = first, _descend(target, best, unit, doubt)
+        viewmat = ends[1].viewmat
+    if ends and ends[1].squares.sum(dtype=np.float64) >= ends[0].squares.sum(dtype=np.float64):
+        viewmat = start
+    return Cameras(viewmat[None], camera.Ks, camera.width, camera.height), _pose_change(start, viewmat, unit)
+
+
+def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial:
+    """The pose after steps that each lower the error; lengths are taken in ``unit`` world units."""
+    damping, error = FIRST_DAMPING, best.error(doubt)
+    slope, curvature = _slope(target, best, unit, doubt), _curvature(target, best, unit, doubt)
+    for _ in range(STEPS):
+        scale = damping * np.diag(curvature) + 1e-9 * curvature.trace() + 1e-30
+        step = -np.linalg.solve(curvature + np.diag(scale), slope)
+        length = float(np.linalg.norm(step))
+        if not np.isfinite(length):
+            break
+        step *= min(1.0, MAX_STEP / max(length, MAX_STEP))
+        trial = target.try_pose(_moved(best.viewmat, step, target, unit))
+        if trial.error(doubt) >= error:
+            damping *= BRAKE
+            if damping > MAX_DAMPING:
+                break
+            continue
+        best, gain, error = trial, 1 - trial.error(doubt) / error, trial.error(doubt)
+        if gain < MIN_GAIN:
+            break
+        damping *= EASE
+        slope, curvature = _slope(target, best, unit, doubt), _curvature(target, best, unit, doubt)
+    return best
+
+
+def _slope(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndarray:
+    """``[6]`` derivatives of the error with respect to a turn about the centre (radians) and a shift (in ``unit``)."""
+    inside = (trial.image > 0) & (trial.image < 1)  # clipped values stay as they are
+    grad_image = np.where(inside, 2 * trial.residual * trial.weights(doubt)[..., None], np.float32(0))
+    plan, drawn = trial.plan, {"image": trial.image, "transmittance": trial.transmittance}
+    gradients = plan_gradients(plan, grad_image, **drawn, with_viewmat=True)
+    shade = color_gradients(plan, gradients.colors) if plan.splats.shN.shape[1] else None
+    grad = pose_gradient(plan, gradients, shade)
+    rotation, shift = trial.viewmat[:3, :3], trial.viewmat[:3, 3]
+    turns = grad[:3, :3] @ rotation.T + np.outer(grad[:3, 3], shift - _in_camera(target.centre, trial.viewmat))
+    turn = [turns[2, 1] - turns[1, 2], turns[0, 2] - turns[2, 0], turns[1, 0] - turns[0, 1]]
+    return np.concatenate([turn, unit * grad[:3, 3]])
+
+
+def _curvature(target: _Target, trial: _Trial, unit: float, doubt: float) -> np.ndarray:
+    """``[6,6]`` Gauss-Newton's second derivatives, of the picture moved as its depth says."""
+    depth = trial.depth().astype(np.float64)
+    y, x = np.nonzero(target.mask & (depth > 0))
+    dy, dx = np.gradient(trial.image.clip(0, 1), axis=(0, 1))
+    dx, dy, z = dx[y, x].astype(np.float64), dy[y, x].astype(np.float64), depth[y, x]
+    fx, fy, cx, cy = target.K[0, 0], target.K[1, 1], target.K[0, 2], target.K[1, 2]
+    rays = np.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy], 1)
+    a, b, c = (rays[:, 0] * z, rays[:, 1] * z, z) - _in_camera(target.centre, trial.viewmat)[:, None]
+    zero, one = np.zeros_like(z), np.full_like(z, unit)
+    forward = np.stack([b, -a, zero, zero, zero, one], 1)  # how z changes with the six numbers
+    right = np.stack([zero, c, -b, one, zero, zero], 1) - rays[:, :1] * forward
+    down = np.stack([-c, zero, a, zero, one, zero], 1) - rays[:, 1:] * forward
+    right, down = right * (fx / z)[:, None], down * (fy / z)[:, None]  # pixels
+    weights = 2 * trial.weights(doubt)[y, x].astype(np.float64)[:, None]
+    xx, xy, yy = (weights * (one * other).sum(1)[:, None] for one, other in ((dx, dx), (dx, dy), (dy, dy)))
+    return np.asarray(right.T @ (xx * right + xy * down) + down.T @ (xy * right + yy * down))
+
+
+def _in_camera(point: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
+    return np.asarray(viewmat[:3, :3] @ point + viewmat[:3, 3])
+
+
+def _moved(viewmat: np.ndarray, step: np.ndarray, target: _Target, unit: float) -> np.ndarray:
+    """The view matrix after a turn about the centre, ``step[:3]`` radians, and a shift, ``step[3:]`` in ``unit``."""
+    turn, centre = cv2.Rodrigues(step[:3])[0], _in_camera(target.centre, viewmat)
+    moved = np.eye(4)
+    moved[:3, :3] = turn @ viewmat[:3, :3]
+    moved[:3, 3] = turn @ (viewmat[:3, 3] - centre) + centre + unit * step[3:]
+    return moved
+
+
+def _pose_change(start: np.ndarray, end: np.ndarray, unit: float) -> PoseChange:
+    """Between two view matrices; ``unit`` is the median depth, world units."""
+    chord = float(np.linalg.norm(end[:3, :3] - start[:3, :3])) / np.sqrt(8)
+    before, after = (-one[:3, :3].T @ one[:3, 3] for one in (start, end))
+    distance = float(np.linalg.norm(after - before))
+    return PoseChange(float(np.degrees(2 * np.arcsin(min(chord, 1.0)))), distance / unit if unit else 0.0)
