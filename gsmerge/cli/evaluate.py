@@ -43,10 +43,8 @@ def parse_align(text: str) -> tuple[str, ...]:
                    "pixels per side.", wording="1", metavar="LIST", parser=parse_zoom),
         opt.option("align", str, "Also score held-out views after alignment with their photos: of the renders' colours "
                    "(color), of the cameras (pose), or both (color,pose).", metavar="LIST", parser=parse_align),
-        opt.switch("compensated", "Render with the opacity of small Gaussians compensated for the low-pass, as some "
-                   "viewers do."),
     ),
-    "lpips lpips_views",
+    "lpips lpips_views antialiased",
     *opt.panel(opt.OUTPUT, opt.option("csv", Path, "Write a row for each result and view to this file.")),
     "report overwrite threads",
 )  # fmt: skip
@@ -68,7 +66,7 @@ def evaluate(args: opt.Args) -> None:
     nets, missing = lpips_networks(args.lpips)
     with opt.usage_errors():
         options = EvaluateOptions(
-            nets, args.lpips_views, args.context, threads=args.threads, compensated=args.compensated,
+            nets, args.lpips_views, args.context, threads=args.threads, antialiased=args.antialiased,
             **args.given(("zoom", "align")),
         )  # fmt: skip
     load = args.load(files)

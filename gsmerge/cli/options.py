@@ -326,6 +326,8 @@ _TABLE = (
     panel(
         OUTPUT,
         option("output", Path, "", "--output", "-o"),
+        switch("antialiased", "Lower the opacity of small Gaussians by what the low-pass adds to them, as some viewers "
+               "do (Mip-Splatting)."),
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
         switch("dry_run", "Print what would be done; write nothing."),

@@ -29,10 +29,9 @@ if TYPE_CHECKING:
     *opt.panel(
         opt.OUTPUT,
         opt.option("background", float, "Grey level behind the scene.", default=0.0, min=0.0, max=1.0),
-        opt.switch("antialiased", "Keep the energy of small Gaussians (Mip-Splatting)."),
     ),
     opt.output("Folder for the pictures.", default=opt.REQUIRED),
-    "overwrite dry_run threads",
+    "antialiased overwrite dry_run threads",
 )  # fmt: skip
 def render(args: opt.Args) -> None:
     """Render a scene from every camera, one PNG each."""

@@ -62,14 +62,14 @@ class _Target:
     K: np.ndarray  # [3,3] intrinsics at this size
     eps2d: float  # low-pass, square pixels of this size
     near: float  # near plane, world units
-    compensated: bool  # whether small Gaussians keep their energy
+    antialiased: bool  # whether small Gaussians keep their energy
     centre: np.ndarray  # [3] world point that the camera turns about
 
     def try_pose(self, viewmat: np.ndarray) -> _Trial:
         height, width = self.mask.shape
         plan = plan_view(
             self.splats, viewmat, self.K, width, height,
-            eps2d=self.eps2d, antialiased=self.compensated, near=self.near,
+            eps2d=self.eps2d, antialiased=self.antialiased, near=self.near,
         )  # fmt: skip
         image, transmittance = composite(plan)
         residual = np.where(self.mask[..., None], image.clip(0, 1) - self.photo, np.float32(0))
@@ -116,7 +116,7 @@ def refine_pose(
     *,
     centre: np.ndarray,
     near: float,
-    compensated: bool = False,
+    antialiased: bool = False,
 ) -> tuple[Cameras, PoseChange]:
     """The camera moved to where its render is closest to its photo; itself where the squared error does not fall.
 
@@ -130,7 +130,7 @@ def refine_pose(
         mask: ``[h,w]`` pixels that count.
         centre: ``[3]`` the scene's middle in the world.
         near: Near plane, world units.
-        compensated: Whether the opacity of small Gaussians is lowered by what the low-pass adds to them.
+        antialiased: Whether the opacity of small Gaussians is lowered by what the low-pass adds to them.
     """
     start = camera.viewmats[0].astype(np.float64)
     viewmat, unit = start, 0.0
@@ -140,7 +140,7 @@ def refine_pose(
         seen = resize_mask(mask, small.width, small.height)
         if not seen.any() or (level > 1 and min(small.width, small.height) < MIN_SIDE):
             continue
-        target = _Target(splats, small.images[0], seen, small.Ks[0], small.eps2d, near, compensated, centre)
+        target = _Target(splats, small.images[0], seen, small.Ks[0], small.eps2d, near, antialiased, centre)
         first = target.try_pose(start)
         depth = first.depth()[seen]
         if not (depth > 0).any():

@@ -42,7 +42,7 @@ class EvaluateOptions:
         threads: Threads to use; None: all processors. The figures do not depend on it.
         zoom: Sizes, in units of the photos' own pixels per side, at which PSNR and SSIM are also measured: the
             Gaussians are rendered at that size and compared with the photo resized to it.
-        compensated: Render with the opacity lowered by what the rasterizer's low-pass adds to small Gaussians, as some
+        antialiased: Render with the opacity lowered by what the rasterizer's low-pass adds to small Gaussians, as some
             viewers do (``antialiased`` of :func:`gsmerge.render`).
         align: Also score held-out views after "color", the affine map of the render's colours that brings it closest
             to the photo, and "pose", the camera moved to where the render is closest; with both also after one and
@@ -59,7 +59,7 @@ class EvaluateOptions:
     own: bool = True
     threads: int | None = None
     zoom: tuple[float, ...] = (1,)
-    compensated: bool = False
+    antialiased: bool = False
     align: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -208,12 +208,12 @@ class _Look:
     """How pictures are drawn."""
 
     near: float  # near plane, world units
-    compensated: bool  # whether small Gaussians keep their energy
+    antialiased: bool  # whether small Gaussians keep their energy
     centre: np.ndarray  # [3] the scene's middle in the world
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
         """``[h,w,3]``: one view, by the one call that renders here, so that equal Gaussians give equal images."""
-        drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.compensated)
+        drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.antialiased)
         return np.asarray(drawn.images[0].clip(0, 1))
 
 
@@ -246,7 +246,7 @@ def evaluate(
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
     with use_threads(options.threads):
-        look = _Look(near_plane(scene), options.compensated, scene_frame(scene).origin)
+        look = _Look(near_plane(scene), options.antialiased, scene_frame(scene).origin)
         splits = _splits(scene, own, targets, options, look)
         scores = []
         named = {INPUT: own, **results} if options.own else results
@@ -356,7 +356,7 @@ def _align_score(
     if "pose" in options.align:
         cameras, change = refine_pose(
             prepare(gaussians), cameras, photo, seen,
-            centre=look.centre, near=look.near, compensated=look.compensated,
+            centre=look.centre, near=look.near, antialiased=look.antialiased,
         )  # fmt: skip
         pictures["pose"] = look.image(gaussians, cameras, 0)
     if "color" in options.align:

@@ -28,13 +28,13 @@ def evaluation_document(
 
     ``schema_version`` 1: tool, reference, views, results (file, count, ratio, render seconds, means by split, a score
     for each view), notes. Means and scores have ``zooms`` where other sizes than the photos' own were asked for,
-    those of held-out views ``aligned`` and ``pose_change`` where that was, and ``compensated`` is there where it is
+    those of held-out views ``aligned`` and ``pose_change`` where that was, and ``antialiased`` is there where it is
     true. Keys are only ever added within one schema version.
     """
     return {
         **document_head(),
         "reference": evaluation.reference,
-        **({"compensated": True} if evaluation.options.compensated else {}),
+        **({"antialiased": True} if evaluation.options.antialiased else {}),
         "num_views": dict(evaluation.num_views),
         "results": [_result(one, evaluation, files.get(one.name, {})) for one in evaluation.results],
         "notes": [*notes, *evaluation.notes],
@@ -127,7 +127,7 @@ def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
     width = max(6, *(len(result["name"]) for result in document["results"]))
     head = f"{'result':{width}}  {'Gaussians':>12}  {'kept':>7}  {'size':>9}  {'ms/view':>8}  {'views':<8} {'PSNR':>6}"
     head += "   SSIM" + "".join(f"  {name.replace('lpips_', 'LPIPS '):>10}" for name in nets)
-    how = ", rendered with compensated opacity" if document.get("compensated") else ""
+    how = ", rendered antialiased" if document.get("antialiased") else ""
     lines = [f"against {document['reference']}, over the pixels that the input views have seen{how}", head]
     for result in document["results"]:
         size = human_bytes(result["bytes"]) if "bytes" in result else ""

@@ -39,7 +39,7 @@ def test_table_and_files(scene_copy: Path, small: Path, run: Run, floor: Callabl
 
 def test_other_sizes(scene_copy: Path, run: Run) -> None:
     call = ("evaluate", scene_copy, "--targets", scene_copy / "targets", "--no-context", "--lpips", "none")
-    outcome = run(*call, "--zoom", ".5,1,2", "--compensated", "--json")
+    outcome = run(*call, "--zoom", ".5,1,2", "--antialiased", "--json")
     document = json.loads(outcome.out)
     sizes = document["results"][0]["mean"]["target"]["zooms"]
     assert [one["zoom"] for one in sizes] == [0.5, 1, 2]

@@ -59,16 +59,16 @@ def test_colours_without_pixels_or_contrast() -> None:
     np.testing.assert_allclose(fit_colors(image, 1 - image, np.ones((4, 5), bool)), 0.75, atol=1e-6)
 
 
-@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("degrees", "shift"), [(1.0, 0.0), (0.0, 0.06), (1.0, 0.06)])  # 0.06: 2 % of the depth
 def test_a_moved_camera_is_found_back(
-    known: tuple[Gaussians, Cameras, np.ndarray], degrees: float, shift: float, compensated: bool
+    known: tuple[Gaussians, Cameras, np.ndarray], degrees: float, shift: float, antialiased: bool
 ) -> None:
     gaussians, camera, _ = known
-    photo = render(gaussians, camera, antialiased=compensated).images[0].clip(0, 1)
+    photo = render(gaussians, camera, antialiased=antialiased).images[0].clip(0, 1)
     start = moved(camera, degrees, shift)
     actual, change = refine_pose(
-        prepare(gaussians), start, photo, everywhere(photo), **SETTINGS, compensated=compensated
+        prepare(gaussians), start, photo, everywhere(photo), **SETTINGS, antialiased=antialiased
     )  # fmt: skip
     before, after = pose_error(start, camera), pose_error(actual, camera)
     assert after[0] <= 0.1 * max(before[0], 1.0)

@@ -159,15 +159,15 @@ def test_zooms_are_renders_at_that_size(scene: PixelScene, half: Gaussians) -> N
 
 
 def test_the_input_s_renders_are_the_reference_at_every_size(scene: PixelScene, half: Gaussians) -> None:
-    options = replace(PLAIN, zoom=(0.5, 2), compensated=True)
+    options = replace(PLAIN, zoom=(0.5, 2), antialiased=True)
     actual = evaluate(replace(scene, images=None), {"half": half}, None, options)
     assert all(math.isinf(one.full.psnr or 0) for s in actual.results[0].scores for one in s.zooms)
     assert all((one.full.psnr or 99) < 60 for s in actual.results[1].scores for one in s.zooms)
 
 
-def test_compensated_opacity(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
+def test_antialiased(scene: PixelScene, half: Gaussians, actual: Evaluation) -> None:
     views = held_out()
-    result = evaluate(scene, {"half": half}, views, replace(PLAIN, compensated=True, context=False)).results[1]
+    result = evaluate(scene, {"half": half}, views, replace(PLAIN, antialiased=True, context=False)).results[1]
     image = gsmerge.render(half, views.cameras[[0]], antialiased=True).images[0].clip(0, 1)
     expected = peak_signal_noise_ratio(views.images[0], image, data_range=1)
     assert result.scores[0].full.psnr == pytest.approx(expected, abs=1e-4)
@@ -177,10 +177,10 @@ def test_compensated_opacity(scene: PixelScene, half: Gaussians, actual: Evaluat
 def test_documents_have_zooms_where_they_were_asked_for(scene: PixelScene, actual: Evaluation) -> None:
     plain = evaluation_document(actual, {})
     assert "zooms" not in plain["results"][0]["views"][0]
-    assert "compensated" not in plain
-    zoomed = evaluate(scene, {}, held_out(), replace(PLAIN, zoom=(0.5, 2), compensated=True))
+    assert "antialiased" not in plain
+    zoomed = evaluate(scene, {}, held_out(), replace(PLAIN, zoom=(0.5, 2), antialiased=True))
     document = evaluation_document(zoomed, {})
-    assert document["compensated"]
+    assert document["antialiased"]
     sizes = document["results"][0]["mean"]["target"]["zooms"]
     assert [tuple(one) for one in sizes] == [("zoom", "psnr", "ssim", "psnr_visible", "ssim_visible")] * 2
     row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
