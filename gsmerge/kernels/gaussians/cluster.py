@@ -85,7 +85,9 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
     At most ``max_size`` to a cluster and one of each view, the best overlaps first; no member is reached through
     another, so clusters cannot chain. Returns the cluster of each Gaussian and the number of clusters.
     """
-    clusters = np.full(order.shape[0], -1, np.int64)
+    clusters = np.empty(order.shape[0], np.int64)
+    for i in range(clusters.shape[0]):
+        clusters[i] = -1
     tried = np.empty(neighbors.shape[1], np.bool_)
     count = 0
     for leader in order:
@@ -93,7 +95,8 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
             continue
         clusters[leader] = count
         size = 1
-        tried[:] = False
+        for i in range(tried.shape[0]):
+            tried[i] = False
         while size < max_size:
             best = _best_left(scores[leader], tried, threshold)
             if best < 0:

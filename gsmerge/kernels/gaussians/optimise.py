@@ -78,7 +78,8 @@ def adam(
             _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
             k += 1
         else:
-            row[:] = f4(0.0)
+            for c in range(COLUMNS):
+                row[c] = f4(0.0)
         for c in range(COLUMNS):
             energy[c] = row[c] * row[c]
         shared = (energy[0] + energy[1] + energy[2]) / f4(3.0)

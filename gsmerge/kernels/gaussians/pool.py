@@ -83,7 +83,9 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
     longest = 0
     for g in range(starts.shape[0] - 1):
         longest = max(longest, starts[g + 1] - starts[g])
-    caps, order = np.ones(longest), np.empty(longest, np.int64)
+    caps, order = np.empty(longest), np.empty(longest, np.int64)
+    for i in range(longest):
+        caps[i] = 1.0
     for g in range(starts.shape[0] - 1):
         members = ids[starts[g] : starts[g + 1]]
         if members.shape[0] == 0:

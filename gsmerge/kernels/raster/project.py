@@ -250,7 +250,9 @@ def project(means, quats, scales, lnops, ids, camera, footprints, depths, boxes)
         boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0
             where nothing is drawn.
     """
-    block = np.ones(11 * BLOCK, np.float32)
+    block = np.empty(11 * BLOCK, np.float32)
+    for i in range(block.shape[0]):
+        block[i] = f4(1.0)
     antialiased = camera[ANTIALIASED] > f4(0.0)
     for start in range(0, ids.shape[0], BLOCK):
         size = min(BLOCK, ids.shape[0] - start)

@@ -185,7 +185,9 @@ def project_backward(
         grad_poses: ``[blocks,POSE]`` float32, written: gradient of the world-to-camera matrix, summed over blocks of
             BLOCK Gaussians; an empty array for none.
     """
-    block = np.ones(PLANES * BLOCK, np.float32)
+    block = np.empty(PLANES * BLOCK, np.float32)
+    for i in range(block.shape[0]):
+        block[i] = f4(1.0)
     for start in range(first, last, BLOCK):
         size = min(BLOCK, last - start)
         for lane in range(size):

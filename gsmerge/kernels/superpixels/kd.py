@@ -96,7 +96,10 @@ def enqueue(node, y0, x0, y1, x1, limit, integral, stride, compactness, nodes, h
 
 @kernel(part=True)
 def paint(nodes, count, height, width):
-    labels = np.full((height + 2, width + 2), -1, np.int32)
+    labels = np.empty((height + 2, width + 2), np.int32)
+    for y in range(height + 2):
+        for x in range(width + 2):
+            labels[y, x] = -1
     for node in range(count):
         for y in range(nodes[node, 0] + 1, nodes[node, 2] + 1):
             for x in range(nodes[node, 1] + 1, nodes[node, 3] + 1):
@@ -120,7 +123,9 @@ def split_rectangles(pixels, count, block, compactness):
     integral, stride = integral_image(pixels), width + 1
     num_rows, num_columns = max(1, height // block), max(1, width // block)
     nodes = np.empty((max(count, num_rows * num_columns), 8), np.int32)
-    heads = np.full(NUM_BUCKETS, -1)
+    heads = np.empty(NUM_BUCKETS, np.int64)
+    for i in range(NUM_BUCKETS):
+        heads[i] = -1
     gain = np.empty(1, np.float32)
     bits = gain.view(np.int32)
     num_leaves, bucket = 0, NUM_BUCKETS - 1

@@ -158,8 +158,9 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
         (parents, num_nodes): ``parents[i]`` is -1 at a root; children come before their parents.
     """
     num_pairs, num_parked, num_nodes = len(pairs), 0, num_leaves
-    parents = np.full(2 * num_leaves, -1, np.int32)
-    best_costs = np.full(2 * num_leaves, np.inf, np.float32)
+    parents, best_costs = np.empty(2 * num_leaves, np.int32), np.empty(2 * num_leaves, np.float32)
+    for i in range(2 * num_leaves):
+        parents[i], best_costs[i] = -1, np.inf
     costs, parked_costs = np.empty(num_pairs, np.float32), np.empty(num_pairs + 1, np.float32)
     parked = np.empty((num_pairs + 1, 2), np.int32)
     while True:
