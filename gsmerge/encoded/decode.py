@@ -111,7 +111,8 @@ def children_of(encoded: Encoded, counts: np.ndarray) -> tuple[Gaussians, np.nda
     rows, parents = pick_children(encoded.division, counts)
     gaussians = Gaussians.concat([feature_to_gaussians(features), encoded.division.children])[rows]
     if heads is not None:
-        from gsmerge.networks import NetworkContext, decode_with_group_features, make_group_features
+        from gsmerge.networks.apply import NetworkContext, decode_with_group_features
+        from gsmerge.networks.tokens import make_group_features
 
         group_features = make_group_features(features, heads.views, heads.group, encoded.cameras)
         nothing = gaussian_members(gaussians[:0], np.zeros(0, np.float32))

@@ -12,7 +12,7 @@ from gsmerge.stages.prepare import Frame
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 if TYPE_CHECKING:
-    from gsmerge.networks import Networks
+    from gsmerge.networks.modules import Networks
 
 
 @dataclass(frozen=True, eq=False)

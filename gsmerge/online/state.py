@@ -18,7 +18,7 @@ from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 
 if TYPE_CHECKING:
-    from gsmerge.networks import NetworkContext
+    from gsmerge.networks.apply import NetworkContext
 
 CHILD_RULE: Rule = "depth"  # children stand for many members: their own size counts, whatever rule they were made by
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
@@ -88,7 +88,7 @@ def bake(
     if max_k > 1:
         children, parents = divide(features, members, np.full(len(features), max_k), rule)
     if networks is not None:
-        from gsmerge.networks import decode_gaussians
+        from gsmerge.networks.apply import decode_gaussians
 
         ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
         children = decode_gaussians(children, parents, features, networks)

@@ -14,7 +14,7 @@ from gsmerge.stages.merge import MergedViews
 from gsmerge.types import FeatureGaussians, Gaussians
 
 if TYPE_CHECKING:
-    from gsmerge.networks import NetworkContext
+    from gsmerge.networks.apply import NetworkContext
 
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
@@ -103,7 +103,7 @@ def decode(
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts, rule)
     if networks is not None:
-        from gsmerge.networks import decode_gaussians
+        from gsmerge.networks.apply import decode_gaussians
 
         gaussians = decode_gaussians(gaussians, parents, features, networks)
     return gaussians[gaussians.opacities >= options.min_opacity]

@@ -13,7 +13,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene, to_float32
 
 if TYPE_CHECKING:
-    from gsmerge.networks import NetworkContext
+    from gsmerge.networks.apply import NetworkContext
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def encode(
     features = from_moments(pool_members(members, starts, ids, options.rule), starts, ids, views)
     if networks is None:
         return features
-    from gsmerge.networks import encode_features
+    from gsmerge.networks.apply import encode_features
 
     return encode_features(features, networks)
 

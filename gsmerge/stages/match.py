@@ -13,7 +13,7 @@ from gsmerge.networks.neighbors import nearest_of_other_views
 from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 
 if TYPE_CHECKING:
-    from gsmerge.networks import NetworkContext
+    from gsmerge.networks.apply import NetworkContext
 
 Method = Literal["overlap", "aabb", "none"]
 Geometry = Literal["analytic", "decoded"]
@@ -81,7 +81,7 @@ def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkCo
     are taken by weight, ties by position. What is fully transparent is left alone.
     """
     if networks is not None and options.geometry == "decoded" and options.method != "none":
-        from gsmerge.networks import match_geometry
+        from gsmerge.networks.apply import match_geometry
 
         features = match_geometry(features, networks)
     count = len(features)

@@ -12,7 +12,7 @@ from gsmerge.moments import Members
 from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, Segmentation, as_tensor, to_float32
 
 if TYPE_CHECKING:
-    from gsmerge.networks import NetworkContext
+    from gsmerge.networks.apply import NetworkContext
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext
         return features
     pooled = pool_runs(features, order, cuts)
     if networks is not None:
-        from gsmerge.networks import merge_features
+        from gsmerge.networks.apply import merge_features
 
         pooled = merge_features(pooled, features, order, cuts, networks)
     return FeatureGaussians.concat([take(features, alone), pooled])
@@ -73,7 +73,7 @@ def refine(features: FeatureGaussians, networks: NetworkContext | None) -> Featu
     """
     if networks is None:
         return features
-    from gsmerge.networks import refine_features
+    from gsmerge.networks.apply import refine_features
 
     return refine_features(features, networks)
 

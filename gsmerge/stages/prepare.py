@@ -28,7 +28,8 @@ from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 from gsmerge.views import distinct_views, scored_views, subset
 
 if TYPE_CHECKING:
-    from gsmerge.networks import Checkpoint, NetworkContext
+    from gsmerge.networks.apply import NetworkContext
+    from gsmerge.networks.checkpoint import Checkpoint
     from gsmerge.options import CompactOptions
 
 Scene = TypeVar("Scene", PixelScene, UnalignedScene)
@@ -165,7 +166,7 @@ class PreparedScene:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
         if self.checkpoint is None:
             return [None]
-        from gsmerge.networks import NetworkContext
+        from gsmerge.networks.apply import NetworkContext
 
         options = self.options
         networks = NetworkContext(self.checkpoint.networks, members, self.scene.cameras, options.seed)
@@ -230,7 +231,7 @@ def find_networks(name: str, options: CompactOptions) -> tuple[Checkpoint | None
     """
     if name == "none":  # torch is imported only where there are networks
         return None, []
-    from gsmerge.networks import find_checkpoint
+    from gsmerge.networks.checkpoint import find_checkpoint
 
     checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
     if checkpoint is not None:

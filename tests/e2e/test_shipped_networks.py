@@ -9,8 +9,7 @@ import pytest
 import torch
 
 import gsmerge
-from gsmerge.networks import load_checkpoint, save_checkpoint
-from gsmerge.networks.checkpoint import SHIPPED
+from gsmerge.networks.checkpoint import SHIPPED, load_checkpoint, save_checkpoint
 
 LEAST_GAIN = 1.0  # dB on photos that the scene was not made from
 

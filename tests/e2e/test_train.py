@@ -17,7 +17,7 @@ import pytest
 from learned import SMALL, noisy, written
 
 from gsmerge.cli.train import find_training_scenes
-from gsmerge.networks import load_checkpoint
+from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.research.training import Example, TrainOptions
 from gsmerge.research.training.examples import make_examples
 from gsmerge.research.training.losses import render_window, window_psnr

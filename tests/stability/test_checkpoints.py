@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
 
 import gsmerge
-from gsmerge.networks import Networks
+from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds
 from gsmerge.types import SH_C0
 

@@ -25,8 +25,8 @@ from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.networks import Networks, save_checkpoint
-from gsmerge.networks.modules import Head
+from gsmerge.networks.checkpoint import save_checkpoint
+from gsmerge.networks.modules import Head, Networks
 from gsmerge.networks.residuals import LOGIT
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, scaled_corrections, target_scales, window_loss

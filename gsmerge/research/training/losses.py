@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsmerge.measure.lpips import lpips_loss
 from gsmerge.moments import Members, pool_members, principal_axes
-from gsmerge.networks import Networks
+from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import RESIDUAL, ROTATION, gaussian_sizes, quat_to_rotmat, residual_limits
 from gsmerge.render.autograd import render_tensors
 from gsmerge.render.photos import NEAR

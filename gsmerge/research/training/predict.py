@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.networks import NetworkContext, Networks
 from gsmerge.networks.apply import (
+    NetworkContext,
     apply_corrections,
     apply_encoding,
     find_neighbors,
@@ -19,6 +19,7 @@ from gsmerge.networks.apply import (
     run_merger,
     run_refiner,
 )
+from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import MEAN, move_gaussians, rotate_vectors
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.research.training.options import TrainOptions

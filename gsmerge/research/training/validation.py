@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsmerge.io.atomic import atomic_output
-from gsmerge.networks import Networks
+from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import COLOR, LOGIT, MEAN, ROTATION, SIZE
 from gsmerge.research.training.examples import Example, draw_views
 from gsmerge.research.training.losses import correction_loss, render_window, scaled_corrections, window_psnr

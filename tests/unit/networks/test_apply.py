@@ -10,16 +10,18 @@ from learned import SMALL, Made, made, noisy
 
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.networks import (
+from gsmerge.networks.apply import (
     NetworkContext,
-    NetworkOptions,
-    Networks,
     decode_gaussians,
     encode_features,
+    find_neighbors,
     match_geometry,
     refine_features,
+    run_encoder,
+    run_heads,
 )
-from gsmerge.networks.apply import find_neighbors, run_encoder, run_heads
+from gsmerge.networks.modules import Networks
+from gsmerge.networks.options import NetworkOptions
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import DecodeOptions, decode, divide
 from gsmerge.stages.match import MatchOptions, match

@@ -13,8 +13,7 @@ from safetensors.torch import load_file, save_file
 
 import gsmerge
 from gsmerge.errors import SceneError
-from gsmerge.networks import find_checkpoint, load_checkpoint
-from gsmerge.networks.checkpoint import SHIPPED
+from gsmerge.networks.checkpoint import SHIPPED, find_checkpoint, load_checkpoint
 
 Spoil = Callable[[Path], None]
 

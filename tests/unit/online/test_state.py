@@ -15,7 +15,7 @@ from loose import far_behind, shuffled, voxels
 from gsmerge import Gaussians, PixelScene, decode_scene, encode_scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
-from gsmerge.networks import encode_features
+from gsmerge.networks.apply import encode_features
 from gsmerge.online.state import (
     GroupSet,
     bake,

@@ -14,7 +14,8 @@ from scenes import arc, make_scene, room
 from training_runs import PAPER, TINY, written
 
 from gsmerge.geometry import rotmat_to_quat
-from gsmerge.networks import Networks, load_checkpoint
+from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.networks.modules import Networks
 from gsmerge.networks.residuals import quat_to_rotmat
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options, train
 from gsmerge.research.training.examples import draw_views, select_views

@@ -16,8 +16,8 @@ from training_runs import OPTIONS, TINY, written
 from gsmerge.errors import GsmergeError
 from gsmerge.measure.evaluate import Views
 from gsmerge.measure.lpips import lpips, lpips_available, lpips_loss
-from gsmerge.networks import NetworkContext, Networks
-from gsmerge.networks.apply import encode_features, refine_features
+from gsmerge.networks.apply import NetworkContext, encode_features, refine_features
+from gsmerge.networks.modules import Networks
 from gsmerge.render import render
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
 from gsmerge.research.training.loop import is_best
