@@ -28,6 +28,7 @@ class FitState:
         v: Second moment.
         units: ``[n]`` size of each Gaussian when it began.
         box_shares: ``[n]`` share of the box about the start that each may use.
+        min_sizes: ``[n]`` least log scale of each.
         shN: ``[n,k-1,3]`` higher harmonics.
         means: ``[n,3]``.
         quats: ``[n,4]``.
@@ -42,6 +43,7 @@ class FitState:
     v: Tensor
     units: Tensor
     box_shares: Tensor
+    min_sizes: Tensor
     shN: Tensor
     means: Tensor
     quats: Tensor
@@ -70,14 +72,15 @@ def state_of(x: Tensor, shN: Tensor) -> FitState:
     sizes = x[:, SIZE:QUAT].sort(1).values
     units = ((sizes[:, 1] + sizes[:, 2]) / 2).exp()
     shown = (x[:, :SIZE], x[:, QUAT:LOGIT], x[:, SIZE:QUAT].exp(), x[:, LOGIT].sigmoid(), x[:, COLOR:])
+    shares, least = torch.ones_like(units), torch.full_like(units, -torch.inf)
     return FitState(
-        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, torch.ones_like(units), shN,
+        x, x.clone(), torch.zeros_like(x), torch.zeros_like(x), units, shares, least, shN,
         *(tensor.clone(memory_format=torch.contiguous_format) for tensor in shown),
     )  # fmt: skip
 
 
 def adam_step(state: FitState, gradients: Gradients, options: FitOptions, rates: Tensor, step: int) -> None:
-    """Adam on a view's gradients, then the box about the start, in place.
+    """Adam on a view's gradients, then the box about the start, in place; what the view does not show stays.
 
     Args:
         state: n Gaussians.
@@ -106,12 +109,13 @@ def step_in_torch(state: FitState, gradients: Gradients, options: FitOptions, ra
     energy = gradient * gradient
     for shared in (slice(0, SIZE), slice(QUAT, LOGIT)):  # one second moment, so that steps turn with the scene
         energy[:, shared] = energy[:, shared].sum(1, keepdim=True) / 3  # degrees of freedom, of a rotation too
-    state.m.lerp_(gradient, 1 - limits.beta1)
-    state.v.lerp_(energy, 1 - limits.beta2)
+    reached = gradients.reached[:, None]
+    state.m.copy_(torch.where(reached, state.m.lerp(gradient, 1 - limits.beta1), state.m))
+    state.v.copy_(torch.where(reached, state.v.lerp(energy, 1 - limits.beta2), state.v))
     first, second = state.m / (1 - limits.beta1**step), state.v / (1 - limits.beta2**step)
     move = rates * first / (second.sqrt() + 1e-15)
     move[:, :SIZE] *= state.units[:, None]
-    state.x.copy_(confine(state, state.x - move, options))
+    state.x.copy_(torch.where(reached, confine(state, state.x - move, options), state.x))
     for shown, meaning in (
         (state.means, state.x[:, :SIZE]), (state.quats, state.x[:, QUAT:LOGIT]),
         (state.scales, state.x[:, SIZE:QUAT].exp()), (state.opacities, state.x[:, LOGIT].sigmoid()),
@@ -139,7 +143,7 @@ def confine(state: FitState, x: Tensor, options: FitOptions) -> Tensor:
     x[:, :SIZE] = torch.where(far > reach, x0[:, :SIZE] + reach / far * offset, x[:, :SIZE])
     sizes, logits, colors = x0[:, SIZE:QUAT], x0[:, LOGIT], x0[:, COLOR:]
     grown = shares * rates.max_scale_change
-    x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown)
+    x[:, SIZE:QUAT] = x[:, SIZE:QUAT].clamp(sizes - grown, sizes + grown).maximum(state.min_sizes[:, None])
     logit = x[:, LOGIT].clamp(logits - rates.max_opacity_change, logits + rates.max_opacity_change)
     x[:, LOGIT] = logit.clamp(float(MIN_LOGIT), float(MAX_LOGIT))
     x[:, COLOR:] = x[:, COLOR:].clamp(colors.clamp_max(-0.05), colors.clamp_min(1.05))

@@ -81,29 +81,30 @@ def _step_quats(x, m, v, g_quats, quats, rates, row, i, mask, b1, b2, c1, c2):
 
 @triton.jit
 def _step(
-    x, x0, m, v, units, shares, g_means, g_quats, g_scales, g_opacities, g_colors, reached, rates,
+    x, x0, m, v, units, shares, least, g_means, g_quats, g_scales, g_opacities, g_colors, reached, rates,
     means, quats, scales, opacities, colors, count, opacity_pull, scale_pull,
     max_shift, max_scale, max_opacity, b1, b2, c1, c2, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = i < count
+    mask = (i < count) & (tl.load(reached + i, i < count, 0) != 0)
     row = i * 14
     unit, share = tl.load(units + i, mask, 1.0), tl.load(shares + i, mask, 1.0)
-    drawn = tl.load(reached + i, mask, 0).to(tl.float32)
+    smallest = tl.load(least + i, mask, 0.0)
     _step_means(x, x0, m, v, g_means, means, rates, row, i, mask, unit, share, max_shift, b1, b2, c1, c2)
     _step_quats(x, m, v, g_quats, quats, rates, row, i, mask, b1, b2, c1, c2)
     for c in tl.static_range(3):
         at = row + 3 + c
         size = tl.load(scales + 3 * i + c, mask, 0.0)
-        g = (tl.load(g_scales + 3 * i + c, mask, 0.0) + scale_pull * drawn / unit) * size
+        g = (tl.load(g_scales + 3 * i + c, mask, 0.0) + scale_pull / unit) * size
         new = tl.load(x + at, mask, 0.0) - tl.load(rates + 3 + c) * _move(m, v, at, mask, g, g * g, b1, b2, c1, c2)
         start = tl.load(x0 + at, mask, 0.0)
         new = _clamp(new, start - share * max_scale, start + share * max_scale)
+        new = tl.maximum(new, smallest)
         tl.store(x + at, new, mask)
         tl.store(scales + 3 * i + c, tl.exp(new), mask)
     at = row + 10
     old = tl.load(opacities + i, mask, 0.0)
-    g = (tl.load(g_opacities + i, mask, 0.0) + opacity_pull * drawn) * old * (1.0 - old)
+    g = (tl.load(g_opacities + i, mask, 0.0) + opacity_pull) * old * (1.0 - old)
     new = tl.load(x + at, mask, 0.0) - tl.load(rates + 10) * _move(m, v, at, mask, g, g * g, b1, b2, c1, c2)
     start = tl.load(x0 + at, mask, 0.0)
     new = _clamp(_clamp(new, start - max_opacity, start + max_opacity), MIN_LOGIT, MAX_LOGIT)
@@ -126,7 +127,7 @@ def launch(state: FitState, gradients: Gradients, options: FitOptions, rates: ob
         return
     wanted = (g.means, g.quats, g.scales, g.opacities, g.colors)
     _step[(triton.cdiv(count, BLOCK),)](
-        state.x, state.x0, state.m, state.v, state.units, state.box_shares,
+        state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes,
         *(tensor.contiguous() for tensor in wanted), g.reached, rates,
         state.means, state.quats, state.scales, state.opacities, state.colors, count,
         options.opacity_reg / count, options.scale_reg / count,

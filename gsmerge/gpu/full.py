@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from gsmerge.stages.fit.full import (
     Plan,
     Progress,
     affordable_steps,
+    look_of,
     plan_run,
     step_sizes,
 )
@@ -120,7 +122,13 @@ def make_levels(photos: tuple[DevicePhotos, DevicePhotos], plan: Plan, device: t
 
 
 def take_step(
-    state: FitState, level: Level, view: int, background: Tensor, kept: Tensor | None, options: FitOptions
+    state: FitState,
+    level: Level,
+    view: int,
+    background: Tensor,
+    kept: Tensor | None,
+    options: FitOptions,
+    look: dict[str, Any],
 ) -> tuple[Gradients, Tensor]:
     """Gradients of one view's loss, and the sum of its weighted squared errors.
 
@@ -131,12 +139,14 @@ def take_step(
         background: ``[3]``.
         kept: ``[n]`` opacities of what is drawn; None: the state's own.
         options: Of the loss.
+        look: Low-pass, and whether its energy is compensated; see :func:`gsmerge.stages.fit.full.look_of`.
     """
     photos = level.photos
     shape = (state.means, state.quats, state.scales, state.opacities if kept is None else kept)
     with torch.enable_grad():
         leaves = [tensor.detach().requires_grad_() for tensor in (*shape, state_colors(state, photos, view))]
-        image, reached = draw((leaves[0], leaves[1], leaves[2], leaves[3]), leaves[4], photos, view, background)
+        drawn = leaves[0], leaves[1], leaves[2], leaves[3]
+        image, reached = draw(drawn, leaves[4], photos, view, background, **look)
     means = level.means.first[view], level.means.square[view]
     wanted, error = loss_gradient(image.detach(), photos.images[view], means, level.weight(view), options.ssim_lambda)
     of_means, of_quats, of_scales, of_opacities, of_colors = torch.autograd.grad(image, leaves, wanted)
@@ -196,8 +206,8 @@ def fit_full(
     plan = plan_run((photos[0].host, photos[1].host), options, seed)
     run = _Run(start_state(shapes), make_levels(photos, plan, device), plan, count, seed, progress)
     judged = torch.from_numpy(np.stack(plan.weights[1])).to(device)
-    half, share = photos[1], options.rates.single_view_share
-    before, run.state.box_shares = initial_scores(run.state, half, judged, options.min_gain, share)
+    half = photos[1]
+    before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
     if baseline_start is not None:
         before = min(before, holdout_score(start_state(baseline_start), half, judged, options.min_gain))
     run.score, after = before, None
@@ -249,10 +259,11 @@ class _Run:
     def take_step(self) -> None:
         """One step on one view."""
         options, dropout = self.plan.options, self.plan.dropout
-        level = self.levels[1 if self.step / self.steps < options.half_res_part else 0]
+        at = 1 if self.step / self.steps < options.half_res_part else 0
+        level, look = self.levels[at], look_of(self.step + 1, at, self.levels[at].photos.host.eps2d)
         view = self.schedule.views[self.step]
         kept = leave_out(self.state, dropout, self.generator) if dropout > 0 else None
-        gradients, error = take_step(self.state, level, view, self.schedule.backgrounds[self.step], kept, options)
+        gradients, error = take_step(self.state, level, view, self.schedule.backgrounds[self.step], kept, options, look)
         adam_step(self.state, gradients, options, self.rates[self.step], self.step + 1)
         mean = error / max(3 * level.counts[view], 1)
         self.error.lerp_(mean, 1 / min(self.step + 1, 10))

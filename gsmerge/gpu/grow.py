@@ -59,5 +59,6 @@ def grow(state: FitState, photos: DevicePhotos, count: int) -> FitState:
     old[picked] = False
     rows = torch.nonzero(old)[:, 0]
     grown.x0[rows], grown.units[rows] = state.x0[rows], state.units[rows]
-    grown.m, grown.v, grown.box_shares = state.m[source], state.v[source], state.box_shares[source]
+    for name in ("m", "v", "box_shares", "min_sizes"):
+        setattr(grown, name, getattr(state, name)[source])
     return grown

@@ -11,6 +11,7 @@ from gsmerge.gpu.adam import FitState
 from gsmerge.gpu.raster import draw_and_transpose, draw_black, harmonic_colors
 from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.render.colored import Shape
+from gsmerge.stages.fit.options import FitOptions
 from gsmerge.types import SH_C0
 
 
@@ -38,23 +39,29 @@ def holdout_score(state: FitState, photos: DevicePhotos, weights: Tensor, min_ga
 
 
 def initial_scores(
-    state: FitState, photos: DevicePhotos, weights: Tensor, min_gain: float, least_share: float
-) -> tuple[float, Tensor]:
-    """PSNR (dB) of the held-out blocks, and ``[n]`` the share of its box that each Gaussian may use.
+    state: FitState, photos: tuple[DevicePhotos, DevicePhotos], weights: Tensor, options: FitOptions
+) -> tuple[float, Tensor, Tensor]:
+    """PSNR (dB) of the half-size held-out blocks; ``[n]`` box shares and ``[n]`` least log scales.
 
     See :func:`gsmerge.stages.fit.full.initial_scores`.
     """
-    images, shape = [], state_shape(state)
+    full, half = photos
+    images, shape, rates = [], state_shape(state), options.rates
     sums, squares = (torch.zeros(len(state), dtype=torch.float64, device=state.x.device) for _ in range(2))
-    for view in range(len(photos)):
-        image, transpose = draw_and_transpose(shape, state_colors(state, photos, view), photos, view)
+    pixels = torch.full_like(state.units, torch.inf)
+    for view in range(len(half)):
+        image, transpose = draw_and_transpose(shape, state_colors(state, half, view), half, view)
         each = transpose(torch.ones_like(image))[:, 0].double()
         images.append(image)
         sums += each
         squares += each * each
+        ahead, focal = half.viewmats[view, 2], float(full.host.Ks[view][[0, 1], [0, 1]].max())
+        sizes = (state.means @ ahead[:3] + ahead[3]) / focal
+        pixels = torch.where(transpose.reached, pixels.minimum(sizes), pixels)
     photos_each = sums**2 / squares.clamp_min(1e-12)
-    shares = (photos_each - 1).clamp(least_share, 1).float()
-    return holdout_psnr(torch.stack(images), photos.images, weights, min_gain), shares
+    shares = (photos_each - 1).clamp(rates.single_view_share, 1).float()
+    min_sizes = (rates.min_scale * pixels.where(pixels.isfinite(), 0)).log()
+    return holdout_psnr(torch.stack(images), half.images, weights, options.min_gain), shares, min_sizes
 
 
 def holdout_psnr(images: Tensor, photos: Tensor, weights: Tensor, min_gain: float) -> float:

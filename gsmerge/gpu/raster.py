@@ -18,7 +18,15 @@ from gsmerge.types import SH_C0
 
 
 def draw(
-    shape: Shape, colors: Tensor, photos: DevicePhotos, view: int, background: Tensor, *, near: float = NEAR
+    shape: Shape,
+    colors: Tensor,
+    photos: DevicePhotos,
+    view: int,
+    background: Tensor,
+    *,
+    near: float = NEAR,
+    eps2d: float | None = None,
+    antialiased: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Image ``[h,w,3]`` of one view and ``[n]`` bool, which Gaussians have a footprint in it.
 
@@ -29,16 +37,19 @@ def draw(
         view: Of the photos.
         background: ``[3]``.
         near: Nearest depth drawn.
+        eps2d: Low-pass, square pixels; None: that of the photos.
+        antialiased: Lower the opacity by what the low-pass adds to the footprint.
     """
+    eps2d = photos.host.eps2d if eps2d is None else eps2d
     if colors.device.type == "cpu":
-        camera = photos.host.camera(view) | {"near": near}
+        camera = photos.host.camera(view) | {"near": near, "eps2d": eps2d, "antialiased": antialiased}
         return draw_colored(shape, colors, camera, background.numpy())
     from gsmerge.render.cuda import rasterize
 
-    eps2d = photos.host.eps2d
     drawn, reached = rasterize(
-        shape, colors, _cameras(photos, view), background, eps2d=eps2d, near=near, unit_quats=True
-    )
+        shape, colors, _cameras(photos, view), background, eps2d=eps2d, antialiased=antialiased, near=near,
+        unit_quats=True,
+    )  # fmt: skip
     return drawn.images[0], reached[0]
 
 
@@ -88,18 +99,19 @@ def draw_and_transpose(shape: Shape, colors: Tensor, photos: DevicePhotos, view:
     """The image of a view over black, and the function that takes images back to the Gaussians that show there."""
     with torch.enable_grad():
         leaf = colors.detach().requires_grad_()
-        image = draw_black(shape, leaf, photos, view)
-    return image.detach(), Transpose(image, leaf)
+        image, reached = draw(shape, leaf, photos, view, torch.zeros(3, device=colors.device))
+    return image.detach(), Transpose(image, leaf, reached)
 
 
 class Transpose:
     """Sums over the pixels of a view of every Gaussian's blending weight times an image.
 
     It is the transpose of drawing as a linear map from colours to images, which is the gradient in the colours.
+    ``reached`` is ``[n]`` bool: which Gaussians have a footprint in the view.
     """
 
-    def __init__(self, image: Tensor, colors: Tensor):
-        self.image, self.colors = image, colors
+    def __init__(self, image: Tensor, colors: Tensor, reached: Tensor):
+        self.image, self.colors, self.reached = image, colors, reached
 
     def __call__(self, values: Tensor) -> Tensor:
         """``[n,3]`` of an image ``[h,w,3]``."""

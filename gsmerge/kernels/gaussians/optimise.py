@@ -25,8 +25,8 @@ def _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, sca
 
 
 @kernel
-def _confine(x, x0, unit, share, limits):
-    """Box trust region about the start, range of colours (no farther out than the start), unit quaternion."""
+def _confine(x, x0, unit, share, least, limits):
+    """Box trust region about the start, least size, colours no farther out than the start, unit quaternion."""
     grown = share * limits[1]
     d0, d1, d2 = x[0] - x0[0], x[1] - x0[1], x[2] - x0[2]
     far, reach = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2), share * limits[0] * unit
@@ -34,7 +34,7 @@ def _confine(x, x0, unit, share, limits):
         f = reach / far
         x[0], x[1], x[2] = x0[0] + f * d0, x0[1] + f * d1, x0[2] + f * d2
     for c in range(SIZE, SIZE + 3):
-        x[c] = min(x0[c] + grown, max(x0[c] - grown, x[c]))
+        x[c] = max(least, min(x0[c] + grown, max(x0[c] - grown, x[c])))
     logit = min(x0[LOGIT] + limits[2], max(x0[LOGIT] - limits[2], x[LOGIT]))
     x[LOGIT] = min(MAX_LOGIT, max(MIN_LOGIT, logit))
     for c in range(COLOR, COLOR + 3):
@@ -47,16 +47,18 @@ def _confine(x, x0, unit, share, limits):
 
 @kernel
 def adam(
-    x, x0, m, v, units, box_shares, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits, betas, step,
-    first, last, means, quats, scales, opacities, colors,
+    x, x0, m, v, units, box_shares, min_sizes, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits,
+    betas, step, first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
-    """Adam on the rows ``first`` to ``last`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
+    """Adam on the rows ``ids[first]`` to ``ids[last - 1]`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
 
     The mean and the quaternion share one second moment over their components, so that the step turns with the
-    scene. Dense: Gaussians without a gradient (``ids`` rising holds those that have one) coast on their momentum.
+    scene. Sparse: rows that a view does not show keep their parameters and moments.
 
     Args:
         box_shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.
+        min_sizes: ``[n]`` least log scale of each, whatever the box.
+        ids: ``[k]`` rows with a gradient, each once; the gradients have k rows.
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
         limits: Of the mean (in sizes), log scale, logit.
         betas: Decay of the first and second moment.
@@ -68,18 +70,10 @@ def adam(
     c2 = f4(1.0) / (f4(1.0) - b2 ** f4(step))
     row = np.zeros(COLUMNS, np.float32)
     energy = np.empty(COLUMNS, np.float32)
-    k, end = 0, ids.shape[0]
-    while k < end:  # the first row with a gradient
-        middle = (k + end) // 2
-        k, end = (middle + 1, end) if ids[middle] < first else (k, middle)
-    for i in range(first, last):
+    for k in range(first, last):
+        i = np.int64(ids[k])
         unit = units[i]
-        if k < ids.shape[0] and ids[k] == i:
-            _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
-            k += 1
-        else:
-            for c in range(COLUMNS):
-                row[c] = f4(0.0)
+        _gather(row, unit, k, g_means, g_quats, g_scales, g_opacities, g_colors, scales[i], opacities[i])
         for c in range(COLUMNS):
             energy[c] = row[c] * row[c]
         shared = (energy[0] + energy[1] + energy[2]) / f4(3.0)
@@ -91,7 +85,7 @@ def adam(
             v[i, c] = b2 * v[i, c] + (f4(1.0) - b2) * energy[c]
             move = rates[c] * m[i, c] * c1 / (np.sqrt(v[i, c] * c2) + f4(1e-15))
             x[i, c] -= move * unit if c < SIZE else move
-        _confine(x[i], x0[i], unit, box_shares[i], limits)
+        _confine(x[i], x0[i], unit, box_shares[i], min_sizes[i], limits)
         for c in range(3):
             means[i, c], colors[i, c] = x[i, c], x[i, COLOR + c]
             scales[i, c] = np.exp(x[i, SIZE + c])

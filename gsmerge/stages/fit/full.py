@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,10 @@ LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS, whatever the views
 PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
+# How full-size steps draw, in turn: the low-pass as a share of the viewers' own, and whether small Gaussians are made
+# clearer by what it adds to them. Some viewers do that, and enlarged twice the low-pass is a quarter: what was fitted
+# to one way alone looks thin or fat in the others (Mip-Splatting, Yu et al. 2024).
+LOOKS = ((1.0, True), (1.0, False), (0.25, False), (1.0, False), (1.0, False), (0.25, False))
 
 NO_LOSS = np.empty((0, 0), np.float32)  # on the transmittance
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
@@ -92,7 +97,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     if plan.dropout > 0:
         kept = rng.random(len(state.x), dtype=np.float32) >= plan.dropout
         opacities = kept * np.minimum(state.splats.opacities / np.float32(1 - plan.dropout), np.float32(0.99))
-    drawn = plan_view(state.splats, **photos.camera(view), opacities=opacities)
+    drawn = plan_view(state.splats, **(photos.camera(view) | look_of(step, level, photos.eps2d)), opacities=opacities)
     all_colors = state.view_colors()
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
@@ -106,15 +111,27 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     betas = np.array([rates.beta1, rates.beta2], np.float32)
 
     def update(first: int) -> None:
-        last = min(first + ROWS, len(state.x))
+        last = min(first + ROWS, len(g.ids))
         kernels.adam(
-            state.x, state.x0, state.m, state.v, state.units, state.box_shares, g.ids,
+            state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes, g.ids,
             g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, step,
             first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
         )  # fmt: skip
 
-    parallel_map(update, range(0, len(state.x), ROWS))
+    parallel_map(update, range(0, len(g.ids), ROWS))
     return error / max(3 * float(weight.sum()), 1)
+
+
+def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
+    """The arguments of :func:`gsmerge.render.plan_view` that say how a step draws.
+
+    Args:
+        step: From 1.
+        level: 0 for full-size photos; 1 for half-size ones, whose steps are few and coarse, and all draw one way.
+        eps2d: Low-pass of the photos, square pixels.
+    """
+    share, antialiased = (1.0, False) if level else LOOKS[step % len(LOOKS)]
+    return {"eps2d": share * eps2d, "antialiased": antialiased}
 
 
 def step_sizes(rates: LearningRates, progress: float, steps: int) -> np.ndarray:
@@ -124,28 +141,34 @@ def step_sizes(rates: LearningRates, progress: float, steps: int) -> np.ndarray:
     return (np.repeat(each, [3, 3, 4, 1, 3]) * decay**progress).astype(np.float32)
 
 
-def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray]:
-    """PSNR (dB) of the half-size held-out blocks, and ``[n]`` float32 the share of its box that each Gaussian may use.
+def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray, np.ndarray]:
+    """PSNR (dB) of the half-size held-out blocks; ``[n]`` box shares and ``[n]`` least log scales, both float32.
 
-    The share is ``single_view_share`` to 1, by how many photos show a Gaussian: the effective number of them,
-    (sum w)^2 / sum w^2 of its blending weights w in them.
+    The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos show it: the
+    effective number of them, (sum w)^2 / sum w^2 of its blending weights w in them. Its least scale is ``min_scale``
+    pixels of the full-size photo that it is nearest to (the 3D filter of Mip-Splatting); none where no photo shows it.
     """
-    photos, colors = plan.photos[1], state.view_colors()
+    photos, colors, rates = plan.photos[1], state.view_colors(), plan.options.rates
     everywhere = np.ones((photos.height, photos.width, 1), np.float32)
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         drawn = plan_view(state.splats, **photos.camera(view))
-        return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0]
+        focal = plan.photos[0].Ks[view][[0, 1], [0, 1]].max()
+        return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0], drawn.ids, drawn.depths / focal
 
     images, sums, squares = [], np.zeros(len(state.x)), np.zeros(len(state.x))
-    for image, each in in_turn(one_view, range(len(photos))):
+    pixels = np.full(len(state.x), np.inf, np.float32)  # size of the finest one
+    for image, each, ids, sizes in in_turn(one_view, range(len(photos))):
         weights = each.astype(np.float64)
         images.append(image)
         sums += weights
         squares += weights**2
+        pixels[ids] = np.minimum(pixels[ids], sizes)
     photos_each = sums**2 / np.maximum(squares, 1e-12)
-    box_shares = np.clip(photos_each - 1, plan.options.rates.single_view_share, 1).astype(np.float32)
-    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), box_shares
+    box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
+    with np.errstate(divide="ignore"):
+        min_sizes = np.log(rates.min_scale * np.where(np.isfinite(pixels), pixels, 0)).astype(np.float32)
+    return holdout_psnr(images, photos, plan.weights[1], plan.options.min_gain), box_shares, min_sizes
 
 
 def holdout_score(state: State, plan: Plan) -> float:
@@ -212,7 +235,7 @@ def fit_full(
     """
     rng, state, plan = np.random.default_rng(seed), start_state(gaussians), plan_run(photos, options, seed, masks)
     tail = TailMean()
-    own, state.box_shares[:] = initial_scores(state, plan)
+    own, state.box_shares[:], state.min_sizes[:] = initial_scores(state, plan)
     after = before = score_to_beat(own, baseline_start, plan)
     queue: list[int] = []
     grows = options.grows

@@ -41,8 +41,8 @@ def grow(state: State, photos: Photos, count: int) -> State:
     """Halve the Gaussians with the largest error masses across their longest axis, until there are ``count``.
 
     Each is halved at most once, so the number at most doubles, and what no photo shows is left alone. The halves
-    start with their parent's momentum and its share of the box; the old ones come first and in order, the second
-    halves after them.
+    start with their parent's momentum, share of the box and least size; the old ones come first and in order, the
+    second halves after them.
 
     Args:
         state: n Gaussians under optimisation.
@@ -72,5 +72,6 @@ def grow(state: State, photos: Photos, count: int) -> State:
     old = np.ones(len(x), bool)
     old[picked] = old[len(state.x) :] = False
     grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
-    grown.m[:], grown.v[:], grown.box_shares[:] = state.m[source], state.v[source], state.box_shares[source]
+    for name in ("m", "v", "box_shares", "min_sizes"):
+        getattr(grown, name)[:] = getattr(state, name)[source]
     return grown

@@ -31,6 +31,8 @@ class LearningRates:
         max_opacity_change: Largest change of an opacity's logit.
         single_view_share: Share of the limits of mean and scales for a Gaussian that one photo alone shows: that photo
             says what it looks like, not where it is. From two photos on the limits are whole.
+        min_scale: Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as needles
+            when a viewer enlarges them. 0 for none.
     """
 
     means_lr: float = 0.1
@@ -45,6 +47,7 @@ class LearningRates:
     max_scale_change: float = 2.5
     max_opacity_change: float = 4.0
     single_view_share: float = 0.3
+    min_scale: float = 0.5
 
 
 @dataclass(frozen=True)

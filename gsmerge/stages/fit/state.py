@@ -22,6 +22,7 @@ class State:
         v: Second moment.
         units: ``[n]`` size of each Gaussian: geometric mean of its two largest scales when it began.
         box_shares: ``[n]`` share of the box about the start that each Gaussian's mean and scales may use.
+        min_sizes: ``[n]`` least log scale of each Gaussian.
         splats: Means, quaternions, scales and opacities as the rasterizer takes them.
         colors: ``[n,3]`` base colours.
     """
@@ -32,6 +33,7 @@ class State:
     v: np.ndarray
     units: np.ndarray
     box_shares: np.ndarray
+    min_sizes: np.ndarray
     splats: Splats
     colors: np.ndarray
 
@@ -69,7 +71,8 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
         origin=np.zeros(3),
     )
     units = np.exp((sizes[:, 1] + sizes[:, 2]) / 2)
-    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, np.ones_like(units), splats, colors)
+    shares, least = np.ones_like(units), np.full_like(units, -np.inf)
+    return State(x, x.copy(), np.zeros_like(x), np.zeros_like(x), units, shares, least, splats, colors)
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:

@@ -32,6 +32,7 @@ def odd_state(count: int, device: torch.device | str = "cpu") -> tuple[FitState,
     state.m, state.v = normal(count, 14) * 0.1, normal(count, 14) ** 2 * 0.1
     state.m[3, 6:10] = 0.0
     state.box_shares = torch.rand(count, generator=generator)
+    state.min_sizes = torch.where(torch.rand(count, generator=generator) < 0.5, -torch.inf, normal(count))
     moved = {name: getattr(state, name).to(device) for name in FitState.__dataclass_fields__}
     return FitState(**moved), replace(FitOptions(opacity_reg=0.5, scale_reg=0.7), rates=RATES)
 

@@ -16,7 +16,15 @@ from gsmerge.render.photos import Photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.fit import FitOptions, LearningRates, start_share
 from gsmerge.stages.fit import full as full_module
-from gsmerge.stages.fit.full import affordable_steps, fit_full, holdout_score, initial_scores, plan_run, step_sizes
+from gsmerge.stages.fit.full import (
+    affordable_steps,
+    fit_full,
+    holdout_score,
+    initial_scores,
+    look_of,
+    plan_run,
+    step_sizes,
+)
 from gsmerge.stages.fit.state import start_state
 from gsmerge.types import SH_C0
 
@@ -90,7 +98,7 @@ def test_every_kind_of_parameter_moves(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
-    rates = LearningRates(max_mean_shift=0.5, max_scale_change=0.1, max_opacity_change=0.2)
+    rates = LearningRates(max_mean_shift=0.5, max_scale_change=0.1, max_opacity_change=0.2, min_scale=0)
     start = scenes.spoil(truth)
     result, report = fit_full(start, photos, replace(QUICK, rates=rates))
     assert report.accepted
@@ -106,7 +114,7 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
 
     def shares_of(some: Pair) -> np.ndarray:
         plan = plan_run(some, QUICK, 0)
-        psnr, actual = initial_scores(state, plan)
+        psnr, actual, _ = initial_scores(state, plan)
         assert psnr == holdout_score(state, plan)
         return actual
 
@@ -123,12 +131,36 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
     np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
 
 
+def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pair) -> None:
+    """Of the photo that it is nearest to, whatever the box says."""
+    start = scenes.spoil(truth)
+    thin = replace(start, scales=start.scales * np.array([0.02, 1, 1], np.float32))
+    _, _, min_sizes = initial_scores(start_state(thin), plan_run(photos, QUICK, 0))
+    views = photos[0].viewmats
+    depths = start.means @ views[:, 2, :3].T + views[:, 2, 3]
+    np.testing.assert_allclose(np.exp(min_sizes), 0.5 * depths.min(1) / photos[0].Ks[0, 0, 0], rtol=1e-4)
+    free = replace(QUICK, rates=replace(QUICK.rates, min_scale=0.0))
+    kept, report = fit_full(thin, photos, QUICK)
+    needles, other = fit_full(thin, photos, free)
+    assert report.accepted
+    assert other.accepted
+    assert (kept.scales >= np.exp(min_sizes)[:, None] * (1 - 1e-5)).all()
+    assert (needles.scales.min(1) < np.exp(min_sizes) / 3).mean() > 0.5
+
+
+def test_full_size_steps_draw_as_viewers_do() -> None:
+    """With and without compensation, and as when enlarged twice; half-size steps always in one way."""
+    looks = [look_of(step, 0, 0.3) for step in range(1, 7)]
+    assert {(look["eps2d"], look["antialiased"]) for look in looks} == {(0.3, True), (0.3, False), (0.075, False)}
+    assert looks[0] == look_of(7, 0, 0.3)
+    assert {tuple(look_of(step, 1, 0.075).values()) for step in range(1, 7)} == {(0.075, False)}
+
+
 def test_single_photo_moves_less(truth: Gaussians) -> None:
     scene, _ = scenes.self_made(0, 1)
-    start = scenes.spoil(truth)
-    result, report = fit_full(start, scenes.pair_of(scene), QUICK)
+    start, rates = scenes.spoil(truth), replace(QUICK.rates, min_scale=0.0)
+    result, report = fit_full(start, scenes.pair_of(scene), replace(QUICK, rates=rates))
     assert report.accepted
-    rates = QUICK.rates
     unit = np.sort(start.scales, 1)[:, 1:].prod(1) ** 0.5
     share = 1.001 * rates.single_view_share
     assert (np.linalg.norm(result.means - start.means, axis=1) <= share * rates.max_mean_shift * unit).all()

@@ -48,6 +48,7 @@ def used(gaussians: Gaussians) -> State:
     state.x0 -= np.float32(0.01)
     state.units *= np.float32(1.5)
     state.box_shares[:] = rng.uniform(size=len(state.x))
+    state.min_sizes[:] = rng.normal(size=len(state.x))
     return state
 
 
@@ -177,13 +178,14 @@ def test_the_rest_stays_as_it_is(gaussians: Gaussians, photos: Photos) -> None:
     grown = grow(state, photos, n + 9)
     worst = np.sort(np.argsort(-error_masses(state, photos), kind="stable")[:9])
     rest = np.setdiff1d(np.arange(n), worst)
-    for name in ("x", "x0", "m", "v", "units", "box_shares", "colors"):
+    for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors"):
         np.testing.assert_array_equal(getattr(grown, name)[rest], getattr(state, name)[rest], err_msg=name)
     halves = np.concatenate([worst, np.arange(n, n + 9)])
     parents = np.concatenate([worst, worst])
     np.testing.assert_array_equal(grown.m[halves], state.m[parents])
     np.testing.assert_array_equal(grown.v[halves], state.v[parents])
     np.testing.assert_array_equal(grown.box_shares[halves], state.box_shares[parents])
+    np.testing.assert_array_equal(grown.min_sizes[halves], state.min_sizes[parents])
     np.testing.assert_array_equal(grown.x0[halves], grown.x[halves])
     own = np.sort(grown.x[halves, SIZE:QUAT], 1)[:, 1:].mean(1)
     np.testing.assert_allclose(grown.units[halves], np.exp(own), rtol=1e-5)
@@ -214,7 +216,7 @@ def test_growing_happens_where_the_error_is(scene: PixelScene, gaussians: Gaussi
 
 def test_growing_repeats(gaussians: Gaussians, photos: Photos) -> None:
     one, two = (grow(used(gaussians), photos, len(gaussians) + 13) for _ in range(2))
-    for name in ("x", "x0", "m", "v", "units", "box_shares"):
+    for name in ("x", "x0", "m", "v", "units", "box_shares", "min_sizes"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
