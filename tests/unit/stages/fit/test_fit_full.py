@@ -150,10 +150,10 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
 
 def test_full_size_steps_draw_as_viewers_do() -> None:
     """With and without compensation, and as when enlarged twice; half-size steps always in one way."""
-    looks = [look_of(step, 0, 0.3) for step in range(1, 7)]
+    looks = [look_of(step, 0, 0.3) for step in range(1, 9)]
     assert {(look["eps2d"], look["antialiased"]) for look in looks} == {(0.3, True), (0.3, False), (0.075, False)}
-    assert looks[0] == look_of(7, 0, 0.3)
-    assert {tuple(look_of(step, 1, 0.075).values()) for step in range(1, 7)} == {(0.075, False)}
+    assert looks[0] == look_of(9, 0, 0.3)
+    assert {tuple(look_of(step, 1, 0.075).values()) for step in range(1, 9)} == {(0.075, False)}
 
 
 def test_single_photo_moves_less(truth: Gaussians) -> None:
