@@ -1,4 +1,4 @@
-"""Quaternions, covariances and projection, on batches of arrays."""
+"""Quaternions, covariances, projection and medians, on batches of arrays."""
 
 from __future__ import annotations
 
@@ -100,6 +100,12 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
     image = camera @ Ks.swapaxes(-1, -2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def lower_median(values: np.ndarray) -> np.ndarray:
+    """The median of ``[n,...]`` rows, n at least 1, each column alone; of an even number, the lower middle one."""
+    middle = (len(values) - 1) // 2
+    return np.partition(values, middle, axis=0)[middle]
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:
