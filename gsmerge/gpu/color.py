@@ -14,12 +14,12 @@ from torch import Tensor
 
 from gsmerge.gpu.holdout import exposure_gains, holdout_psnr
 from gsmerge.gpu.raster import draw_all, draw_and_transpose, draw_black, shape_of
-from gsmerge.gpu.scene import DevicePhotos, Shapes
+from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.stages.fit.color import HOLDOUT, MAX_RETRIES
 from gsmerge.stages.fit.holdout import training_weights
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
-from gsmerge.types import SH_C0
+from gsmerge.types import SH_C0, Gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +27,14 @@ class _System:
     """Least squares in the colours of n Gaussians.
 
     Args:
-        shapes: The Gaussians, whose geometry stays.
+        gaussians: The Gaussians, whose geometry stays.
         photos: V photos.
         images: ``[v,h,w,3]`` their renders with the colours as they were.
         weights: ``[v,h,w]`` of the pixels.
         gains: ``[v,3]`` exposures.
     """
 
-    shapes: Shapes
+    gaussians: Gaussians
     photos: DevicePhotos
     images: Tensor
     weights: Tensor
@@ -42,27 +42,29 @@ class _System:
 
     def spread(self, view: int, colors: Tensor) -> Tensor:
         """The matrix of a view times colours ``[n,3]``: an image ``[h,w,3]``."""
-        return draw_black(shape_of(self.shapes), colors.float(), self.photos, view)
+        return draw_black(shape_of(self.gaussians), colors.float(), self.photos, view)
 
     def fitted(self, offsets: Tensor) -> Tensor:
         """``[v,h,w,3]`` renders with offsets ``[n,3]`` on the base colours."""
         return torch.stack([image + self.spread(view, offsets) for view, image in enumerate(self.images)])
 
 
-def fit_colors(shapes: Shapes, photos: DevicePhotos, options: FitOptions, seed: int = 0) -> tuple[Shapes, FitReport]:
+def fit_colors(
+    gaussians: Gaussians, photos: DevicePhotos, options: FitOptions, seed: int = 0
+) -> tuple[Gaussians, FitReport]:
     """Base colours fitted to the photos, kept only if held-out blocks of the photos get better.
 
     Args:
-        shapes: Gaussians, whose geometry, opacities and higher harmonics stay as they are.
+        gaussians: Gaussians, whose geometry, opacities and higher harmonics stay as they are.
         photos: The input views.
         options: The solver's settings.
         seed: Chooses the held-out blocks.
     """
-    device = shapes.means.device
+    device = gaussians.means.device
     train = training_weights(photos.host, min(0.5, HOLDOUT * options.holdout), seed)
     weights = torch.from_numpy(np.stack(train)).to(device)
-    images = torch.stack(draw_all(shapes, photos))
-    plain = _System(shapes, photos, images, weights, torch.ones(len(photos), 3, device=device))
+    images = torch.stack(draw_all(gaussians, photos))
+    plain = _System(gaussians, photos, images, weights, torch.ones(len(photos), 3, device=device))
     before = holdout_psnr(images, photos.images, weights, options.min_gain)
     prior_weight = options.prior_weight
     for _ in range(1 + MAX_RETRIES):
@@ -71,16 +73,16 @@ def fit_colors(shapes: Shapes, photos: DevicePhotos, options: FitOptions, seed: 
         if after > before:
             offsets = _finish(system, offsets, options, prior_weight)
             report = FitReport("color", True, options.iterations, before, after, f"prior weight {prior_weight:g}")
-            return replace(shapes, sh0=_clamped(shapes, offsets)), report
+            return replace(gaussians, sh0=_clamped(gaussians, offsets)), report
         prior_weight *= 8
     report = FitReport("none", False, options.iterations, before, after, "held-out parts of the photos did not improve")
-    return shapes, report
+    return gaussians, report
 
 
 def _solve(plain: _System, options: FitOptions, prior_weight: float) -> tuple[_System, Tensor]:
     """Offsets ``[n,3]`` of the base colours that fit the training pixels, and the system with its final weights."""
     steps = max(1, options.iterations // 3)
-    start = torch.zeros(len(plain.shapes), 3, dtype=torch.float64, device=plain.images.device)
+    start = torch.zeros(len(plain.gaussians), 3, dtype=torch.float64, device=plain.images.device)
     offsets = conjugate_gradients(plain, start, steps, prior_weight)
     system = _reweighed(plain, plain.weights, offsets, options)
     return system, conjugate_gradients(system, offsets, steps, prior_weight)
@@ -119,7 +121,7 @@ def _residual(system: _System, x: Tensor) -> tuple[Tensor, Tensor]:
     mass, gradient = torch.zeros_like(x), torch.zeros_like(x)
     for view, image in enumerate(system.images):
         weight, gain = system.weights[view][..., None], system.gains[view]
-        added, transpose = draw_and_transpose(shape_of(system.shapes), x.float(), system.photos, view)
+        added, transpose = draw_and_transpose(shape_of(system.gaussians), x.float(), system.photos, view)
         residual = weight * (system.photos.images[view] - gain * (image + added))
         mass += transpose(weight.expand_as(image)) * gain**2
         gradient += transpose(residual) * gain
@@ -130,7 +132,7 @@ def _normal(system: _System, x: Tensor) -> Tensor:
     """Normal matrix of the data term times ``x``."""
     total = torch.zeros_like(x)
     for view in range(len(system.images)):
-        image, transpose = draw_and_transpose(shape_of(system.shapes), x.float(), system.photos, view)
+        image, transpose = draw_and_transpose(shape_of(system.gaussians), x.float(), system.photos, view)
         total += transpose(image * system.weights[view][..., None]) * system.gains[view] ** 2
     return total
 
@@ -145,8 +147,8 @@ def _reweighed(system: _System, base: Tensor, x: Tensor, options: FitOptions) ->
     return replace(system, weights=robust, gains=gains)
 
 
-def _clamped(shapes: Shapes, offsets: Tensor) -> Tensor:
+def _clamped(gaussians: Gaussians, offsets: Tensor) -> Tensor:
     """New sh0 within a little more than the range of colours, or where they were outside it, no farther out."""
-    before = 0.5 + SH_C0 * shapes.sh0[:, 0].double()
+    before = 0.5 + SH_C0 * gaussians.sh0[:, 0].double()
     color = (before + offsets).clamp(before.clamp_max(-0.05), before.clamp_min(1.05))
     return ((color - 0.5) / SH_C0).float()[:, None]
