@@ -16,7 +16,7 @@ from torch import Tensor
 from gsmerge.gpu import decode as on_device_decode
 from gsmerge.gpu import match as on_device_match
 from gsmerge.gpu import segment as on_device_segment
-from gsmerge.gpu.fit import fit
+from gsmerge.gpu.fit import ON_DEVICE
 from gsmerge.gpu.match import merge
 from gsmerge.gpu.pool import encode
 from gsmerge.gpu.runs import group_rows
@@ -37,6 +37,7 @@ from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.decode import decode_merged
+from gsmerge.stages.fit.stage import fit_with
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match as match_on_cpu
 from gsmerge.stages.merge import MergedViews
@@ -136,9 +137,8 @@ class DeviceScene:
             return gaussians.numpy()
         with self.stage(log, "fit"):
             log.choices["begun_with"] = len(gaussians)
-            gaussians, report = fit(
-                gaussians, self.photos, options.fit, count, options.seed, log.fit_progress, other, exact=exact
-            )
+            settings = options.fit, count, options.seed, log.fit_progress, other
+            gaussians, report = fit_with(ON_DEVICE, gaussians, self.photos, *settings, exact=exact)
             gaussians = gaussians.numpy()
         log.add_fit(report)
         return gaussians

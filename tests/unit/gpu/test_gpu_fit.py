@@ -19,8 +19,7 @@ from step_states import gradients_of, odd_state
 from gsmerge import Gaussians, PixelScene
 from gsmerge.gpu import full as gpu_full
 from gsmerge.gpu.adam import adam_step
-from gsmerge.gpu.fit import fit as fit_on_device
-from gsmerge.gpu.fit import fit_gaussians, visible_mask
+from gsmerge.gpu.fit import ON_DEVICE, fit_gaussians, visible_mask
 from gsmerge.gpu.grow import error_masses, grow_to
 from gsmerge.gpu.holdout import exposure_gains, holdout_psnr
 from gsmerge.gpu.loss import loss_gradient, photo_means
@@ -153,7 +152,7 @@ def test_a_fit_that_fails_falls_back(start: Gaussians, photos: Pair) -> None:
 
 def test_nothing_is_fitted_where_nothing_is_asked_for(start: Gaussians, photos: Pair) -> None:
     tensors = upload_gaussians(start, CPU)
-    same, report = fit_on_device(tensors, on_device(photos), replace(QUICK, fit="none", effort="draft"))
+    same, report = stage.fit_with(ON_DEVICE, tensors, on_device(photos), replace(QUICK, fit="none", effort="draft"))
     assert same is tensors
     assert report is None
     few, _ = fit_gaussians(start[:0], photos, QUICK, device=CPU)
@@ -282,7 +281,7 @@ def test_scores_are_the_renderers(start: Gaussians, scene: PixelScene, monkeypat
     assert photo_psnr(tensors, resident, [1], near=NEAR, quarter=False) == pytest.approx(
         render_photos.photo_psnr(start, full, [1]), abs=1e-4
     )
-    assert photo_error(tensors, resident) == pytest.approx(stage._photos_error(start, full), rel=1e-4)
+    assert photo_error(tensors, resident) == pytest.approx(stage.photo_error(start, full), rel=1e-4)
 
 
 def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
