@@ -26,6 +26,7 @@ from gsmerge.stages.fit.full import (
     PROBE,
     Plan,
     Progress,
+    TailMean,
     affordable_steps,
     plan_run,
     step_sizes,
@@ -147,29 +148,6 @@ def leave_out(state: FitState, dropout: float, generator: torch.Generator) -> Te
     """``[n]`` opacities with a share of the Gaussians left out, the others a little more opaque."""
     kept = torch.rand(len(state), device=state.x.device, generator=generator) >= dropout
     return kept * (state.opacities / (1 - dropout)).clamp_max(MAX_DRAWN)
-
-
-class TailMean:
-    """Mean of parameters ``[n,14]`` over the last steps; see :class:`gsmerge.stages.fit.full.TailMean`."""
-
-    def __init__(self) -> None:
-        self.mean, self.count = torch.empty(0), 0
-
-    def add(self, x: Tensor) -> None:
-        """One more step; the first one after Gaussians were added begins anew."""
-        if len(self.mean) != len(x) or self.count == 0:
-            self.mean, self.count = x.clone(), 1
-        else:
-            self.count += 1
-            self.mean.lerp_(x, 1 / self.count)
-
-    def of(self, x: Tensor) -> Tensor:
-        """The mean with unit quaternions; ``x`` itself where no step of as many Gaussians was added."""
-        if self.count == 0 or len(self.mean) != len(x):
-            return x
-        mean = self.mean.clone()
-        mean[:, QUAT:LOGIT] /= mean[:, QUAT:LOGIT].norm(dim=1, keepdim=True)
-        return mean
 
 
 def fit_full(
