@@ -1,10 +1,10 @@
-"""Quaternions, covariances and projection, on batches of arrays."""
+"""Quaternions, covariances, projection and medians, on batches of arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.types import SH_C0, Cameras
+from gsmerge.types import SH_C0, Array, Cameras
 
 MORTON_BITS = 21  # per axis: three fit into 63 bits
 
@@ -18,13 +18,17 @@ def quat_to_rotmat(quats: np.ndarray) -> np.ndarray:
     Returns:
         ``[...,3,3]`` rotations, local to world.
     """
-    w, x, y, z = np.moveaxis(normalize(quats), -1, 0)
-    rows = [
+    entries = rotation_entries(*np.moveaxis(normalize(quats), -1, 0))
+    return np.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def rotation_entries(w: Array, x: Array, y: Array, z: Array) -> list[Array]:
+    """The nine entries, row by row, of the rotations of unit quaternions, arrays or tensors of any one shape."""
+    return [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    return np.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def normalize(vectors: np.ndarray) -> np.ndarray:
@@ -96,6 +100,12 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
     image = camera @ Ks.swapaxes(-1, -2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def lower_median(values: np.ndarray) -> np.ndarray:
+    """The median of ``[n,...]`` rows, n at least 1, each column alone; of an even number, the lower middle one."""
+    middle = (len(values) - 1) // 2
+    return np.partition(values, middle, axis=0)[middle]
 
 
 def morton_codes(points: np.ndarray) -> np.ndarray:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsmerge.gpu.scene import Features, Shapes
+from gsmerge.gpu.scene import Features
 from gsmerge.moments import MAX_OPACITY, MIN_SCALE
+from gsmerge.types import Gaussians
 
 SWEEPS = 6  # of Jacobi rotations: they converge quadratically, and matrices of 3 x 3 are done after five
 
@@ -75,11 +76,11 @@ def determinants(matrices: Tensor) -> Tensor:
     return (torch.linalg.cross(x, y) * z).sum(1)
 
 
-def moments_to_shapes(covars: Tensor, extinctions: Tensor, spreads: Tensor, means: Tensor, sh: Tensor) -> Shapes:
+def to_gaussians(covars: Tensor, extinctions: Tensor, spreads: Tensor, means: Tensor, sh: Tensor) -> Gaussians:
     """Gaussians of given moments, float64; opacity from the conserved optical depth over the (unspread) disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - (-extinctions / (scales[:, 1] * scales[:, 2])).exp()
-    return Shapes(
+    return Gaussians(
         means=means.float(),
         quats=quats.float(),
         scales=(scales * spreads[:, None]).float(),
@@ -89,9 +90,9 @@ def moments_to_shapes(covars: Tensor, extinctions: Tensor, spreads: Tensor, mean
     )
 
 
-def features_to_shapes(features: Features) -> Shapes:
+def feature_to_gaussians(features: Features) -> Gaussians:
     """One Gaussian per Feature Gaussian (K = 1)."""
-    return moments_to_shapes(
+    return to_gaussians(
         features.covars.double(),
         (features.extinctions * features.gains).double(),
         features.spreads.double(),

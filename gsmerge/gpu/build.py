@@ -16,7 +16,7 @@ from torch import Tensor
 from gsmerge.gpu import decode as on_device_decode
 from gsmerge.gpu import match as on_device_match
 from gsmerge.gpu import segment as on_device_segment
-from gsmerge.gpu.fit import fit
+from gsmerge.gpu.fit import ON_DEVICE
 from gsmerge.gpu.match import merge
 from gsmerge.gpu.pool import encode
 from gsmerge.gpu.runs import group_rows
@@ -24,9 +24,7 @@ from gsmerge.gpu.scene import (
     DeviceMembers,
     DevicePhotos,
     Features,
-    Shapes,
     download_features,
-    download_gaussians,
     download_groups,
     to_device,
     upload_gaussians,
@@ -39,6 +37,7 @@ from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.decode import decode_merged
+from gsmerge.stages.fit.stage import fit_with
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match as match_on_cpu
 from gsmerge.stages.merge import MergedViews
@@ -127,27 +126,26 @@ class DeviceScene:
         other, keeps_all = None, prepared.keeps_all(count)
         problem = "nothing is merged" if keeps_all else merge_problem(prepared)
         if problem is None:
-            shapes, count, exact = self._merge(prepared, count, log, reasons)
+            gaussians, count, exact = self._merge(prepared, count, log, reasons)
         else:
-            gaussians, count, exact, analytic = self.begin(prepared, count, log)
-            shapes = upload_gaussians(gaussians, self.device)
+            start, count, exact, analytic = self.begin(prepared, count, log)
+            gaussians = upload_gaussians(start, self.device)
             other = None if analytic is None else upload_gaussians(analytic, self.device)
             reasons["merging"] = problem
         log.choices |= {"device": self.device.type} | ({"on_cpu": reasons} if reasons else {})
         if scene.images is None or not options.fit.needs_photos:
-            return download_gaussians(shapes)
+            return gaussians.numpy()
         with self.stage(log, "fit"):
-            log.choices["begun_with"] = len(shapes)
-            shapes, report = fit(
-                shapes, self.photos, options.fit, count, options.seed, log.fit_progress, other, exact=exact
-            )
-            gaussians = download_gaussians(shapes)
+            log.choices["begun_with"] = len(gaussians)
+            settings = options.fit, count, options.seed, log.fit_progress, other
+            gaussians, report = fit_with(ON_DEVICE, gaussians, self.photos, *settings, exact=exact)
+            gaussians = gaussians.numpy()
         log.add_fit(report)
         return gaussians
 
     def _merge(
         self, prepared: PreparedScene, count: int | None, log: RunLog, reasons: dict[str, str]
-    ) -> tuple[Shapes, int, bool]:
+    ) -> tuple[Gaussians, int, bool]:
         """The arrows up to decoding of an aligned scene -> Gaussians, their number in the end, if it is to be met."""
         options = prepared.options
         with self.stage(log, "segment"):
@@ -161,13 +159,13 @@ class DeviceScene:
         with self.stage(log, "decode"):
             if on_device_decode.covers(options.decode):
                 wanted = cut.count if cut.exact and not options.fit.grows else None
-                shapes = on_device_decode.decode(merged, self.members, options.decode, wanted)
-                if cut.exact and len(shapes) > cut.count:  # K each would be more than the fit may grow to
-                    shapes = on_device_decode.decode(merged, self.members, options.decode, cut.count)
+                gaussians = on_device_decode.decode(merged, self.members, options.decode, wanted)
+                if cut.exact and len(gaussians) > cut.count:  # K each would be more than the fit may grow to
+                    gaussians = on_device_decode.decode(merged, self.members, options.decode, cut.count)
             else:
                 reasons["decode"] = f"k {options.decode.k}"
-                shapes = self._decode_on_cpu(prepared, merged, cut)
-        return shapes, cut.count, cut.exact
+                gaussians = self._decode_on_cpu(prepared, merged, cut)
+        return gaussians, cut.count, cut.exact
 
     def _segment(self, prepared: PreparedScene, count: int | None, reasons: dict[str, str]) -> Superpixels:
         """Superpixels of every view, by the stage where :mod:`gsmerge.gpu.segment` does not cut them."""
@@ -191,7 +189,7 @@ class DeviceScene:
         rows = group_rows(numbers, sum(cut.counts))
         return encode(self.members, rows, torch.searchsorted(first, rows.groups, right=True) - 1)
 
-    def _decode_on_cpu(self, prepared: PreparedScene, merged: Features, cut: Superpixels) -> Shapes:
+    def _decode_on_cpu(self, prepared: PreparedScene, merged: Features, cut: Superpixels) -> Gaussians:
         """Gaussians by the stage, for what :func:`gsmerge.gpu.decode.covers` leaves out."""
         assert prepared.members is not None
         options = prepared.options
@@ -208,9 +206,9 @@ class DeviceScene:
         """
         given, scene = prepared.given, prepared.scene
         if gaussians is given.gaussians and len(gaussians) == len(scene.gaussians) and prepared.members is not None:
-            shapes: Shapes = self.members
+            gaussians = self.members.gaussians
         else:
-            shapes = upload_gaussians(prepared.frame.enter(gaussians), self.device)
+            gaussians = upload_gaussians(prepared.frame.enter(gaussians), self.device)
         if given.images is scene.images:
             photos = self.photos[0]
         else:
@@ -218,7 +216,7 @@ class DeviceScene:
             assert given.images is not None
             photos = upload_photos(photos_of(given.images, cameras), self.device)
         quarter = prepared.options.budget.target_psnr is None
-        return photo_psnr(shapes, photos, scored_views(len(photos)), near=NEAR, quarter=quarter)
+        return photo_psnr(gaussians, photos, scored_views(len(photos)), near=NEAR, quarter=quarter)
 
 
 def _match(features: Features, prepared: PreparedScene, reasons: dict[str, str]) -> tuple[Tensor, int]:

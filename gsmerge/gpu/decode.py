@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import torch
 from torch import Tensor
 
-from gsmerge.gpu.axes import features_to_shapes, moments_to_shapes
+from gsmerge.gpu.axes import feature_to_gaussians, to_gaussians
 from gsmerge.gpu.halve import Division, halve, member_points
 from gsmerge.gpu.match import take
 from gsmerge.gpu.pool import pool_members
 from gsmerge.gpu.runs import owners_of
-from gsmerge.gpu.scene import DeviceMembers, Features, Shapes
+from gsmerge.gpu.scene import DeviceMembers, Features
 from gsmerge.stages.decode import MAX_CHILDREN, MIXED, DecodeOptions, hull_gains
+from gsmerge.types import Gaussians
 
 
 def covers(options: DecodeOptions) -> bool:
@@ -21,7 +20,7 @@ def covers(options: DecodeOptions) -> bool:
     return options.k != MIXED
 
 
-def decode(features: Features, members: DeviceMembers, options: DecodeOptions, count: int | None) -> Shapes:
+def decode(features: Features, members: DeviceMembers, options: DecodeOptions, count: int | None) -> Gaussians:
     """``count`` Gaussians, spent where they lower distortion most, or None: K of each Feature Gaussian.
 
     Those below the least opacity are left out. See :func:`gsmerge.stages.decode.decode`; the rule is ``"depth"``.
@@ -30,26 +29,25 @@ def decode(features: Features, members: DeviceMembers, options: DecodeOptions, c
         children = torch.full((len(features),), options.max_k, device=features.means.device)
     else:
         children = split_counts(features, members, max(0, count - len(features)), MAX_CHILDREN)
-    shapes = divide(features, members, children)
-    return shapes[shapes.opacities >= options.min_opacity]
+    gaussians = divide(features, members, children)
+    return gaussians[gaussians.opacities >= options.min_opacity]
 
 
-def divide(features: Features, members: DeviceMembers, counts: Tensor) -> Shapes:
+def divide(features: Features, members: DeviceMembers, counts: Tensor) -> Gaussians:
     """At most ``counts [g]`` children of every Feature Gaussian, however faint, those of one next to each other."""
-    shapes = features_to_shapes(features)
+    gaussians = feature_to_gaussians(features)
     groups = torch.nonzero((counts > 1) & ~features.backing)[:, 0]
     if len(groups) == 0:
-        return shapes
+        return gaussians
     few, division = _halve(features, members, groups, counts[groups])
     moments = pool_members(members, division.starts, few.members[division.order])
     gains, spreads = few.gains.double()[division.groups], few.spreads.double()[division.groups]
-    parts = moments_to_shapes(moments.covars, moments.extinctions * gains, spreads, moments.means, moments.sh)
+    parts = to_gaussians(moments.covars, moments.extinctions * gains, spreads, moments.means, moments.sh)
     whole = torch.ones(len(features), dtype=torch.bool, device=counts.device)
     whole[groups] = False
     rows = torch.nonzero(whole)[:, 0]
     order = torch.sort(torch.cat([rows, groups[division.groups]]), stable=True).indices
-    names = [f.name for f in fields(Shapes)]
-    return Shapes(*(torch.cat([getattr(shapes, name)[rows], getattr(parts, name)])[order] for name in names))
+    return Gaussians.concat([gaussians[rows], parts])[order]
 
 
 def split_counts(features: Features, members: DeviceMembers, extra: int, max_children: int = MAX_CHILDREN) -> Tensor:
@@ -75,5 +73,6 @@ def _halve(features: Features, members: DeviceMembers, groups: Tensor, counts: T
     ids = few.members
     owners = owners_of(few.starts, len(ids))
     centres, footprints = few.means.double(), few.footprints.double()
-    points = member_points(members.means[ids], members.sh0[ids], members.opacities[ids], centres, footprints, owners)
+    g = members.gaussians
+    points = member_points(g.means[ids], g.sh0[ids], g.opacities[ids], centres, footprints, owners)
     return few, halve(points, few.starts, counts)

@@ -19,7 +19,7 @@ from gsmerge.gpu.grow import grow_to
 from gsmerge.gpu.holdout import holdout_score, initial_scores, state_colors
 from gsmerge.gpu.loss import PhotoMeans, loss_gradient, photo_means
 from gsmerge.gpu.raster import draw
-from gsmerge.gpu.scene import DevicePhotos, Shapes
+from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.kernels.gaussians.optimise import COLOR, LOGIT, QUAT, SIZE
 from gsmerge.stages.fit.full import (
     GROWTH,
@@ -27,6 +27,7 @@ from gsmerge.stages.fit.full import (
     PROBE,
     Plan,
     Progress,
+    TailMean,
     affordable_steps,
     look_of,
     plan_run,
@@ -34,7 +35,7 @@ from gsmerge.stages.fit.full import (
 )
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
-from gsmerge.types import SH_C0
+from gsmerge.types import SH_C0, Gaussians
 
 READ_EVERY = 20  # steps; each reading waits for the device
 MAX_DRAWN = 0.99  # opacity of what is drawn in place of the Gaussians that a step leaves out
@@ -81,25 +82,25 @@ def draw_schedule(seed: int, num_views: int, steps: int, device: torch.device) -
     return Schedule(views, torch.from_numpy(backgrounds).to(device))
 
 
-def start_state(shapes: Shapes) -> FitState:
+def start_state(gaussians: Gaussians) -> FitState:
     """A fresh state at some Gaussians."""
-    opacities = shapes.opacities.double().clamp(0.004, 0.999)
+    opacities = gaussians.opacities.double().clamp(0.004, 0.999)
     x = torch.cat(
         [
-            shapes.means,
-            shapes.scales.clamp_min(1e-9).log(),
-            shapes.quats,
+            gaussians.means,
+            gaussians.scales.clamp_min(1e-9).log(),
+            gaussians.quats,
             (opacities / (1 - opacities)).log().float()[:, None],
-            0.5 + SH_C0 * shapes.sh0[:, 0],
+            0.5 + SH_C0 * gaussians.sh0[:, 0],
         ],
         1,
     )
-    return state_of(x, shapes.shN)
+    return state_of(x, gaussians.shN)
 
 
-def shapes_of(x: Tensor, shN: Tensor) -> Shapes:
+def gaussians_of(x: Tensor, shN: Tensor) -> Gaussians:
     """The Gaussians that parameters ``[n,14]`` stand for."""
-    return Shapes(
+    return Gaussians(
         means=x[:, :SIZE].contiguous(),
         quats=x[:, QUAT:LOGIT].contiguous(),
         scales=x[:, SIZE:QUAT].exp(),
@@ -159,42 +160,19 @@ def leave_out(state: FitState, dropout: float, generator: torch.Generator) -> Te
     return kept * (state.opacities / (1 - dropout)).clamp_max(MAX_DRAWN)
 
 
-class TailMean:
-    """Mean of parameters ``[n,14]`` over the last steps; see :class:`gsmerge.stages.fit.full.TailMean`."""
-
-    def __init__(self) -> None:
-        self.mean, self.count = torch.empty(0), 0
-
-    def add(self, x: Tensor) -> None:
-        """One more step; the first one after Gaussians were added begins anew."""
-        if len(self.mean) != len(x) or self.count == 0:
-            self.mean, self.count = x.clone(), 1
-        else:
-            self.count += 1
-            self.mean.lerp_(x, 1 / self.count)
-
-    def of(self, x: Tensor) -> Tensor:
-        """The mean with unit quaternions; ``x`` itself where no step of as many Gaussians was added."""
-        if self.count == 0 or len(self.mean) != len(x):
-            return x
-        mean = self.mean.clone()
-        mean[:, QUAT:LOGIT] /= mean[:, QUAT:LOGIT].norm(dim=1, keepdim=True)
-        return mean
-
-
 def fit_full(
-    shapes: Shapes,
+    gaussians: Gaussians,
     photos: tuple[DevicePhotos, DevicePhotos],
     options: FitOptions,
     count: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
-    baseline_start: Shapes | None = None,
-) -> tuple[Shapes, FitReport]:
+    baseline_start: Gaussians | None = None,
+) -> tuple[Gaussians, FitReport]:
     """All parameters fitted to the photos; see :func:`gsmerge.stages.fit.full.fit_full`.
 
     Args:
-        shapes: Canonical Gaussians.
+        gaussians: Canonical Gaussians.
         photos: The input views at full and at half size.
         options: Steps, rates, limits.
         count: Number of Gaussians to grow to.
@@ -202,9 +180,9 @@ def fit_full(
         progress: Called every ``READ_EVERY`` steps and at the end.
         baseline_start: Another start that the fit may beat instead.
     """
-    device = shapes.means.device
+    device = gaussians.means.device
     plan = plan_run((photos[0].host, photos[1].host), options, seed)
-    run = _Run(start_state(shapes), make_levels(photos, plan, device), plan, count, seed, progress)
+    run = _Run(start_state(gaussians), make_levels(photos, plan, device), plan, count, seed, progress)
     judged = torch.from_numpy(np.stack(plan.weights[1])).to(device)
     half = photos[1]
     before, run.state.box_shares, run.state.min_sizes = initial_scores(run.state, photos, judged, options)
@@ -221,11 +199,11 @@ def fit_full(
     after = holdout_score(run.state, half, judged, options.min_gain) if after is None else after
     if after <= before:
         why = f"held-out parts of the photos were no better after {run.step} steps"
-        return shapes, FitReport("none", False, run.step, before, after, why)
+        return gaussians, FitReport("none", False, run.step, before, after, why)
     if options.grows:  # a time budget may end before the growth
         run.state = grow_to(run.state, half, count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
-    fitted = shapes_of(run.tail.of(run.state.x), run.state.shN)
+    fitted = gaussians_of(run.tail.of(run.state.x), run.state.shN)
     return fitted, FitReport("full", True, run.step, before, after, why)
 
 

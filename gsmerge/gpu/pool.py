@@ -52,19 +52,19 @@ def pool_members(members: DeviceMembers, starts: Tensor, ids: Tensor) -> Moments
 
 
 def _pool(members: DeviceMembers, starts: Tensor, ids: Tensor) -> Moments:
-    owners, sizes = owners_of(starts, len(ids)), starts[1:] - starts[:-1]
-    opacities = members.opacities[ids].double().clamp_max(MAX_OPACITY)
+    owners, sizes, g = owners_of(starts, len(ids)), starts[1:] - starts[:-1], members.gaussians
+    opacities = g.opacities[ids].double().clamp_max(MAX_OPACITY)
     weights = sum_runs(opacities, starts)
     # a fully transparent group still has a place and a colour
     shares = torch.where((weights > 0)[owners], opacities / weights[owners], 1 / sizes[owners].double())
-    scales = members.scales[ids].double() * member_caps(members, starts, ids, owners)[:, None]
-    own_means = members.means[ids].double()
-    colors = torch.cat([members.sh0[ids], members.shN[ids]], 1).reshape(len(ids), -1)
+    scales = g.scales[ids].double() * member_caps(members, starts, ids, owners)[:, None]
+    own_means = g.means[ids].double()
+    colors = torch.cat([g.sh0[ids], g.shN[ids]], 1).reshape(len(ids), -1)
     firsts = torch.cat([own_means, members.footprints[ids].double()[:, None], colors.double()], 1)
     averages = sum_runs(shares[:, None] * firsts, starts)
     means, footprints = averages[:, :3], averages[:, 3]
     delta = own_means - means[owners]
-    half = quat_to_rotmat(_no_zero(members.quats[ids].double())) * scales[:, None]
+    half = quat_to_rotmat(_no_zero(g.quats[ids].double())) * scales[:, None]
     spread = torch.stack(
         [shares * (delta[:, i] * delta[:, j] + (half[:, i] * half[:, j]).sum(1)) for i, j in ENTRIES], 1
     )
@@ -92,7 +92,7 @@ def _no_zero(quats: Tensor) -> Tensor:
 
 def member_caps(members: DeviceMembers, starts: Tensor, ids: Tensor, owners: Tensor) -> Tensor:
     """``[m]`` shrink factor of each member: at most ``CAP`` times the median extent of its group, in footprints."""
-    extents = members.scales[ids].amax(1) / members.footprints[ids]
+    extents = members.gaussians.scales[ids].amax(1) / members.footprints[ids]
     limits = CAP * middle_of_runs(extents, starts, owners).double()
     return torch.where(extents > limits[owners], limits[owners] / extents, 1.0)
 

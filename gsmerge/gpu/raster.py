@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.gpu.scene import DevicePhotos, Shapes
+from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.render import contributions, plan_view
 from gsmerge.render.colored import Shape, draw_colored, seen_colors
 from gsmerge.render.photos import NEAR
 from gsmerge.render.plan import Splats
-from gsmerge.types import SH_C0
+from gsmerge.types import SH_C0, Gaussians
 
 
 def draw(
@@ -57,15 +57,15 @@ def _cameras(photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor, int, int]
     return photos.viewmats[view : view + 1], photos.Ks[view : view + 1], photos.width, photos.height
 
 
-def draw_all(shapes: Shapes, photos: DevicePhotos) -> list[Tensor]:
+def draw_all(gaussians: Gaussians, photos: DevicePhotos) -> list[Tensor]:
     """``[h,w,3]`` render of every photo over black, not clipped."""
-    return [draw_shapes(shapes, photos, view) for view in range(len(photos))]
+    return [draw_gaussians(gaussians, photos, view) for view in range(len(photos))]
 
 
-def draw_shapes(shapes: Shapes, photos: DevicePhotos, view: int, *, near: float = NEAR) -> Tensor:
+def draw_gaussians(gaussians: Gaussians, photos: DevicePhotos, view: int, *, near: float = NEAR) -> Tensor:
     """``[h,w,3]`` render of one photo over black, not clipped."""
-    colors = shown_colors(shapes, photos, view)
-    return draw_black(shape_of(shapes), colors, photos, view, near=near)
+    colors = shown_colors(gaussians, photos, view)
+    return draw_black(shape_of(gaussians), colors, photos, view, near=near)
 
 
 def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int, *, near: float = NEAR) -> Tensor:
@@ -73,16 +73,16 @@ def draw_black(shape: Shape, colors: Tensor, photos: DevicePhotos, view: int, *,
     return draw(shape, colors, photos, view, torch.zeros(3, device=colors.device), near=near)[0]
 
 
-def shape_of(shapes: Shapes) -> Shape:
+def shape_of(gaussians: Gaussians) -> Shape:
     """Means, quaternions, scales and opacities."""
-    return shapes.means, shapes.quats, shapes.scales, shapes.opacities
+    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
 
 
-def shown_colors(shapes: Shapes, photos: DevicePhotos, view: int) -> Tensor:
+def shown_colors(gaussians: Gaussians, photos: DevicePhotos, view: int) -> Tensor:
     """``[n,3]`` colours that Gaussians show a view, not below 0."""
-    if shapes.shN.shape[1] == 0:
-        return (0.5 + SH_C0 * shapes.sh0[:, 0]).clamp_min(0)
-    return harmonic_colors(shapes.means, shapes.sh0, shapes.shN, photos, view)
+    if gaussians.shN.shape[1] == 0:
+        return (0.5 + SH_C0 * gaussians.sh0[:, 0]).clamp_min(0)
+    return harmonic_colors(gaussians.means, gaussians.sh0, gaussians.shN, photos, view)
 
 
 def harmonic_colors(means: Tensor, sh0: Tensor, shN: Tensor, photos: DevicePhotos, view: int) -> Tensor:
@@ -118,15 +118,15 @@ class Transpose:
         return torch.autograd.grad(self.image, self.colors, values.contiguous(), retain_graph=True)[0]
 
 
-def peak_weights(shapes: Shapes, photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor]:
+def peak_weights(gaussians: Gaussians, photos: DevicePhotos, view: int) -> tuple[Tensor, Tensor]:
     """``[n]`` largest blending weight of every Gaussian at some pixel of a view; ``[n]`` bool: it lies in the view."""
-    if shapes.means.device.type != "cpu":
+    if gaussians.means.device.type != "cpu":
         from gsmerge.render.cuda import peak_weights as gsplat_peaks
 
-        return gsplat_peaks(shape_of(shapes), _cameras(photos, view), eps2d=photos.host.eps2d)
-    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape_of(shapes))
-    sh0, shN = shapes.sh0.numpy(), shapes.shN.numpy()
+        return gsplat_peaks(shape_of(gaussians), _cameras(photos, view), eps2d=photos.host.eps2d)
+    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in shape_of(gaussians))
+    sh0, shN = gaussians.sh0.numpy(), gaussians.shN.numpy()
     plan = plan_view(Splats(means, quats, scales, opacities, sh0, shN, np.zeros(3)), **photos.host.camera(view))
-    inside = torch.zeros(len(shapes), dtype=torch.bool)
+    inside = torch.zeros(len(gaussians), dtype=torch.bool)
     inside[torch.from_numpy(plan.ids).long()] = True
     return torch.from_numpy(contributions(plan)[1]), inside

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsmerge.moments import Members
 from gsmerge.render.photos import Photos, scene_photos
-from gsmerge.types import Array, FeatureGaussians, Gaussians, Groups, PixelScene, UnalignedScene
+from gsmerge.types import Array, FeatureGaussians, Gaussians, Groups, PixelScene, UnalignedScene, as_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,28 +46,10 @@ class DevicePhotos:
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
-    """n Gaussians on a device, float32; fields and shapes as of :class:`gsmerge.types.Gaussians`."""
+class DeviceMembers:
+    """The scene's Gaussians on a device, and ``footprints [n]``; see :class:`gsmerge.moments.Members`."""
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    def __getitem__(self, index: Tensor) -> Shapes:
-        """The rows that a mask or an integer tensor selects."""
-        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceMembers(Shapes):
-    """The scene's Gaussians on a device, float32; shapes as of :class:`gsmerge.moments.Members`."""
-
+    gaussians: Gaussians
     footprints: Tensor
 
 
@@ -101,12 +83,6 @@ def to_device(array: Array, device: torch.device, dtype: torch.dtype | None = No
     return torch.as_tensor(array).to(device, dtype)
 
 
-def to_core(tensor: Tensor) -> np.ndarray:
-    """A tensor as the core types hold it: the only place of this package that makes their arrays."""
-    array: np.ndarray = tensor.cpu().numpy()
-    return array
-
-
 def upload_photos(photos: Photos, device: torch.device) -> DevicePhotos:
     """Photos and their cameras on a device."""
     rotations, shifts = photos.viewmats[:, :3, :3], photos.viewmats[:, :3, 3]
@@ -123,25 +99,20 @@ def upload_pair(scene: PixelScene | UnalignedScene, device: torch.device) -> tup
 
 def upload_members(members: Members, device: torch.device) -> DeviceMembers:
     """The scene's Gaussians on a device."""
-    return DeviceMembers(*(to_device(getattr(members, f.name), device) for f in fields(DeviceMembers)))
+    return DeviceMembers(upload_gaussians(members, device), to_device(members.footprints, device))
 
 
-def upload_gaussians(gaussians: Gaussians, device: torch.device) -> Shapes:
-    """Gaussians on a device, in float32."""
-    return Shapes(*(to_device(getattr(gaussians, f.name), device, torch.float32) for f in fields(Shapes)))
-
-
-def download_gaussians(shapes: Shapes) -> Gaussians:
-    """The core type of Gaussians on a device."""
-    return Gaussians(*(to_core(getattr(shapes, f.name).float()) for f in fields(Shapes)))
+def upload_gaussians(gaussians: Gaussians | Members, device: torch.device) -> Gaussians:
+    """Gaussians on a device, in float32; :meth:`gsmerge.types.Gaussians.numpy` downloads them."""
+    return Gaussians(*(to_device(getattr(gaussians, f.name), device, torch.float32) for f in fields(Gaussians)))
 
 
 def download_features(features: Features) -> FeatureGaussians:
     """The core type of Feature Gaussians on a device, without latents."""
-    columns = {f.name: to_core(getattr(features, f.name)) for f in fields(Features)}
+    columns = {f.name: as_array(getattr(features, f.name)) for f in fields(Features)}
     return FeatureGaussians(**columns, latents=np.zeros((len(features), 0), np.float32))
 
 
 def download_groups(labels: Tensor, counts: tuple[int, ...]) -> Groups:
     """The core type of superpixels ``[v,h,w]`` on a device."""
-    return Groups(to_core(labels.int()), counts)
+    return Groups(as_array(labels.int()), counts)

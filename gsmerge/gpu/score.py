@@ -7,26 +7,29 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsmerge.gpu.raster import draw_shapes
-from gsmerge.gpu.scene import DevicePhotos, Shapes
+from gsmerge.gpu.raster import draw_gaussians
+from gsmerge.gpu.scene import DevicePhotos
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.render.photos import scored_tiles
+from gsmerge.types import Gaussians
 
 
-def photo_error(shapes: Shapes, photos: DevicePhotos) -> float:
+def photo_error(gaussians: Gaussians, photos: DevicePhotos) -> float:
     """Mean squared error of all photos."""
     errors = [
-        (draw_shapes(shapes, photos, view).clamp(0, 1) - photo).square().mean(dtype=torch.float64)
+        (draw_gaussians(gaussians, photos, view).clamp(0, 1) - photo).square().mean(dtype=torch.float64)
         for view, photo in enumerate(photos.images)
     ]
     return float(torch.stack(errors).mean())
 
 
-def photo_psnr(shapes: Shapes, photos: DevicePhotos, views: Sequence[int], *, near: float, quarter: bool) -> float:
+def photo_psnr(
+    gaussians: Gaussians, photos: DevicePhotos, views: Sequence[int], *, near: float, quarter: bool
+) -> float:
     """Mean over some views of the PSNR (dB) of their photos.
 
     Args:
-        shapes: Gaussians in the photos' frame.
+        gaussians: Gaussians in the photos' frame.
         photos: Of full size.
         views: Of the photos.
         near: Near plane.
@@ -34,7 +37,8 @@ def photo_psnr(shapes: Shapes, photos: DevicePhotos, views: Sequence[int], *, ne
     """
     values = []
     for view in views:
-        squares = (draw_shapes(shapes, photos, view, near=near).clamp(0, 1) - photos.images[view]).double().square()
+        image = draw_gaussians(gaussians, photos, view, near=near).clamp(0, 1)
+        squares = (image - photos.images[view]).double().square()
         mask = scored_pixels(photos, view) if quarter else None
         error = squares.mean() if mask is None else (squares * mask[..., None]).sum() / (3 * mask.sum())
         values.append(-10 * error.log10())

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import lower_median
 from gsmerge.io.alignment.fit_cameras import CameraFit
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
 from gsmerge.io.alignment.poses import check_cameras, choose_poses, other_conventions
@@ -117,8 +118,7 @@ def is_padding(gaussians: Gaussians) -> np.ndarray:
     if len(rows) < MIN_PADDING:
         return padding
     shape = np.concatenate([gaussians.scales, gaussians.opacities[:, None], gaussians.sh0[:, 0]], 1)[rows]
-    middle = (len(rows) - 1) // 2
-    padding[rows[(shape == np.partition(shape, middle, 0)[middle]).all(1)]] = True
+    padding[rows[(shape == lower_median(shape)).all(1)]] = True
     return padding
 
 

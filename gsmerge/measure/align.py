@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gsmerge.measure.zoom import resize_mask
 from gsmerge.render import Splats, ViewPlan, composite, plan_view
-from gsmerge.render.blend import blend
+from gsmerge.render.blend import mean_depths
 from gsmerge.render.gradient import color_gradients, plan_gradients, pose_gradient
 from gsmerge.render.photos import photos_of
 from gsmerge.types import Cameras
@@ -102,10 +102,7 @@ class _Trial:
 
     def depth(self) -> np.ndarray:
         """``[h,w]`` mean depth of what is drawn, world units; 0 where little is."""
-        colors = np.repeat(self.plan.depths[:, None], 3, 1)
-        weighted = blend(self.plan, colors, np.zeros(3, np.float32))[0][..., 0]
-        alpha = 1 - self.transmittance
-        return np.divide(weighted, alpha, out=np.zeros_like(weighted), where=alpha > OPAQUE)
+        return mean_depths(self.plan, 1 - self.transmittance, OPAQUE)
 
 
 def refine_pose(
@@ -167,12 +164,13 @@ def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial
             break
         step *= min(1.0, MAX_STEP / max(length, MAX_STEP))
         trial = target.try_pose(_moved(best.viewmat, step, target, unit))
-        if trial.error(doubt) >= error:
+        trial_error = trial.error(doubt)
+        if trial_error >= error:
             damping *= BRAKE
             if damping > MAX_DAMPING:
                 break
             continue
-        best, gain, error = trial, 1 - trial.error(doubt) / error, trial.error(doubt)
+        best, gain, error = trial, 1 - trial_error / error, trial_error
         if gain < MIN_GAIN:
             break
         damping *= EASE

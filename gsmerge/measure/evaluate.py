@@ -246,7 +246,8 @@ def evaluate(
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
     with use_threads(options.threads):
-        look = _Look(near_plane(scene), options.antialiased, scene_frame(scene).origin)
+        frame = scene_frame(scene)
+        look = _Look(NEAR * frame.unit, options.antialiased, frame.origin)
         splits = _splits(scene, own, targets, options, look)
         scores = []
         named = {INPUT: own, **results} if options.own else results

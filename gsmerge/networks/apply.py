@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsmerge.geometry import covariances, rotmat_to_quat
+from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.modules import SLOTS, Networks
 from gsmerge.networks.neighbors import nearest_points
@@ -104,8 +104,7 @@ def run_encoder(features: FeatureGaussians, group_features: GroupFeatures, conte
 
 def _longest_axes(base: Gaussians) -> np.ndarray:
     """``[g,3]`` third axis of each Gaussian, whose scales are ascending: the last column of its rotation."""
-    w, x, y, z = base.quats.numpy().T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    return np.stack(rotation_entries(*base.quats.numpy().T)[2::3], 1)
 
 
 def apply_encoding(

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsmerge.geometry import rotation_entries
 from gsmerge.networks.options import Bounds
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_array, as_tensor
 
@@ -44,13 +45,8 @@ def gaussian_sizes(scales: Tensor) -> Tensor:
 
 def quat_to_rotmat(quats: Tensor) -> Tensor:
     """:func:`gsmerge.geometry.quat_to_rotmat` for tensors, differentiable."""
-    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+    entries = rotation_entries(*normalize(quats, dim=-1).unbind(-1))
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def rotation_matrices(vectors: Tensor) -> Tensor:

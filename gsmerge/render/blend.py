@@ -45,6 +45,12 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
     return image, transmittance
 
 
+def mean_depths(plan: ViewPlan, alphas: Array, least_alpha: float = 0.0) -> Array:
+    """``[h,w]`` mean camera z of what is blended; 0 where ``alphas [h,w]`` are not above ``least_alpha``."""
+    weighted = blend(plan, np.repeat(plan.depths[:, None], 3, 1), np.zeros(3, np.float32))[0][..., 0]
+    return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > least_alpha)
+
+
 def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back.
 

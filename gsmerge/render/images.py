@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.render.blend import background_color, blend, view_colors
+from gsmerge.render.blend import background_color, blend, mean_depths, view_colors
 from gsmerge.render.plan import Splats, ViewPlan, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, Gaussians, as_tensor
@@ -47,16 +47,14 @@ def draw_views(
 ) -> Rendering:
     """Draw the plans, one for the number of each view, of images of ``shape`` (views, height, width)."""
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
-    depths = np.zeros((*shape, 1), np.float32) if with_depths else None
+    depths = np.empty((*shape, 1), np.float32) if with_depths else None
 
     def one(view: int) -> None:
         plan = plan_one(view)
         images[view], transmittance = blend(plan, view_colors(plan), background)
         alphas[view, ..., 0] = 1 - transmittance
         if depths is not None:
-            colors = np.repeat(plan.depths[:, None], 3, 1)
-            weighted = blend(plan, colors, np.zeros(3, np.float32))[0][..., :1]
-            np.divide(weighted, alphas[view], out=depths[view], where=alphas[view] > 0)
+            depths[view, ..., 0] = mean_depths(plan, alphas[view, ..., 0])
 
     parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
     return Rendering(images, alphas, depths)

@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.budget import exact_count
 from gsmerge.errors import UsageError
-from gsmerge.geometry import project
+from gsmerge.geometry import lower_median, project
 from gsmerge.moments import Members, scene_members
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import RunLog
@@ -75,12 +75,6 @@ class Frame:
         return replace(cameras, viewmats=viewmats)
 
 
-def _middle(values: np.ndarray) -> np.ndarray:
-    """The median of ``[n,...]`` rows; of an even number, the lower of the two in the middle."""
-    half = (len(values) - 1) // 2
-    return np.partition(values, half, axis=0)[half]
-
-
 def find_frame(scene: PixelScene) -> Frame:
     """The canonical frame of a scene: median mean (float64) and median depth of its valid Gaussians.
 
@@ -95,9 +89,9 @@ def find_frame(scene: PixelScene) -> Frame:
     means = scene.gaussians.means[rows].astype(np.float64)
     viewmats = scene.cameras.viewmats[rows // (h * w)]
     depths = (viewmats[:, 2, :3] * means).sum(1) + viewmats[:, 2, 3]
-    depth = float(_middle(np.abs(depths)))
+    depth = float(lower_median(np.abs(depths)))
     unit = 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
-    return Frame(_middle(means), unit)
+    return Frame(lower_median(means), unit)
 
 
 def find_unaligned_frame(scene: UnalignedScene) -> Frame:
@@ -113,8 +107,8 @@ def find_unaligned_frame(scene: UnalignedScene) -> Frame:
     pixels, depths = project(means, views)
     size = np.array([views.width, views.height])
     seen = (depths > 0) & ((pixels > 0) & (pixels < size)).all(-1)
-    depth = float(_middle(depths[seen])) if seen.any() else 0.0
-    return Frame(_middle(means), 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
+    depth = float(lower_median(depths[seen])) if seen.any() else 0.0
+    return Frame(lower_median(means), 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
 
 
 def scene_frame(scene: PixelScene | UnalignedScene) -> Frame:

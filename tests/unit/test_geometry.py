@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gsmerge.geometry import covariances, normalize, project, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry import covariances, lower_median, normalize, project, quat_to_rotmat, rotmat_to_quat
 from gsmerge.types import Cameras
 
 HALF = math.sqrt(0.5)
@@ -59,3 +59,8 @@ def test_quaternions_of_rotations_and_back() -> None:
     actual = rotmat_to_quat(quat_to_rotmat(quats))
     np.testing.assert_allclose(np.abs((actual * quats).sum(1)), 1)
     assert (actual[np.arange(68), np.abs(actual).argmax(1)] > 0).all()
+
+
+def test_lower_median_is_a_value_of_each_column() -> None:
+    assert lower_median(np.array([4.0, 1.0, 3.0, 2.0])) == 2
+    assert lower_median(np.array([[5.0, 0.0], [1.0, 9.0], [3.0, 8.0]])).tolist() == [3, 8]

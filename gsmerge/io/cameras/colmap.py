@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_lens, make_pinhole
 
@@ -76,12 +77,8 @@ def _pose(numbers: list[float]) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise ValueError("a pose that is not finite")
     quat = np.array(numbers[:4]) / max(1e-12, *map(abs, numbers[:4]))
-    w, x, y, z = quat / max(float(np.linalg.norm(quat)), 1e-12)
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    entries = rotation_entries(*quat / max(float(np.linalg.norm(quat)), 1e-12))
+    rotation = np.reshape(entries, (3, 3))
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 
 

@@ -40,7 +40,7 @@ def image_extinctions(starts, ids, means, quats, scales, opacities, footprints, 
     longest = 0
     for g in range(starts.shape[0] - 1):
         longest = max(longest, starts[g + 1] - starts[g])
-    caps, order = np.ones(longest), np.empty(longest, np.int64)
+    caps, order = np.empty(longest), np.empty(longest, np.int64)
     r = viewmat[:3, :3]
     for g in range(starts.shape[0] - 1):
         members = ids[starts[g] : starts[g + 1]]

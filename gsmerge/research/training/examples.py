@@ -15,6 +15,7 @@ import numpy as np
 
 from gsmerge.budget import share_text
 from gsmerge.errors import SceneError
+from gsmerge.geometry import lower_median
 from gsmerge.io import SceneLoad, load_scene, read_held_out
 from gsmerge.measure.evaluate import Views
 from gsmerge.moments import Members, feature_to_gaussians
@@ -147,9 +148,7 @@ def make_example(
 def _median_depth(features: FeatureGaussians, cameras: Cameras) -> float:
     """Of Feature Gaussians in their own views; a footprint is a pixel there."""
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1]))
-    depths = features.footprints * focals.astype(np.float64)[features.views]
-    middle = (len(depths) - 1) // 2
-    return float(np.partition(depths, middle)[middle])
+    return float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
 
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:

@@ -7,10 +7,11 @@ linear system whose matrix is one splat and one transposed splat; a few precondi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from typing import Protocol
 
 import numpy as np
 
+from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.render import Splats, composite, plan_view, prepare
 from gsmerge.render.photos import Photos
 from gsmerge.render.weights import ViewWeights, apply, apply_transposed, view_weights
@@ -18,7 +19,7 @@ from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.holdout import exposure_gains, holdout_psnr, training_weights
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import Array, Gaussians
 
 MAX_RETRIES = 2
 HOLDOUT = 4  # times the share: the last steps see everything, and a small sample misjudges a scene of few views
@@ -37,20 +38,6 @@ class Drawn:
     count: int
     views: list[ViewWeights]
     images: list[np.ndarray]
-
-
-@dataclass(frozen=True, eq=False)
-class _System:
-    """Least squares in the colours: renders, photos, pixel weights ``[h,w]``, exposure gains ``[v,3]``.
-
-    ``color_precision [n,1]`` is the diagonal of earlier photos' normal equations, which the present colours solve.
-    """
-
-    drawn: Drawn
-    photos: np.ndarray
-    weights: list[np.ndarray]
-    gains: np.ndarray
-    color_precision: np.ndarray
 
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
@@ -87,57 +74,69 @@ def fit_colors(
         The Gaussians with new sh0 (or the old ones, where the fit was not accepted), and the report.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
-    before_these = (
-        np.zeros((drawn.count, 1)) if color_precision is None else color_precision[:, None].astype(np.float64)
-    )
-    plain = _System(drawn, photos.images, train, np.ones((len(photos), 3)), before_these)
-    before = holdout_psnr(drawn.images, photos, train, options.min_gain)
-    prior_weight = options.prior_weight
-    for _ in range(1 + MAX_RETRIES):
-        system, offsets = _solve(plain, options, prior_weight)
-        fitted = parallel_map(partial(_image, plain, offsets=offsets), range(len(photos)))
-        after = holdout_psnr(fitted, photos, train, options.min_gain)
-        if after > before:
-            offsets = _finish(system, offsets, options, prior_weight)
-            report = FitReport("color", True, options.iterations, before, after, f"prior weight {prior_weight:g}")
-            return replace(gaussians, sh0=_clamped(gaussians, offsets)), report
-        prior_weight *= 8
-    report = FitReport("none", False, options.iterations, before, after, "held-out parts of the photos did not improve")
-    return gaussians, report
+    precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
+    system = _System(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
+    offsets, report = solve_colors(system, np.zeros((drawn.count, 3)), options)
+    if not report.accepted:
+        return gaussians, report
+    sh0 = add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
+    return replace(gaussians, sh0=sh0.astype(np.float32)), report
 
 
-def _solve(plain: _System, options: FitOptions, prior_weight: float) -> tuple[_System, np.ndarray]:
-    """Offsets ``[n,3]`` of the base colours that fit the training pixels, and the system with its final weights.
+class ColorSystem(Protocol):
+    """Least squares in the colours of n Gaussians, of arrays or of tensors; ``x [n,3]`` are offsets, float64."""
+
+    @property
+    def precision(self) -> Array:
+        """``[n,1]``, or a number: what is added to the diagonal, with 0 as its solution."""
+
+    def score(self, x: Array = None) -> float:
+        """PSNR (dB) of the held-out blocks; None: with the colours as they were."""
+
+    def residual(self, x: Array) -> tuple[Array, Array]:
+        """Diagonal scale ``[n,3]`` and negative gradient ``[n,3]`` of the data term."""
+
+    def normal(self, x: Array) -> Array:
+        """``[n,3]`` normal matrix of the data term times ``x``."""
+
+    def reweigh(self, x: Array, *, everywhere: bool = False) -> ColorSystem:
+        """With Huber weights of the residuals, on the training pixels or on all, and exposure gains."""
+
+
+def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tuple[Array, FitReport]:
+    """Offsets ``[n,3]`` of the base colours, from ``start`` on, and the report; the start where held-out blocks lost.
 
     A third of the steps with plain weights; then pixels that still fit badly count less, exposure is compensated,
-    and another third follows.
+    and another third follows. The last ones are on all pixels.
     """
-    steps = max(1, options.iterations // 3)
-    offsets = _conjugate_gradients(plain, np.zeros((plain.drawn.count, 3)), steps, prior_weight)
-    system = _reweighed(plain, plain.weights, offsets, options)
-    return system, _conjugate_gradients(system, offsets, steps, prior_weight)
+    third = options.iterations // 3
+    before, prior_weight = system.score(), options.prior_weight
+    for _ in range(1 + MAX_RETRIES):
+        x = conjugate_gradients(system, start, max(1, third), prior_weight)
+        x = conjugate_gradients(system.reweigh(x), x, max(1, third), prior_weight)
+        after = system.score(x)
+        if after > before:
+            last = max(1, options.iterations - 2 * third)
+            x = conjugate_gradients(system.reweigh(x, everywhere=True), x, last, prior_weight)
+            return x, FitReport("color", True, options.iterations, before, after, f"prior weight {prior_weight:g}")
+        prior_weight *= 8
+    stopped = "held-out parts of the photos did not improve"
+    return start, FitReport("none", False, options.iterations, before, after, stopped)
 
 
-def _finish(system: _System, offsets: np.ndarray, options: FitOptions, prior_weight: float) -> np.ndarray:
-    """The last steps, on all pixels."""
-    everywhere = [np.ones_like(weight) for weight in system.weights]
-    steps = max(1, options.iterations - 2 * (options.iterations // 3))
-    return _conjugate_gradients(_reweighed(system, everywhere, offsets, options), offsets, steps, prior_weight)
+def conjugate_gradients(system: ColorSystem, x: Array, iterations: int, prior_weight: float) -> Array:
+    """Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952) from ``x [n,3]`` on.
 
-
-def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, prior_weight: float) -> np.ndarray:
-    """Jacobi-preconditioned conjugate gradients from ``x`` on.
-
-    They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + color_precision) |x|^2.
+    They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + precision) |x|^2.
     """
-    mass, r = _residual(system, x)
-    back = prior_weight * mass + system.color_precision
-    r -= back * x
-    inverse = 1 / (mass * (1 + prior_weight) + system.color_precision + 1e-6)
+    mass, r = system.residual(x)
+    back = prior_weight * mass + system.precision
+    r = r - back * x
+    inverse = 1 / (mass * (1 + prior_weight) + system.precision + 1e-6)
     z = inverse * r
     p, rz = z, (r * z).sum(0)
     for _ in range(iterations):
-        ap = _normal(system, p) + back * p
+        ap = system.normal(p) + back * p
         step = rz / ((p * ap).sum(0) + 1e-12)
         x, r = x + step * p, r - step * ap
         z = inverse * r
@@ -146,60 +145,77 @@ def _conjugate_gradients(system: _System, x: np.ndarray, iterations: int, prior_
     return x
 
 
-def _image(system: _System, view: int, offsets: np.ndarray | None) -> np.ndarray:
-    """Render of a view with offsets on the base colours."""
-    image = system.drawn.images[view]
-    return image if offsets is None else image + apply(system.drawn.views[view], offsets)
+def add_offsets(sh0: Array, offsets: Array) -> Array:
+    """``sh0``, float64, with offsets of its colours: in [-0.05, 1.05], or no farther outside than they were."""
+    before = sh0_to_rgb(sh0)
+    return rgb_to_sh0((before + offsets).clip(before.clip(None, -0.05), before.clip(1.05)))
 
 
-def _residual(system: _System, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Diagonal scale ``[n,3]`` and negative gradient ``[n,3]`` of the data term at ``x``."""
+@dataclass(frozen=True, eq=False)
+class _System:
+    """:class:`ColorSystem` of arrays.
 
-    def one_view(view: int) -> np.ndarray:
-        weight, gain = system.weights[view][..., None], system.gains[view].astype(np.float32)
-        residual = weight * (system.photos[view] - gain * _image(system, view, x))
-        return apply_transposed(system.drawn.views[view], np.concatenate([residual, weight], -1))
+    Args:
+        drawn: The Gaussians against the photos.
+        photos: V photos.
+        options: The solver's settings.
+        train: ``[h,w]`` of every view: 0 on the held-out blocks, 1 elsewhere.
+        weights: ``[h,w]`` of the pixels of every view.
+        gains: ``[v,3]`` exposures.
+        precision: ``[n,1]`` diagonal of earlier photos' normal equations, which the present colours solve; or 0.
+    """
 
-    mass, gradient = np.zeros_like(x), np.zeros_like(x)
-    for view, sums in enumerate(in_turn(one_view, range(len(system.photos)))):
-        ids, gain = system.drawn.views[view].ids, system.gains[view]
-        mass[ids] += sums[:, 3:] * gain**2
-        gradient[ids] += sums[:, :3] * gain
-    return mass, gradient
+    drawn: Drawn
+    photos: Photos
+    options: FitOptions
+    train: list[np.ndarray]
+    weights: list[np.ndarray]
+    gains: np.ndarray
+    precision: np.ndarray | float
 
+    def _image(self, view: int, x: np.ndarray) -> np.ndarray:
+        return self.drawn.images[view] + apply(self.drawn.views[view], x)
 
-def _normal(system: _System, x: np.ndarray) -> np.ndarray:
-    """Normal matrix of the data term times ``x``."""
+    def _images(self, x: np.ndarray) -> list[np.ndarray]:
+        return parallel_map(lambda view: self._image(view, x), range(len(self.photos)))
 
-    def one_view(view: int) -> np.ndarray:
-        matrix = system.drawn.views[view]
-        return apply_transposed(matrix, apply(matrix, x) * system.weights[view][..., None])
+    def score(self, x: np.ndarray | None = None) -> float:
+        images = self.drawn.images if x is None else self._images(x)
+        return holdout_psnr(images, self.photos, self.train, self.options.min_gain)
 
-    # views are added in their order, so that the threads cannot change the sum
-    total = np.zeros_like(x)
-    for view, sums in enumerate(in_turn(one_view, range(len(system.photos)))):
-        total[system.drawn.views[view].ids] += sums * system.gains[view] ** 2
-    return total
+    def residual(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def one_view(view: int) -> np.ndarray:
+            weight, gain = self.weights[view][..., None], self.gains[view].astype(np.float32)
+            residual = weight * (self.photos.images[view] - gain * self._image(view, x))
+            return apply_transposed(self.drawn.views[view], np.concatenate([residual, weight], -1))
 
+        mass, gradient = np.zeros_like(x), np.zeros_like(x)
+        for view, sums in enumerate(in_turn(one_view, range(len(self.photos)))):
+            ids, gain = self.drawn.views[view].ids, self.gains[view]
+            mass[ids] += sums[:, 3:] * gain**2
+            gradient[ids] += sums[:, :3] * gain
+        return mass, gradient
 
-def _reweighed(system: _System, base: list[np.ndarray], x: np.ndarray, options: FitOptions) -> _System:
-    """Weights ``base`` times Huber weights of the present residuals; exposure gains with geometric mean one."""
+    def normal(self, x: np.ndarray) -> np.ndarray:
+        def one_view(view: int) -> np.ndarray:
+            matrix = self.drawn.views[view]
+            return apply_transposed(matrix, apply(matrix, x) * self.weights[view][..., None])
 
-    views = range(len(system.photos))
-    images = parallel_map(partial(_image, system, offsets=x), views)
+        # views are added in their order, so that the threads cannot change the sum
+        total = np.zeros_like(x)
+        for view, sums in enumerate(in_turn(one_view, range(len(self.photos)))):
+            total[self.drawn.views[view].ids] += sums * self.gains[view] ** 2
+        return total
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        error = np.sqrt(((system.photos[view] - images[view]) ** 2).mean(-1))
-        robust = base[view] * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
-        return robust, base[view] * (error < 2 * options.huber)
+    def reweigh(self, x: np.ndarray, *, everywhere: bool = False) -> _System:
+        images, options = self._images(x), self.options
 
-    weights, calm = zip(*parallel_map(one_view, views), strict=True)
-    gains = exposure_gains(images, system.photos, calm, options.min_gain, options.max_gain)
-    return replace(system, weights=list(weights), gains=gains)
+        def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+            base = np.ones_like(self.train[view]) if everywhere else self.train[view]
+            error = np.sqrt(((self.photos.images[view] - images[view]) ** 2).mean(-1))
+            robust = base * np.minimum(1, options.huber / np.maximum(error, 1e-6)).astype(np.float32)
+            return robust, base * (error < 2 * options.huber)
 
-
-def _clamped(gaussians: Gaussians, offsets: np.ndarray) -> np.ndarray:
-    """New sh0 within a little more than the range of colours, or where they were outside it, no farther out."""
-    before = 0.5 + SH_C0 * gaussians.sh0[:, 0].astype(np.float64)
-    color = np.clip(before + offsets, np.minimum(before, -0.05), np.maximum(before, 1.05))
-    return ((color - 0.5) / SH_C0).astype(np.float32)[:, None]
+        weights, calm = zip(*parallel_map(one_view, range(len(self.photos))), strict=True)
+        gains = exposure_gains(images, self.photos.images, calm, options.min_gain, options.max_gain)
+        return replace(self, weights=list(weights), gains=gains)

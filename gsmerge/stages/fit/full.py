@@ -27,7 +27,7 @@ from gsmerge.stages.fit.loss import image_gradient
 from gsmerge.stages.fit.options import LONG_STEPS, FitOptions, LearningRates
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
-from gsmerge.types import Gaussians
+from gsmerge.types import Array, Gaussians
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
 GROWTH = 0.5  # part of the run after which Gaussians are added
@@ -190,23 +190,24 @@ def score_to_beat(own: float, baseline_start: Gaussians | None, plan: Plan) -> f
 
 @dataclass
 class TailMean:
-    """Mean of parameters ``[n,14]`` over the last steps, which a single step's noise moves less."""
+    """Mean of parameters ``[n,14]``, an array or a tensor, over the last steps; one step's noise moves it less."""
 
-    mean: np.ndarray | None = None
+    mean: Array = None
     count: int = 0
 
-    def add(self, x: np.ndarray) -> None:
+    def add(self, x: Array) -> None:
         """One more step; the first one after Gaussians were added begins anew."""
         if self.mean is None or len(self.mean) != len(x):
-            self.mean, self.count = np.zeros_like(x), 0
+            self.mean, self.count = 0 * x, 0
         self.count += 1
-        self.mean += (x - self.mean) / np.float32(self.count)
+        self.mean += (x - self.mean) / self.count
 
-    def of(self, x: np.ndarray) -> np.ndarray:
+    def of(self, x: Array) -> Array:
         """The mean with unit quaternions; ``x`` itself where no step of as many Gaussians was added."""
         if self.mean is None or len(self.mean) != len(x):
             return x
-        self.mean[:, QUAT:LOGIT] /= np.linalg.norm(self.mean[:, QUAT:LOGIT], axis=1, keepdims=True)
+        quats = self.mean[:, QUAT:LOGIT]
+        quats /= (quats * quats).sum(1)[:, None] ** 0.5
         return self.mean
 
 

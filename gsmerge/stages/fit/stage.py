@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -15,11 +17,24 @@ from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import gaussians_of, start_state
-from gsmerge.types import Gaussians
+from gsmerge.types import Array, Gaussians
 
+FitResult = tuple[Gaussians, FitReport]
+PhotosT = TypeVar("PhotosT")  # photos of one size, where a back end has them
 CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
+
+
+@dataclass(frozen=True)
+class FitBackend(Generic[PhotosT]):
+    """What the stage is made of: functions on arrays and :class:`Photos`, or on tensors and their device's photos."""
+
+    visible_mask: Callable[[Gaussians, PhotosT, float], Array]  # see visible_mask
+    fit_full: Callable[..., FitResult]  # see gsmerge.stages.fit.full.fit_full; without masks
+    fit_colors: Callable[[Gaussians, PhotosT, FitOptions, int], FitResult]  # the last: a seed
+    grow: Callable[[Gaussians, PhotosT, int], Gaussians]  # to a number, see gsmerge.stages.fit.grow.grow_to
+    photo_error: Callable[[Gaussians, PhotosT], float]  # mean squared error of all photos
 
 
 def fit(
@@ -58,26 +73,57 @@ def fit(
         return fit_gaussians(
             gaussians, photos, options, count, seed, progress, baseline_start, exact=exact, device=device
         )
+    return fit_with(ON_CPU, gaussians, photos, options, count, seed, progress, baseline_start, exact=exact)
+
+
+def fit_with(
+    backend: FitBackend[PhotosT],
+    gaussians: Gaussians,
+    photos: tuple[PhotosT, PhotosT],
+    options: FitOptions,
+    count: int = 0,
+    seed: int = 0,
+    progress: Progress | None = None,
+    baseline_start: Gaussians | None = None,
+    *,
+    exact: bool = False,
+) -> tuple[Gaussians, FitReport | None]:
+    """:func:`fit` by the functions of a back end, of Gaussians and photos that are its own."""
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
-    keep = visible_mask(gaussians, photos[1], options.min_contribution)
+    full, half = photos
+    keep = backend.visible_mask(gaussians, half, options.min_contribution)
+    kept, close = gaussians[keep], CLOSE
     if options.fit == "none":
-        return gaussians[keep], None
+        return kept, None
     if options.fit == "full":
-        kept = gaussians[keep]
-        fitted, report = fit_full(kept, photos, options, count, seed, progress, None, baseline_start)
-        fitted, report = _better_of(kept, fitted, report, photos[0])
+        fitted, report = backend.fit_full(kept, photos, options, count, seed, progress, baseline_start=baseline_start)
+        fitted, report = _better_of(backend, full, kept, fitted, report, close)
         if report.accepted:
             return fitted, report
+        close = ALWAYS
         if options.grows:  # the stages before left room for a growth that did not happen
-            state = grow_to(start_state(kept), photos[1], count)
-            grown = gaussians_of(state.x, state.splats.shN)
-            fitted, report = fit_colors(grown, draw(grown, photos[1]), photos[1], options, seed)
-            return _better_of(kept, fitted, report, photos[0], ALWAYS) if report.accepted else (kept, report)
-    fitted, report = fit_colors(gaussians, draw(gaussians, photos[1]), photos[1], options, seed)
-    return _better_of(gaussians[keep], fitted[keep], report, photos[0], ALWAYS if options.fit == "full" else CLOSE)
+            fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
+            return _better_of(backend, full, kept, fitted, report, close) if report.accepted else (kept, report)
+    fitted, report = backend.fit_colors(gaussians, half, options, seed)
+    return _better_of(backend, full, kept, fitted[keep], report, close)
+
+
+def _better_of(
+    backend: FitBackend[PhotosT], photos: PhotosT, before: Gaussians, after: Gaussians, report: FitReport, close: float
+) -> FitResult:
+    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
+
+    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
+    more the photos are not compared.
+    """
+    if not report.accepted or report.holdout_after - report.holdout_before >= close:
+        return after, report
+    if backend.photo_error(after, photos) <= backend.photo_error(before, photos):
+        return after, report
+    return before, replace(report, method="none", accepted=False, stopped="the photos as a whole were shown worse")
 
 
 def _device(options: FitOptions, photos: Photos) -> str:
@@ -110,28 +156,25 @@ def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.
     return ~inside | (peak >= min_weight)
 
 
-def _better_of(
-    before: Gaussians, after: Gaussians, report: FitReport, photos: Photos, close: float = CLOSE
-) -> tuple[Gaussians, FitReport]:
-    """The fitted Gaussians; their start if the held-out blocks hardly gained and the photos as a whole lost.
-
-    Gaussians that were fitted already are where steps of the default size only scatter. After a gain of ``close`` dB or
-    more the photos are not compared.
-    """
-    if not report.accepted or report.holdout_after - report.holdout_before >= close:
-        return after, report
-    if _photos_error(after, photos) <= _photos_error(before, photos):
-        return after, report
-    return before, replace(report, method="none", accepted=False, stopped="the photos as a whole were shown worse")
+def _fit_colors(gaussians: Gaussians, photos: Photos, options: FitOptions, seed: int) -> FitResult:
+    return fit_colors(gaussians, draw(gaussians, photos), photos, options, seed)
 
 
-def _photos_error(gaussians: Gaussians, photos: Photos) -> float:
+def _grow(gaussians: Gaussians, photos: Photos, count: int) -> Gaussians:
+    state = grow_to(start_state(gaussians), photos, count)
+    return gaussians_of(state.x, state.splats.shN)
+
+
+def photo_error(gaussians: Gaussians, photos: Photos) -> float:
     """Mean squared error of all photos."""
 
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
 
     return float(np.mean(photo_errors(gaussians, photos, score)))
+
+
+ON_CPU = FitBackend(visible_mask, fit_full, _fit_colors, _grow, photo_error)
 
 
 def start_share(options: FitOptions) -> float:

@@ -56,12 +56,12 @@ def draw_elsewhere(shape: Any, colors: Any, photos: DevicePhotos, view: int, bac
     return _Draw.apply(photos.host.camera(view) | near, background, *shape, colors)
 
 
-def peaks_elsewhere(shapes: Any, photos: DevicePhotos, view: int) -> Any:
+def peaks_elsewhere(gaussians: Any, photos: DevicePhotos, view: int) -> Any:
     names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    arrays = [getattr(shapes, name).inner.contiguous().numpy() for name in names]
+    arrays = [getattr(gaussians, name).inner.contiguous().numpy() for name in names]
     with torch._C._DisableTorchDispatch():
         plan = plan_view(Splats(*arrays, origin=[0, 0, 0]), **photos.host.camera(view))
-        inside = torch.zeros(len(shapes), dtype=torch.bool)
+        inside = torch.zeros(len(gaussians), dtype=torch.bool)
         inside[torch.from_numpy(plan.ids).long()] = True
         return Elsewhere(torch.from_numpy(contributions(plan)[1])), Elsewhere(inside)
 
@@ -118,9 +118,9 @@ def test_what_gsplat_is_given_and_gives_stays_on_the_device(monkeypatch: pytest.
     made: list[list[Any]] = []
     for device in (torch.device("cpu"), DEVICE):
         with SecondDevice():
-            shapes, resident = upload_gaussians(gaussians, device), upload_photos(photos, device)
-            images = raster.draw_all(shapes, resident)
-            peaks, reached = raster.peak_weights(shapes, resident, 1)
+            tensors, resident = upload_gaussians(gaussians, device), upload_photos(photos, device)
+            images = raster.draw_all(tensors, resident)
+            peaks, reached = raster.peak_weights(tensors, resident, 1)
             made.append([one.cpu() for one in (*images, peaks, reached & (peaks > 0))])
     for expected, ours in zip(*made, strict=True):
         torch.testing.assert_close(ours, expected, atol=1e-3, rtol=1e-3)

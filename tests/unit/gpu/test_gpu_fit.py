@@ -19,12 +19,11 @@ from step_states import gradients_of, odd_state
 from gsmerge import Gaussians, PixelScene
 from gsmerge.gpu import full as gpu_full
 from gsmerge.gpu.adam import adam_step
-from gsmerge.gpu.fit import fit as fit_shapes
-from gsmerge.gpu.fit import fit_gaussians, visible_mask
+from gsmerge.gpu.fit import ON_DEVICE, fit_gaussians, visible_mask
 from gsmerge.gpu.grow import error_masses, grow_to
 from gsmerge.gpu.holdout import exposure_gains, holdout_psnr
 from gsmerge.gpu.loss import loss_gradient, photo_means
-from gsmerge.gpu.scene import Shapes, upload_gaussians, upload_photos
+from gsmerge.gpu.scene import upload_gaussians, upload_photos
 from gsmerge.gpu.score import photo_error, photo_psnr
 from gsmerge.kernels.gaussians import optimise
 from gsmerge.render import photos as render_photos
@@ -156,9 +155,9 @@ def test_a_fit_that_fails_falls_back(start: Gaussians, photos: Pair) -> None:
 
 
 def test_nothing_is_fitted_where_nothing_is_asked_for(start: Gaussians, photos: Pair) -> None:
-    shapes = upload_gaussians(start, CPU)
-    same, report = fit_shapes(shapes, on_device(photos), replace(QUICK, fit="none", effort="draft"))
-    assert same is shapes
+    tensors = upload_gaussians(start, CPU)
+    same, report = stage.fit_with(ON_DEVICE, tensors, on_device(photos), replace(QUICK, fit="none", effort="draft"))
+    assert same is tensors
     assert report is None
     few, _ = fit_gaussians(start[:0], photos, QUICK, device=CPU)
     assert len(few) == 0
@@ -281,15 +280,15 @@ def test_scores_are_the_renderers(start: Gaussians, scene: PixelScene, monkeypat
     monkeypatch.setattr(render_photos, "BLOCK", 1)  # so that these small views are divided, too
     wide = scenes.make_scene(scenes.room(), scenes.arc(2, 72, 66))
     full = render_photos.scene_photos(wide)
-    shapes, resident = upload_gaussians(start, CPU), upload_photos(full, CPU)
+    tensors, resident = upload_gaussians(start, CPU), upload_photos(full, CPU)
     assert render_photos.scored_tiles(0, 72, 66) is not None
-    assert photo_psnr(shapes, resident, [0, 1], near=NEAR, quarter=True) == pytest.approx(
+    assert photo_psnr(tensors, resident, [0, 1], near=NEAR, quarter=True) == pytest.approx(
         render_photos.photo_psnr(start, full, [0, 1], quarter=True), abs=1e-4
     )
-    assert photo_psnr(shapes, resident, [1], near=NEAR, quarter=False) == pytest.approx(
+    assert photo_psnr(tensors, resident, [1], near=NEAR, quarter=False) == pytest.approx(
         render_photos.photo_psnr(start, full, [1]), abs=1e-4
     )
-    assert photo_error(shapes, resident) == pytest.approx(stage._photos_error(start, full), rel=1e-4)
+    assert photo_error(tensors, resident) == pytest.approx(stage.photo_error(start, full), rel=1e-4)
 
 
 def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +302,7 @@ def test_all_of_a_step_is_on_the_device(start: Gaussians, photos: Pair, monkeypa
     monkeypatch.setattr(gpu_full, "draw", drawn)
     monkeypatch.setattr(torch.autograd, "grad", lambda image, leaves, wanted: [torch.empty_like(x) for x in leaves])
     meta = torch.device("meta")
-    state = gpu_full.start_state(Shapes(*(torch.as_tensor(getattr(start, f)).to(meta) for f in scenes.FIELDS)))
+    state = gpu_full.start_state(start.to(meta))
     plan = stage_full.plan_run(photos, QUICK, 0)
     levels = gpu_full.make_levels((upload_photos(photos[0], meta), upload_photos(photos[1], meta)), plan, meta)
     schedule = gpu_full.draw_schedule(0, 3, 8, meta)

@@ -13,9 +13,10 @@ from gsmerge import PixelScene
 from gsmerge.gpu import decode as gpu_decode
 from gsmerge.gpu import match as gpu_match
 from gsmerge.gpu import pool as gpu_pool
-from gsmerge.gpu.axes import features_to_shapes, principal_axes
+from gsmerge.gpu.axes import feature_to_gaussians as gpu_feature_to_gaussians
+from gsmerge.gpu.axes import principal_axes
 from gsmerge.gpu.runs import group_rows, middle_of_runs, smallest_by_part
-from gsmerge.gpu.scene import Features, download_features, download_gaussians, to_device, upload_members
+from gsmerge.gpu.scene import Features, download_features, to_device, upload_members
 from gsmerge.kernels.gaussians.cluster import leader_clusters
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
 from gsmerge.moments import principal_axes as axes_of
@@ -172,7 +173,7 @@ def merged(features: FeatureGaussians) -> FeatureGaussians:
 @pytest.mark.parametrize("k", [1, 2, 3, 8])
 def test_children_are_the_stages(merged: FeatureGaussians, members: Members, k: int) -> None:
     options = DecodeOptions(k=k)
-    ours = download_gaussians(gpu_decode.decode(upload(merged), upload_members(members, CPU), options, None))
+    ours = gpu_decode.decode(upload(merged), upload_members(members, CPU), options, None)
     expected = decode(merged, members, options)
     assert len(ours) == len(expected)
     for name in ("means", "scales", "opacities", "sh0", "shN"):
@@ -196,7 +197,7 @@ def test_members_that_are_alike_are_not_divided(merged: FeatureGaussians, member
 
 
 def test_one_gaussian_each(merged: FeatureGaussians) -> None:
-    ours, expected = features_to_shapes(upload(merged)), feature_to_gaussians(merged)
+    ours, expected = gpu_feature_to_gaussians(upload(merged)), feature_to_gaussians(merged)
     torch.testing.assert_close(ours.scales, torch.as_tensor(expected.scales), rtol=1e-5, atol=0)
     torch.testing.assert_close(ours.opacities, torch.as_tensor(expected.opacities), rtol=1e-5, atol=1e-7)
 

@@ -11,7 +11,7 @@ import scenes
 
 from gsmerge import Gaussians, PixelScene
 from gsmerge.render.photos import Photos
-from gsmerge.stages.fit import FitOptions, FitReport, fit
+from gsmerge.stages.fit import FitOptions, FitReport, fit, stage
 from gsmerge.stages.fit.full import fit_full
 from gsmerge.stages.fit.stage import visible_mask
 from gsmerge.types import SH_C0
@@ -52,7 +52,8 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
 def test_stage_falls_back_to_colours(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the full fit is refused."""
     refused = FitReport("none", False, 7, 20.0, 19.0, "worse")
-    monkeypatch.setattr("gsmerge.stages.fit.stage.fit_full", lambda gaussians, *_: (gaussians, refused))
+    backend = replace(stage.ON_CPU, fit_full=lambda gaussians, *_, **__: (gaussians, refused))
+    monkeypatch.setattr(stage, "ON_CPU", backend)
     start = replace(truth, sh0=truth.sh0 + 0.2 / SH_C0)
     result, report = fit(start, photos, QUICK)
     assert report is not None
