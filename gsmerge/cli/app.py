@@ -90,7 +90,9 @@ def run(args: Sequence[str] | None = None) -> int:
         return fail("interrupted", code) if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except GsmergeError as error:
         return fail(str(error), error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
+    except (KeyboardInterrupt, typer.Abort) as error:
+        if isinstance(error.__cause__, EOFError):  # which Typer takes for the end of the user's input: there is none
+            return fail("unexpected error: EOFError; run again with --debug", 1)
         return fail("interrupted", INTERRUPTED)
     except MemoryError:
         return fail("out of memory; use a smaller scene or fewer --threads", 1)
