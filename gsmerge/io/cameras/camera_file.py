@@ -106,14 +106,14 @@ def make_camera_file(
         if pose.shape not in ((3, 4), (4, 4)):
             raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
         poses[i, :3] = pose[:3]
-        _check(path, view.name, poses[i], Ks[i])
+        check_camera(path, view.name, poses[i], Ks[i])
         _check_lens(path, view.name, view.lens)
     for w, h in (view.size for view in views):
         if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
             raise SceneError(path, f"expected a positive image size, found {w:.6g} x {h:.6g}")
     Ks, sizes = _in_pixels(Ks, [view.size for view in views])
     for view, K, size in zip(views, Ks, sizes, strict=True):
-        _check_against_size(path, view.name, K, size)
+        check_size(path, view.name, K, size)
     lenses = tuple(view.lens for view in views)
     return CameraFile(
         path=str(path),
@@ -139,7 +139,8 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
     return Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None], sizes
 
 
-def _check(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndarray) -> None:
+def check_camera(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndarray) -> None:
+    """Refuse a pose ``[4,4]`` or intrinsics ``[3,3]`` that no camera has, as a SceneError."""
     if not (np.isfinite(pose).all() and np.isfinite(K).all()):
         raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
     largest = max(np.abs(pose).max(), np.abs(K).max())
@@ -167,7 +168,8 @@ def _check_lens(path: str | os.PathLike[str], name: str, lens: Lens | None) -> N
             raise SceneError(path, f"{problem} ({lens.name})", "correct it, or undistort the images first")
 
 
-def _check_against_size(path: str | os.PathLike[str], name: str, K: np.ndarray, size: tuple[int, int]) -> None:
+def check_size(path: str | os.PathLike[str], name: str, K: np.ndarray, size: tuple[int, int]) -> None:
+    """Refuse intrinsics ``[3,3]`` in pixels that do not fit an image of (width, height), as a SceneError."""
     side = max(size)
     if min(size) <= 1:  # not known
         return
