@@ -17,7 +17,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     Returns:
         0 done, 1 unexpected error, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
-        130 interrupted.
+        129 ended by SIGHUP, 130 interrupted, 143 ended by SIGTERM.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # we report damaged images ourselves
     os.environ.setdefault("GSMERGE_COMMAND", "1")  # see gsmerge.kernels.jit

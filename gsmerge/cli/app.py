@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -72,6 +75,30 @@ def _usage_message(error: Any) -> str:
     return f"{message.rstrip('.')}; see '{place} --help'"
 
 
+@contextmanager
+def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
+    """A block that SIGTERM and SIGHUP end as Ctrl-C does, so that nothing unfinished is left; adds those that came.
+
+    What the caller has handled or ignored, as under nohup, stays so.
+    """
+
+    def stop(number: int, _: object) -> None:
+        signals.append(signal.Signals(number))
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    ours = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     words = list(sys.argv[1:] if args is None else args)
@@ -83,17 +110,22 @@ def run(args: Sequence[str] | None = None) -> int:
         return code
 
     known = any(words[:1] == [name] for names in COMMANDS.values() for name in names)
+    signals: list[signal.Signals] = []
+
+    def stopped() -> int:
+        return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
+
     try:
-        with plain_warnings():
+        with plain_warnings(), _orderly_stop(signals):
             app = make_app(words[0] if known else None)
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
-        return fail("interrupted", code) if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
+        return stopped() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except GsmergeError as error:
         return fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort) as error:
         if isinstance(error.__cause__, EOFError):  # which Typer takes for the end of the user's input: there is none
             return fail("unexpected error: EOFError; run again with --debug", 1)
-        return fail("interrupted", INTERRUPTED)
+        return stopped()
     except MemoryError:
         return fail("out of memory; use a smaller scene or fewer --threads", 1)
     except Exception as error:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -83,3 +89,60 @@ def test_a_gpu_that_is_not_there_is_wrong_usage(scene_copy: Path, run: Run, monk
     plan = run("compact", scene_copy, "--device", "auto", "--dry-run", "--json")
     assert plan.code == 0
     assert '"device": "cpu"' in plan.out
+
+
+@pytest.mark.parametrize("more", [("--report", "none/report.json"), ("--levels", 2), ("--report", "report.json")])
+def test_several_outputs_are_all_there_or_none(
+    more: tuple[object, ...], scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A report that cannot be written, a disk that is full at the second level, or at the end."""
+    from gsmerge.io import write_gaussians
+
+    def full(path: Path, *arguments: Any, **named: Any) -> None:
+        if "level1" in str(path):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_gaussians(path, *arguments, **named)
+
+    def no_room(*_: object) -> str:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("gsmerge.compact_file.write_gaussians", full)
+    monkeypatch.setattr("gsmerge.compact_file.to_json", no_room)
+    before = listing(scene_copy)
+    where = [scene_copy / word if isinstance(word, str) and word.endswith("json") else word for word in more]
+    quick = ("--superpixels", 40, "--no-robust", "--fit", "none")
+    outcome = run("compact", scene_copy, "-o", scene_copy / "out.ply", *quick, *where, "--quiet")
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1), outcome.err
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root: Path) -> None:
+    """Whenever it comes: no file is left, and one line says why."""
+    before = listing(scene_copy)
+    command = [sys.executable, "-m", "gsmerge", "compact", str(scene_copy), "-o", str(scene_copy / "out.ply"), "-q"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=root) as process:
+        while process.poll() is None and listing(scene_copy) == before:
+            time.sleep(0.002)
+        process.send_signal(signal.Signals[name])
+        _, err = process.communicate()
+    assert process.returncode == code
+    assert err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
+def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As under nohup."""
+    seen = []
+    monkeypatch.setattr("gsmerge.compact_file.compact", lambda *_, **__: seen.append(signal.getsignal(signal.SIGHUP)))
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        run("compact", scene_copy, "--quiet")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    run("compact", scene_copy, "--quiet")
+    assert seen[0] == signal.SIG_IGN
+    assert callable(seen[1])
+    assert signal.getsignal(signal.SIGHUP) == before

@@ -30,6 +30,7 @@ from gsmerge.batch.records import (
 )
 from gsmerge.batch.summary import MAX_LISTED, Totals, summary_lines, write_summary
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.io.atomic import temporary_path
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.jsonl import append_line, each_line, read_lines
@@ -356,7 +357,7 @@ def test_the_summary_has_the_newest_of_every_scene(tmp_path: Path) -> None:
         append_line(tmp_path / RECORDS, one)
     append_line(tmp_path / RECORDS, done("c.ply"))
     append_line(tmp_path / RECORDS, record(FAILED, "in/c.ply", "c.ply", error="killed"))
-    (tmp_path / ".summary-00112233.csv").touch()  # of a killed run
+    temporary_path(tmp_path / "summary.csv").touch()  # of a killed run
     assert write_summary(tmp_path) == tmp_path / "summary.csv"
     actual = rows(tmp_path)
     assert list(actual[0]) == list(COLUMNS)
