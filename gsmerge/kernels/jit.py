@@ -22,21 +22,35 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from gsmerge.errors import UsageError
+
 OURS = "GSMERGE_COMMAND"  # set in processes that run nothing but the command line
 
 
 def _import_numba() -> Any:
-    """Import numba; in processes of our own without SciPy's BLAS, which no kernel needs and which takes 0.2 s."""
+    """Import numba; in processes of our own without SciPy's BLAS, which no kernel needs and which takes 0.2 s.
+
+    UsageError if a variable of the environment that numba reads is none that it can use, or turns it off.
+    """
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if not threads.isdecimal() or int(threads) < 1:
+        raise UsageError(f"NUMBA_NUM_THREADS: expected a number from 1 on, found {threads!r}; unset it")
     hidden = "scipy.linalg" if OURS in os.environ and "scipy.linalg" not in sys.modules else None
     if hidden:
         sys.modules[hidden] = None  # type: ignore[assignment]
     try:
-        import numba.np.arraymath
-
-        return numba
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "Environment variable 'NUMBA_")
+            import numba.np.arraymath
+    except RuntimeWarning as warning:
+        raise UsageError(f"{str(warning).splitlines()[0].rstrip('.')}; unset it") from warning
     finally:
         if hidden:
             del sys.modules[hidden]
+    config: Any = numba.config
+    if config.DISABLE_JIT:
+        raise UsageError("NUMBA_DISABLE_JIT: expected kernels that are compiled, found it set; unset it")
+    return numba
 
 
 numba = _import_numba()
