@@ -165,6 +165,15 @@ def finite(value: Any) -> Any:
     return value
 
 
+def csv_cell(value: Any) -> Any:
+    """A value for a table of comma-separated values; text that spreadsheets would run as a formula gets a quote before
+    it. Empty for None.
+    """
+    if value is None:
+        return ""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
+
+
 def summary_lines(document: Mapping[str, Any]) -> list[str]:
     """What ``compact`` ends with: a line for the result, one for each further level, and the curve if measured."""
     levels = [

@@ -14,7 +14,7 @@ from gsmerge.batch.records import COLUMNS, DONE, FAILED, SKIPPED, SUMMARY, each_
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.atomic import remove_leftovers
-from gsmerge.report import human_bytes
+from gsmerge.report import csv_cell, human_bytes
 
 MAX_LISTED = 20  # scenes in the table, and failures below it
 
@@ -92,7 +92,7 @@ def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     ):
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
 
 
 def summary_lines(totals: Totals, path: Path | None) -> list[str]:

@@ -371,6 +371,15 @@ def test_the_summary_has_the_newest_of_every_scene(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [RECORDS, "summary.csv"]
 
 
+def test_names_in_the_summary_are_no_formulas(tmp_path: Path) -> None:
+    names = ["=cmd|' x'!A1/s.ply", "+1.ply", "-1.ply", "@a.ply", "plain-1.ply"]
+    for name in names:
+        append_line(tmp_path / RECORDS, record(FAILED, name, name, error=name))
+    actual = rows(write_summary(tmp_path).parent)
+    for column in ("scene", "output", "error"):
+        assert sorted(row[column] for row in actual) == sorted([*(f"'{name}" for name in names[:4]), names[4]])
+
+
 def test_totals_do_not_grow_with_the_number_of_scenes(tmp_path: Path) -> None:
     totals = Totals(1000)
     for number in range(300):
