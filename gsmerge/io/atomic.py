@@ -86,9 +86,9 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
         path = made[error.path][0]  # the temporary name means nothing to the caller
         raise SceneError(path, error.problem, error.remedy) from error
     except OSError as error:
-        if error.errno not in _DISK_ERRORS and error.filename not in made:
+        if not made or (error.errno not in _DISK_ERRORS and error.filename not in made):
             raise
-        path = next((made[name][0] for name in (str(error.filename), *made) if name in made), Path(str(error.filename)))
+        path = made.get(str(error.filename), next(iter(made.values())))[0]
         raise SceneError(path, f"could not be written ({error.strerror})") from error
     finally:
         for temporary in made:

@@ -163,6 +163,15 @@ def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
+def test_a_disk_error_of_a_writer_inside_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    with (
+        pytest.raises(SceneError, match=r"out\.txt: could not be written \(No space left"),
+        atomic_output(tmp_path / "out.txt") as temporary,
+    ):
+        write_half_and_fail(temporary, OSError(errno.ENOSPC, "No space left on device"))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
     flush, replace = os.fsync, os.replace
