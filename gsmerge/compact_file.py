@@ -14,7 +14,7 @@ from gsmerge.io import (
     ReadHints,
     SceneFiles,
     SceneLoad,
-    atomic_output,
+    atomic_outputs,
     kept_comments,
     load_files,
     lost_harmonics,
@@ -24,7 +24,7 @@ from gsmerge.io import (
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
-from gsmerge.report import report_document
+from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.run_log import Progress
 from gsmerge.types import PixelScene, UnalignedScene
@@ -60,8 +60,10 @@ def compact_files(
     progress: Progress | None = None,
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
+    report_path: Path | None = None,
 ) -> dict[str, Any]:
-    """Read a scene, compact it and write the result, and its further levels of detail beside it.
+    """Read a scene, compact it and write the result, its further levels of detail beside it, and the report: all of
+    them or none.
 
     Args:
         files: The scene.
@@ -73,6 +75,7 @@ def compact_files(
         progress: As of :func:`gsmerge.compact`.
         hashed: Hash the input for the report.
         seconds_before: Wall time by name of what the caller did before.
+        report_path: A file for the report; None: none is written.
 
     Returns:
         The report, see :func:`gsmerge.report.report_document`.
@@ -82,7 +85,8 @@ def compact_files(
         UsageError: If the settings need what the scene does not have, or the name has no known ending.
     """
     start, ending = perf_counter(), output_format(out)
-    with atomic_output(out, overwrite=overwrite) as temporary:
+    with atomic_outputs(overwrite=overwrite) as add:
+        at = {path: add(path) for path in (out, report_path) if path is not None}
         given = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         result = compact(given.scene, settings, progress=progress)
@@ -90,23 +94,26 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         compacted = perf_counter()
-        write_gaussians(temporary, result.gaussians, overwrite=True, comments=given.comments, ending=ending)
-    lost = lost_harmonics(out, result.gaussians.sh_degree)
-    coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
-    for path, level in coarser:
-        with atomic_output(path, overwrite=overwrite) as temporary:
-            write_gaussians(temporary, level.gaussians, overwrite=True, comments=given.comments, ending=ending)
-    return report_document(
-        result.report,
-        input_path=files.ply,
-        output_path=out,
-        seconds_before={**(seconds_before or {}), "read": read - start},
-        seconds_after={"write": perf_counter() - compacted},
-        coarser=[(path, level.report) for path, level in coarser],
-        recognised=given.recognised,
-        notes=[*given.notes, *([lost] if lost else [])],
-        hashed=hashed,
-    )
+        coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
+        at |= {path: add(path) for path, _ in coarser}
+        for path, one in ((out, result), *coarser):
+            write_gaussians(at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending)
+        lost = lost_harmonics(out, result.gaussians.sh_degree)
+        document = report_document(
+            result.report,
+            input_path=files.ply,
+            output_path=out,
+            seconds_before={**(seconds_before or {}), "read": read - start},
+            seconds_after={"write": perf_counter() - compacted},
+            coarser=[(path, level.report) for path, level in coarser],
+            recognised=given.recognised,
+            notes=[*given.notes, *([lost] if lost else [])],
+            hashed=hashed,
+            written_at=at,
+        )
+        if report_path is not None:
+            at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")
+    return document
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> SceneInput:

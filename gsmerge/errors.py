@@ -6,6 +6,7 @@ with what is in them raises one of these; the command line prints the message as
 
 from __future__ import annotations
 
+import errno
 from os import PathLike
 
 
@@ -60,11 +61,36 @@ def is_opencv_damaged(error: BaseException) -> bool:
     return isinstance(error, AttributeError | ImportError) and "cv2" in f"{error} {getattr(error, 'path', '')}"
 
 
+OUT_OF_MEMORY = "out of memory; use fewer --threads or --jobs, or a smaller scene"
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread")
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or one behind it, says that there is no more memory: libraries have many words for it."""
+    while error is not None:
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def file_problem(error: BaseException) -> str | None:
+    """What the system says about a file or the disk, as one line; None for another error."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return None
+    if error.filename is not None:
+        return f"{error.filename}: cannot be read or written ({error.strerror})"
+    disk = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+    return f"what was printed could not be written ({error.strerror}); send it elsewhere" if disk else None
+
+
 def error_line(error: BaseException) -> str:
     """An error as one line."""
-    if isinstance(error, MemoryError):
-        return "out of memory; use fewer --threads or --jobs, or a smaller scene"
+    if is_out_of_memory(error):
+        return OUT_OF_MEMORY
     if is_opencv_damaged(error):
         return DAMAGED_OPENCV
+    if not isinstance(error, GsmergeError) and (problem := file_problem(error)) is not None:
+        return problem
     text = str(error) if isinstance(error, GsmergeError) else f"{type(error).__name__}: {error}"
     return " ".join(text.split())

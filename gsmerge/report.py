@@ -96,6 +96,7 @@ def report_document(
     recognised: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
     hashed: bool = True,
+    written_at: Mapping[Path, Path] | None = None,
 ) -> dict[str, Any]:
     """The report of one ``compact`` as plain JSON types.
 
@@ -106,11 +107,12 @@ def report_document(
         recognised: What is known of the input besides path, bytes and count (layout, views, ...).
         notes: Of the reader; the report's own follow.
         hashed: Also hash the input, which takes time on large files.
+        written_at: Where files are until they are renamed to their names.
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
     """
-    numbers = asdict(report)
+    numbers, at = asdict(report), written_at or {}
     return {
         **document_head(),
         "input": {
@@ -120,10 +122,10 @@ def report_document(
             "num_gaussians": numbers["num_input"],
             **(recognised or {}),
         },
-        "output": _file_facts(output_path, report),
+        "output": _file_facts(output_path, report, at),
         "levels": [
             {
-                **_file_facts(path, level),
+                **_file_facts(path, level, at),
                 "psnr_input_views": level.psnr_after,
                 "seconds": round(sum(level.seconds.values()), 4),
                 "choices": level.choices,
@@ -143,8 +145,8 @@ def report_document(
     }
 
 
-def _file_facts(path: Path, report: CompactReport) -> dict[str, Any]:
-    return {"path": os.fspath(path), "bytes": path.stat().st_size, "num_gaussians": report.num_output}
+def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Path]) -> dict[str, Any]:
+    return {"path": os.fspath(path), "bytes": at.get(path, path).stat().st_size, "num_gaussians": report.num_output}
 
 
 def to_json(document: Mapping[str, Any]) -> str:
@@ -161,6 +163,15 @@ def finite(value: Any) -> Any:
     if isinstance(value, float) and not (abs(value) < float("inf")):
         return None
     return value
+
+
+def csv_cell(value: Any) -> Any:
+    """A value for a table of comma-separated values; text that spreadsheets would run as a formula gets a quote before
+    it. Empty for None.
+    """
+    if value is None:
+        return ""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
 
 
 def summary_lines(document: Mapping[str, Any]) -> list[str]:

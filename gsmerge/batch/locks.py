@@ -122,7 +122,7 @@ def _write(descriptor: int, what: str, **facts: bool) -> None:
 def _read(descriptor: int) -> dict[str, object]:
     try:
         value = json.loads(os.pread(descriptor, 1 << 16, 0))
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
 

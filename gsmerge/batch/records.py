@@ -17,6 +17,10 @@ RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
 DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records
 # Of outcomes that are not recorded: another process has the scene, its process died, records cannot be written.
 BUSY, LOST, STUCK = "busy", "lost", "stuck"
+COLUMNS = (
+    "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
+    "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,12 @@ class DoneResult:
 
     def holds(self, folder: Path, key: str) -> bool:
         """Whether it was made from the same content and settings, and every file is unchanged since."""
+        paths = [folder / name for name, _ in self.files]
         try:
-            return self.key == key and all(file_sha256(folder / name) == sha256 for name, sha256 in self.files)
-        except OSError:
+            if self.key != key or not paths or not all(path.is_file() for path in paths):  # a pipe would never end
+                return False
+            return all(file_sha256(path) == sha256 for path, (_, sha256) in zip(paths, self.files, strict=True))
+        except (OSError, ValueError):  # the latter of a name that no file has
             return False
 
 
@@ -48,13 +55,14 @@ class RecordIndex:
         """Read the lines that were added since."""
         for end, value in each_line(self.folder / RECORDS, self.end):
             self.end = end
-            if value is None:
+            if value is None or not is_record(value):
                 self.damaged += 1
                 continue
-            output, result = value.get("output"), _done_result(value)
-            if result is not None:
-                self.known[str(output)] = result
-            elif value.get("status") == FAILED and output in self.known:
+            output = value["output"]
+            if value["status"] == DONE:
+                files = tuple((file["path"], file["sha256"]) for file in value["files"])
+                self.known[output] = DoneResult(value["key"], files)
+            elif value["status"] == FAILED and output in self.known:
                 self.known[output] = replace(self.known[output], failed_since=True)
 
     def result_paths(self) -> set[str]:
@@ -63,15 +71,45 @@ class RecordIndex:
         return {os.path.realpath(self.folder / name) for name in names}
 
 
-def _done_result(value: Mapping[str, Any]) -> DoneResult | None:
-    """The result of a record; None for one of another kind."""
-    if value.get("status") != DONE:
-        return None
+def is_record(value: Mapping[str, Any]) -> bool:
+    """Whether a line is a record: anybody may have written it, and one that is none must not stop a batch."""
     try:
-        files = tuple((str(file["path"]), str(file["sha256"])) for file in value["files"])
-        return DoneResult(str(value["key"]), files) if "output" in value else None
-    except (KeyError, TypeError):
-        return None
+        texts = [value["scene"], value["output"]]
+        texts += [text for file in value["files"] for text in (file["path"], file["sha256"])]
+        if value["status"] == DONE:
+            texts.append(value["key"])
+            if not value["report"]:
+                return False
+        cells = row_of(value).values()
+        for text in texts:
+            os.fsencode(text.replace("\0", "\ud800"))  # neither may be in the name of a file
+    except (KeyError, TypeError, AttributeError, ArithmeticError, UnicodeEncodeError):
+        return False
+    plain = all(isinstance(cell, str | int | float | None) for cell in cells)
+    return plain and value["status"] in (DONE, FAILED, SKIPPED)
+
+
+def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record as a row of the CSV file, with None for unknown values."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {name: record.get(name) for name in ("scene", "output", "status", "attempt", "error")}
+    report = record.get("report")
+    if not report:
+        return row
+    psnr = report["psnr_input_views"]
+    files = [*report["levels"], report["output"]]
+    return row | {
+        "num_input": report["input"]["num_gaussians"],
+        "num_output": report["output"]["num_gaussians"],
+        "ratio": report["ratio"],
+        "bytes_input": report["input"]["bytes"],
+        "bytes_output": sum(file["bytes"] for file in files),
+        "psnr_before": psnr["before"],
+        "psnr_after": psnr["after"],
+        "seconds": report["total_seconds"],
+        "peak_memory_bytes": report["peak_memory_bytes"],
+        "unmet": report["unmet"],
+    }
 
 
 def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]:
@@ -91,7 +129,7 @@ def written_files(folder: Path, names: Sequence[str]) -> list[dict[str, Any]]:
 def each_record(folder: Path) -> Iterator[dict[str, Any]]:
     """The records of a folder in their order, without damaged ones."""
     for _, value in each_line(folder / RECORDS):
-        if value is not None and {"status", "scene", "output"} <= value.keys():
+        if value is not None and is_record(value):
             yield value
 
 

@@ -10,16 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.batch.locks import LOCK_TIMEOUT, BusyError, scene_lock
-from gsmerge.batch.records import DONE, FAILED, SKIPPED, SUMMARY, each_record
+from gsmerge.batch.records import COLUMNS, DONE, FAILED, SKIPPED, SUMMARY, each_record, row_of
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.atomic import remove_leftovers
-from gsmerge.report import human_bytes
+from gsmerge.report import csv_cell, human_bytes
 
-COLUMNS = (
-    "scene", "output", "status", "num_input", "num_output", "ratio", "bytes_input", "bytes_output", "psnr_before",
-    "psnr_after", "seconds", "peak_memory_bytes", "attempt", "unmet", "error",
-)  # fmt: skip
 MAX_LISTED = 20  # scenes in the table, and failures below it
 
 
@@ -55,29 +51,6 @@ class Totals:
     def ended(self) -> int:
         """Scenes that have ended."""
         return sum(self.counts.values())
-
-
-def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A record as a row of the CSV file, with None for unknown values."""
-    row: dict[str, Any] = dict.fromkeys(COLUMNS)
-    row |= {name: record.get(name) for name in ("scene", "output", "status", "attempt", "error")}
-    report = record.get("report")
-    if not report:
-        return row
-    psnr = report["psnr_input_views"]
-    files = [*report["levels"], report["output"]]
-    return row | {
-        "num_input": report["input"]["num_gaussians"],
-        "num_output": report["output"]["num_gaussians"],
-        "ratio": report["ratio"],
-        "bytes_input": report["input"]["bytes"],
-        "bytes_output": sum(file["bytes"] for file in files),
-        "psnr_before": psnr["before"],
-        "psnr_after": psnr["after"],
-        "seconds": report["total_seconds"],
-        "peak_memory_bytes": report["peak_memory_bytes"],
-        "unmet": report["unmet"],
-    }
 
 
 def write_summary(folder: Path) -> Path:
@@ -119,7 +92,7 @@ def _write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     ):
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
 
 
 def summary_lines(totals: Totals, path: Path | None) -> list[str]:

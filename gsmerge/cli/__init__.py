@@ -6,6 +6,7 @@ import atexit
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 
@@ -17,13 +18,24 @@ def main(args: Sequence[str] | None = None) -> int:
 
     Returns:
         0 done, 1 unexpected error, 2 wrong usage, 3 bad input, 4 target not met, 5 part of a batch failed,
-        130 interrupted.
+        129 ended by SIGHUP, 130 interrupted, 143 ended by SIGTERM.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # we report damaged images ourselves
     os.environ.setdefault("GSMERGE_COMMAND", "1")  # see gsmerge.kernels.jit
+    _open_streams()
     from gsmerge.cli.app import run
 
     return run(args)
+
+
+def _open_streams() -> None:
+    """Output and errors that exist and take any character, as names in files and folders may hold all of them."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
+        reconfigure = getattr(getattr(sys, name), "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
 
 
 def program() -> NoReturn:
@@ -35,10 +47,6 @@ def program() -> NoReturn:
     code = main()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        try:
+        with suppress(OSError):  # the command has said so, or whoever read its output has seen enough
             stream.flush()
-        except BrokenPipeError:  # whoever read our output has seen enough
-            pass
-        except OSError:
-            code = code or 1
     os._exit(code)

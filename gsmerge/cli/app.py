@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 
 from gsmerge import __version__
-from gsmerge.cli.console import one_line, plain_warnings
+from gsmerge.cli.console import plain_warnings, say
 from gsmerge.cli.options import renamed
-from gsmerge.errors import DAMAGED_OPENCV, GsmergeError, is_opencv_damaged
+from gsmerge.errors import (
+    DAMAGED_OPENCV,
+    GsmergeError,
+    SceneError,
+    error_line,
+    file_problem,
+    is_opencv_damaged,
+    is_out_of_memory,
+)
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
@@ -72,6 +84,37 @@ def _usage_message(error: Any) -> str:
     return f"{message.rstrip('.')}; see '{place} --help'"
 
 
+def _check_folder() -> None:
+    try:
+        os.getcwd()
+    except OSError as error:  # libraries fail in ways of their own where there is none
+        raise SceneError(os.curdir, f"the working directory cannot be used ({error.strerror})", "change it") from error
+
+
+@contextmanager
+def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
+    """A block that SIGTERM and SIGHUP end as Ctrl-C does, so that nothing unfinished is left; adds those that came.
+
+    What the caller has handled or ignored, as under nohup, stays so.
+    """
+
+    def stop(number: int, _: object) -> None:
+        signals.append(signal.Signals(number))
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
+    ours = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     words = list(sys.argv[1:] if args is None else args)
@@ -79,24 +122,36 @@ def run(args: Sequence[str] | None = None) -> int:
     def fail(message: str, code: int) -> int:
         if "--debug" in words:
             traceback.print_exc()
-        print(one_line(f"{PROGRAM}: error: {message}"), file=sys.stderr)
+        say(f"{PROGRAM}: error: {message}")
         return code
 
     known = any(words[:1] == [name] for names in COMMANDS.values() for name in names)
+    signals: list[signal.Signals] = []
+
+    def stopped() -> int:
+        return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
+
     try:
-        with plain_warnings():
+        with plain_warnings(), _orderly_stop(signals):
+            _check_folder()
             app = make_app(words[0] if known else None)
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
-        return fail("interrupted", code) if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
+            with suppress(BrokenPipeError):  # whoever read our output has seen enough
+                sys.stdout.flush()
+        return stopped() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except GsmergeError as error:
         return fail(str(error), error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        return fail("interrupted", INTERRUPTED)
-    except MemoryError:
-        return fail("out of memory; use a smaller scene or fewer --threads", 1)
+    except (KeyboardInterrupt, typer.Abort) as error:
+        if isinstance(error.__cause__, EOFError):  # which Typer takes for the end of the user's input: there is none
+            return fail("unexpected error: EOFError; run again with --debug", 1)
+        return stopped()
+    except BrokenPipeError:
+        return 1
     except Exception as error:
         if isinstance(error, _UsageErrors):
             return fail(_usage_message(error), 2)
+        if is_out_of_memory(error) or file_problem(error) is not None:
+            return fail(error_line(error), SceneError.exit_code)
         if is_opencv_damaged(error):
             return fail(DAMAGED_OPENCV, 1)
         first = f"{type(error).__name__}: {error}".splitlines()[0]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, duration, print_document, say_notes, total_progress
 from gsmerge.cli.held_out import lpips_networks
-from gsmerge.cli.paths import write_text
+from gsmerge.cli.paths import write_texts
 from gsmerge.errors import BatchError, UsageError
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def _draw(out: Path, notes: Sequence[str], num_done: int) -> dict[str, Any]:
     drawings = draw_figures(figures, out / CHARTS)
     command = shlex.join(["gsmerge", "chart", "--draw-only", "--output", str(out)])
     page = make_page(records, figures, drawings, verdicts, out, command=command)
-    write_text(out / PAGE, page, overwrite=True)
+    write_texts({out / PAGE: page}, overwrite=True)
     return {
         **document_head(),
         "output": str(out),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_format, check_outputs, checkpoint_files, default_output, input_files, write_text
+from gsmerge.cli.paths import check_format, check_outputs, checkpoint_files, default_output, input_files
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def compact(args: opt.Args) -> None:
         return
     _warn_of_memory(files, quiet=args.silent)
     from gsmerge.compact_file import compact_files
-    from gsmerge.report import summary_lines, to_json
+    from gsmerge.report import summary_lines
 
     seconds_before = {"import": perf_counter() - start}
     needs_fit = settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
@@ -56,12 +56,10 @@ def compact(args: opt.Args) -> None:
 
         document = compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
-            hashed=args.json or args.report is not None, seconds_before=seconds_before,
+            hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
         )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)
-    if args.report is not None:
-        write_text(args.report, to_json(document), overwrite=args.overwrite)
     print_document(document, summary_lines(document), as_json=args.json, quiet=args.quiet)
     if document["unmet"]:
         raise TargetError(document["unmet"])

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
@@ -22,9 +22,10 @@ def one_line(text: str) -> str:
 
 
 def say(message: str, *, quiet: bool = False) -> None:
-    """Print one status line on stderr unless ``quiet``."""
+    """Print one status line on stderr unless ``quiet``; that nobody can read it is no reason to stop."""
     if not quiet:
-        print(one_line(message), file=sys.stderr, flush=True)
+        with suppress(OSError):
+            print(one_line(message), file=sys.stderr, flush=True)
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:

@@ -31,6 +31,8 @@ def decode(args: opt.Args) -> None:
     out = args.output or default_output(args.encoded)
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite)
     check_format(out)
+    import numpy as np
+
     from gsmerge.encoded.decode import plan_decode
     from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
     from gsmerge.online.decode import check_fit, decodable, decode_stored, default_fit, num_photos
@@ -68,6 +70,8 @@ def decode(args: opt.Args) -> None:
             )
         if len(decoded.gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "encode the scene again")
+        if not all(np.isfinite(getattr(decoded.gaussians, name)).all() for name in ("means", "scales", "quats")):
+            raise SceneError(path, "expected Gaussians of finite numbers, found others", "encode the scene again")
         done, ending = perf_counter(), output_format(out)
         write_gaussians(temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending)
     seconds = {"import": imported - start, "read": read - imported, "decode": done - read}

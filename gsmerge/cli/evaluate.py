@@ -10,7 +10,7 @@ import typer
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks, require_views
-from gsmerge.cli.paths import check_outputs, input_files, write_text
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
@@ -80,9 +80,8 @@ def evaluate(args: opt.Args) -> None:
         evaluation = evaluate_scene(scene, gaussians, held_out, options, progress=progress)
     facts = {"input": _file(load.ply), **{name: _file(ply.info) for name, ply in plys.items()}}
     document = evaluation_document(evaluation, facts, notes)
-    for path, text in ((args.report, to_json(document)), (args.csv, evaluation_csv(document))):
-        if path is not None:
-            write_text(path, text, overwrite=args.overwrite)
+    texts = {args.report: to_json(document), args.csv: evaluation_csv(document)}
+    write_texts({path: text for path, text in texts.items() if path is not None}, overwrite=args.overwrite)
     print_document(document, evaluation_lines(document), as_json=args.json, quiet=args.quiet)
     say_notes(evaluation.notes, quiet=args.silent)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +51,13 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    try:
+        os.lstat(output)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:  # the latter: a zero byte
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(output, f"cannot be written ({reason})", "choose another name") from error
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
@@ -80,12 +87,13 @@ def checkpoint_files(checkpoint: str | None) -> tuple[Path, ...]:
     return () if checkpoint is None or checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 
-def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """Write a text file, atomically."""
-    from gsmerge.io import atomic_output
+def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
+    """Write text files, all of them or none."""
+    from gsmerge.io import atomic_outputs
 
-    with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="replace")
+    with atomic_outputs(overwrite=overwrite) as add:
+        for path, text in texts.items():
+            add(path).write_text(text, encoding="utf-8", errors="replace")
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:

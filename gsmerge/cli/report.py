@@ -11,7 +11,7 @@ import typer
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes
 from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks
-from gsmerge.cli.paths import check_outputs, input_files, write_text
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
@@ -138,4 +138,4 @@ def _write(
         text = comparison_html(document, png_bytes(sheet))
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)
-    write_text(path, text, overwrite=overwrite)
+    write_texts({path: text}, overwrite=overwrite)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
 from gsmerge.cli.held_out import held_out_views, require_views
-from gsmerge.cli.paths import check_outputs, input_files, write_text
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import TargetError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def stress(args: opt.Args) -> None:
         "notes": notes,
     }
     if args.report is not None:
-        write_text(args.report, to_json(document), overwrite=args.overwrite)
+        write_texts({args.report: to_json(document)}, overwrite=args.overwrite)
     print_document(document, _lines(outcomes), as_json=args.json, quiet=args.quiet)
     failed = [outcome.case for outcome in outcomes if outcome.passed is False]
     if failed:

@@ -13,7 +13,7 @@ from gsmerge.errors import UsageError
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.render.photos import blank_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.decode import MAX_CHILDREN
+from gsmerge.stages.decode import MAX_CHILDREN, deal_visible
 from gsmerge.stages.fit import visible_mask
 from gsmerge.types import Gaussians
 
@@ -24,6 +24,7 @@ class DecodePlan:
 
     counts: np.ndarray  # [g] most Gaussians of each group
     min_contribution: float  # See StoredSettings; 0: contributions are not measured
+    total: int | None = None  # Gaussians to be met; None: as many as can be seen
     notes: tuple[str, ...] = ()  # What differs from what was asked for, one sentence each
 
 
@@ -48,7 +49,8 @@ def plan_decode(encoded: Encoded, *, k: int | None = None, budget: int | str | N
         more = "" if s.max_k == MAX_CHILDREN else ", as encoded (more with a larger max k)"
         raise UsageError(f"k: expected 1 to {s.max_k}{more}, got {number!r}")
     if s.num_slots is not None:
-        return replace(_distribute(encoded, s.num_slots * number), min_contribution=s.min_contribution)
+        plan = _distribute(encoded, s.num_slots * number)
+        return replace(plan, min_contribution=s.min_contribution, total=None)
     return DecodePlan(np.full(len(encoded), number), s.min_contribution)
 
 
@@ -73,10 +75,10 @@ def _distribute(encoded: Encoded, total: int) -> DecodePlan:
     order, extra = encoded.division.growth_order, max(0, total - len(encoded))
     counts = 1 + np.bincount(order[:extra], minlength=len(encoded))
     if extra <= len(order):
-        return DecodePlan(counts, 0.0)
+        return DecodePlan(counts, 0.0, total)
     limit, count = len(encoded) + len(order) + encoded.num_kept, total + encoded.num_kept
     note = f"{count} Gaussians were asked for, and the groups divide into {limit} at most"
-    return DecodePlan(counts, 0.0, (note,))
+    return DecodePlan(counts, 0.0, total, (note,))
 
 
 def decode_scene(
@@ -96,8 +98,12 @@ def decode_scene(
     """
     plan, s = plan_decode(encoded, k=k, budget=budget), encoded.settings
     with use_threads(threads):
-        gaussians, _ = children_of(encoded, plan.counts)
-        gaussians = gaussians[gaussians.opacities >= s.min_opacity]
+        if plan.total is None:
+            gaussians, _ = children_of(encoded, plan.counts)
+            gaussians = gaussians[gaussians.opacities >= s.min_opacity]
+        else:
+            order, g = encoded.division.growth_order, len(encoded)
+            gaussians = deal_visible(order, g, plan.total, s.min_opacity, lambda n: children_of(encoded, n)[0])
         if plan.min_contribution > 0:
             gaussians = gaussians[visible_mask(gaussians, blank_photos(encoded.cameras, 2), plan.min_contribution)]
         if encoded.kept is not None:

@@ -24,7 +24,9 @@ from gsmerge import __version__
 from gsmerge.encoded.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import check_file, check_pixels
+from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
+from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.stages.decode import MAX_CHILDREN
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, as_tensor
@@ -34,7 +36,22 @@ SUFFIX = ".gsm"
 ENCODED, STATE = "gsmerge-encoded", "gsmerge-state"  # names of the metadata entry
 REMEDY = "copy it again, or encode the scene again"
 MAX_COUNT = 1 << 40
-MAX_SIDE = 1 << 16  # pixels per side of a view
+MAX_NUMBER = 1e37  # of any array: float32 ends at 3e38
+MAX_FACTOR = 1e6  # of what is multiplied with others
+FACTORS = ("gains", "spreads", "quats")
+NOT_NEGATIVE = (
+    "gains",
+    "spreads",
+    "weights",
+    "masses",
+    "extinctions",
+    "footprints",
+    "scales",
+    "opacities",
+    "held",
+)  # of keys
+# Pixels of a view that a file may claim: each of its bytes says something about some of them, or it is a small one.
+PIXELS_PER_BYTE, SMALL_VIEW = 100, 1 << 20
 
 SETTING_KEYS = {
     "max_k": "most",
@@ -96,7 +113,10 @@ def write_gsm(
 
 
 def _float32(values: Array) -> np.ndarray:
-    return as_array(values).astype(np.float32, copy=False)
+    """What overflowed as a reader takes it."""
+    with np.errstate(over="ignore"):
+        numbers = np.nan_to_num(as_array(values).astype(np.float32, copy=False))
+    return np.clip(numbers, -MAX_NUMBER, MAX_NUMBER, dtype=np.float32)
 
 
 def save_encoded(
@@ -154,8 +174,14 @@ class GsmFile:
         same_rank = array.dtype == dtype and array.ndim == len(shape)
         if not same_rank or any(n is not None and n != size for n, size in zip(shape, array.shape, strict=True)):
             raise self.error(f"{expected}, found {array.dtype} {list(array.shape)}")
-        if not np.isfinite(array).all():
-            raise self.error(f"{key}: expected finite numbers, found others")
+        if array.dtype.kind == "f":
+            column = key.rpartition(".")[2]
+            most = MAX_FACTOR if column in FACTORS else MAX_NUMBER
+            least = 0.0 if column in NOT_NEGATIVE else -most
+            low, high = array.min(initial=0), array.max(initial=0)
+            if not (least <= low and high <= most):  # NaN, too
+                found = high if least <= low else low
+                raise self.error(f"{key}: expected finite numbers from {least:g} to {most:g}, found {found:g}")
         return array
 
     def features(self) -> FeatureGaussians:
@@ -183,14 +209,29 @@ class GsmFile:
         kept = self.gaussians("kept", None, num_higher)
         unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
         origin = self.array("frame.origin", np.float64, 3)
-        if not 0 < unit < float("inf"):
-            raise self.error(f"unit: expected a length above 0, found {unit}")
+        if not 0 < unit < MAX_LENGTH:
+            raise self.error(f"unit: expected a length above 0 and below {MAX_LENGTH:g}, found {unit}")
+        if np.abs(origin).max() > MAX_LENGTH:
+            raise self.error(f"frame.origin: expected numbers up to {MAX_LENGTH:g}, found others")
         viewmats = self.array("cameras.viewmats", np.float64, None, 4, 4)
         Ks = self.array("cameras.Ks", np.float64, len(viewmats), 3, 3)
-        if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-            raise self.error(f"expected the size of the views, found {width} x {height}")
-        cameras = Cameras(viewmats, Ks, width, height)
+        cameras = self._cameras(viewmats, Ks, width, height)
         return {"kept": kept if len(kept) else None, "frame": Frame(origin, unit), "cameras": cameras}
+
+    def _cameras(self, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> Cameras:
+        """Views that cameras can have taken, of a size that the file has the bytes for."""
+        check_pixels(self.path, width, height)
+        most = SMALL_VIEW + PIXELS_PER_BYTE * sum(
+            a.nbytes for key, a in self.arrays.items() if not key.startswith("networks.")
+        )
+        if width * height > most:
+            raise self.error(
+                f"expected views of at most {most:,} pixels in a file of this size, found {width} x {height}"
+            )
+        for i, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+            check_camera(self.path, f"{i}", viewmat, K)
+            check_size(self.path, f"{i}", K, (width, height))
+        return Cameras(viewmats, Ks, width, height)
 
     def settings(self) -> StoredSettings:
         """The settings that are known here, each within its range."""

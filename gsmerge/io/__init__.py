@@ -4,6 +4,7 @@ from gsmerge.io.alignment.recover import Recovery as Recovery
 from gsmerge.io.alignment.score import Alignment as Alignment
 from gsmerge.io.alignment.score import check_alignment as check_alignment
 from gsmerge.io.atomic import atomic_output as atomic_output
+from gsmerge.io.atomic import atomic_outputs as atomic_outputs
 from gsmerge.io.bounds import read_json as read_json
 from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
 from gsmerge.io.cameras.camera_file import to_cameras as to_cameras

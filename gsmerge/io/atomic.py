@@ -1,4 +1,8 @@
-"""Files that are either complete or not there."""
+"""Files that are either complete or not there, one or several together.
+
+Each is written under another name beside its place, and renamed when all is done and on the disk. The name holds the
+process that writes it and where that runs, so that the next process removes what a killed one left.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,24 @@ import errno
 import os
 import re
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+import shutil
+import socket
+import stat
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from gsmerge.errors import SceneError
 
 # What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
-_DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS}
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+_MAX_STEM, _MAX_SUFFIX = 100, 32  # bytes of a name that its temporary one keeps: names end at 255
+_TEMPORARY = re.compile(r"\..*-[0-9a-f]{8}-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
+
+_written: set[str] = set()  # the temporary files of this process
+_clean: set[str] = set()  # folders in which it has looked for those of dead ones
 
 
 @contextmanager
@@ -21,41 +35,132 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     """A temporary file next to ``path``, renamed to it when the block succeeds and removed when it fails.
 
     Args:
-        path: The file to be written. Its folder must exist.
+        path: The file to be written. Its folder must exist. A link stays one: the file that it leads to is replaced.
         overwrite: Replace an existing file; without it one is refused, before the block is entered.
 
     Yields:
-        An empty file in the same folder with the same suffix, to be written by the block.
+        An empty file in the same folder with the same suffix, to be written by the block. For a file that such a block
+        yielded, the file itself.
 
     Raises:
         SceneError: If the file exists and may not be replaced, or the folder cannot be written.
     """
-    path = Path(path)
-    _refuse(path, overwrite)
-    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
+    with atomic_outputs(overwrite=overwrite) as add:
+        yield add(Path(path))
+
+
+@contextmanager
+def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path]]:
+    """A block that writes several files, all of them or none: the function makes each, as :func:`atomic_output`."""
+    made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
+
+    def add(path: Path) -> Path:
+        if str(path) in _written:
+            return path
+        _refuse(path, overwrite)
+        target = Path(os.path.realpath(path)) if path.is_symlink() else path
+        remove_stale(target.parent)
+        temporary = temporary_path(target)
+        made[str(temporary)] = path, target
+        _written.add(str(temporary))
+        try:
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        except OSError as error:
+            raise SceneError(path, f"cannot be written ({error.strerror})", "choose another folder") from error
+        return temporary
+
     try:
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-    except OSError as error:
-        raise SceneError(path, f"cannot be written ({error.strerror})", "choose another folder") from error
-    try:
-        yield temporary
-        _refuse(path, overwrite)  # somebody else may have been quicker
-        temporary.replace(path)
+        yield add
+        for path, _ in made.values():
+            _refuse(path, overwrite)  # somebody else may have been quicker
+        for temporary in made:
+            _flush(temporary)
+        for temporary, (_, target) in made.items():
+            os.replace(temporary, target)
+        for folder in {target.parent for _, target in made.values()}:
+            with suppress(OSError):  # not every system can
+                _flush(folder)
     except SceneError as error:
-        if error.path != str(temporary):
+        if error.path not in made:
             raise
-        raise SceneError(path, error.problem, error.remedy) from error  # the temporary name means nothing to the caller
+        path = made[error.path][0]  # the temporary name means nothing to the caller
+        raise SceneError(path, error.problem, error.remedy) from error
     except OSError as error:
-        if error.errno not in _DISK_ERRORS and error.filename != str(temporary):
+        if not made or (error.errno not in _DISK_ERRORS and error.filename not in made):
             raise
+        path = made.get(str(error.filename), next(iter(made.values())))[0]
         raise SceneError(path, f"could not be written ({error.strerror})") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        for temporary in made:
+            with suppress(OSError):
+                os.unlink(temporary)
+            _written.discard(temporary)
+
+
+def _flush(path: str | Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # file systems that know no such thing
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def temporary_path(path: Path) -> Path:
+    """A name for what will be ``path``, which says who writes it."""
+    return path.with_name(f"{_start(path)}-{_place()}-{os.getpid()}-{secrets.token_hex(4)}{_suffix(path)}")
+
+
+def _start(path: Path) -> str:
+    """What the names of an output's temporary files start with, and no other output's."""
+    name = os.fsencode(path.name)
+    return f".{os.fsencode(path.stem)[:_MAX_STEM].decode('utf-8', 'ignore')}-{zlib.crc32(name):08x}"
+
+
+def _suffix(path: Path) -> str:
+    return path.suffix if len(os.fsencode(path.suffix)) <= _MAX_SUFFIX else ""
+
+
+@cache
+def _place() -> str:
+    """Where process numbers mean the same: the machine, and the container."""
+    names = socket.gethostname()
+    with suppress(OSError):
+        names += os.readlink("/proc/self/ns/pid")
+    return f"{zlib.crc32(names.encode()):08x}"
+
+
+def remove_stale(folder: Path) -> None:
+    """Remove the temporary files that processes of this machine left in a folder and that run no more; once."""
+    if os.path.realpath(folder) in _clean or os.name == "nt":
+        return
+    _clean.add(os.path.realpath(folder))
+    with suppress(OSError), os.scandir(folder) as entries:  # another may be cleaning as well, or may not
+        for entry in list(entries):
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match is not None and match["place"] == _place() and not _runs(int(match["pid"])):
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    os.unlink(entry.path)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's
+        return True
+    return True
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove the temporary files that killed processes left of this output; nobody may be writing it."""
-    name = re.compile(rf"\.+{re.escape(path.stem)}(-[0-9a-f]{{8}})+{re.escape(path.suffix)}")  # also one's own one
+    """Remove all temporary files of this output, on whatever machine it was written; nobody may be writing it."""
+    name = re.compile(rf"{re.escape(_start(path))}-[0-9a-f]{{8}}-\d+-[0-9a-f]{{8}}{re.escape(_suffix(path))}")
     try:
         with os.scandir(path.parent) as entries:
             leftovers = [entry.path for entry in entries if name.fullmatch(entry.name)]
@@ -66,8 +171,18 @@ def remove_leftovers(path: Path) -> None:
 
 
 def _refuse(path: Path, overwrite: bool) -> None:
-    if os.path.isdir(path):
+    """Refuse an output that cannot be written or may not be replaced, as a SceneError."""
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        status = None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(path, f"cannot be written ({reason})", "choose another name") from error
+    if status is not None and stat.S_ISDIR(status.st_mode):
         raise SceneError(path, "expected a file to write, found a folder", "name a file in it")
+    if status is not None and not stat.S_ISREG(status.st_mode):
+        raise SceneError(path, "expected a file to write, found a pipe or a device", "name a file")
     if not os.path.isdir(path.parent):
         raise SceneError(path, f"the folder {path.parent} does not exist", "make it first")
     if os.path.lexists(path) and not overwrite:

@@ -14,6 +14,7 @@ from gsmerge.errors import SceneError
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any has
 MAX_MODEL_BYTES = 256 << 20  # of a COLMAP text file, which lists the points of every image as well
 MAX_VIEWS = 10_000
+MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
 
 
@@ -32,6 +33,19 @@ def check_file(path: Path) -> int:
     if not stat.S_ISREG(status.st_mode):
         raise SceneError(path, "expected a file, found a pipe or a device", "write its content to a file first")
     return status.st_size
+
+
+def walk_files(folder: Path) -> list[Path]:
+    """All files below a folder, links to other folders left out. SceneError if there are too many: a link to the root
+    of the disk would be read for minutes.
+    """
+    files: list[Path] = []
+    for num_folders, (base, _, names) in enumerate(os.walk(folder), 1):
+        files += [Path(base) / name for name in names]
+        if len(files) + num_folders > MAX_FILES:
+            problem = f"expected a folder of photos, found one with more than {MAX_FILES:,} files and folders"
+            raise SceneError(folder, problem, "name the folder that holds the photos alone with --images")
+    return files
 
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import CameraFile, SceneFiles, read_cameras
+from gsmerge.io.bounds import walk_files
 from gsmerge.io.cameras.json_files import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
 from gsmerge.io.cameras.trajectory import INTRINSICS
@@ -28,7 +29,7 @@ def content_hash(files: Sequence[Path]) -> str:
     """SHA-256 over the names and contents of files; of folders, over everything in them."""
     state = hashlib.sha256()
     for given in files:
-        inside = sorted(p for p in given.rglob("*") if p.is_file()) if given.is_dir() else [given]
+        inside = sorted(p for p in walk_files(given) if p.is_file()) if given.is_dir() else [given]
         for path in inside:
             name = path.relative_to(given).as_posix() if given.is_dir() else path.name
             try:

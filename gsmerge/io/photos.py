@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels
+from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, walk_files
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
 
@@ -129,9 +129,8 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str) -> Path | N
 
 
 def list_images(folder: Path) -> list[Path]:
-    """All images below a folder, numbers in their names counted as numbers."""
-    files = [Path(base) / f for base, _, inside in os.walk(folder) for f in inside]
-    images = [f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
+    """All images below a folder, numbers in their names counted as numbers. Raises as :func:`walk_files`."""
+    images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
 
 

@@ -153,7 +153,10 @@ def count_remedy(count: int, cameras: Cameras) -> str:
 
 
 def misalignment_error(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
-    """That the rows would be enough, but do not lie on the rays of their pixels."""
+    """That the rows would be enough, but do not lie on the rays of their pixels, or as well on those of others."""
+    if alignment.ok:
+        problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
+        return SceneError(camera_file.path, problem, "name the order of the rows with --order")
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
         f"found a median of up to {alignment.worst_px:.1f} px and "

@@ -107,15 +107,20 @@ def _quality_table(quality: Mapping[str, Any]) -> tuple[str, Row, list[Row]]:
 
 def comparison_markdown(document: Mapping[str, Any]) -> str:
     """The comparison for people, in Markdown."""
-    lines = [f"# {document['before']['path']}: before and after", ""]
+    lines = [f"# {_plain(document['before']['path'])}: before and after", ""]
     for title, head, rows in _tables(document):
         lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
-    lines += [f"- {note}" for note in document["notes"]]
+    lines += [f"- {_plain(note)}" for note in document["notes"]]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _line(cells: Row) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+    return "| " + " | ".join(_plain(cell).replace("|", "\\|") for cell in cells) + " |"
+
+
+def _plain(text: str) -> str:
+    """Text that is one line and no HTML in Markdown."""
+    return " ".join(html.escape(text, quote=False).split())
 
 
 def comparison_html(document: Mapping[str, Any], picture: bytes | None = None) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsmerge.measure.align import PoseChange
 from gsmerge.measure.evaluate import AlignedScore, Evaluation, Quality, ResultScores, ZoomScore
-from gsmerge.report import document_head, human_bytes
+from gsmerge.report import csv_cell, document_head, human_bytes
 
 ZOOMED = {"psnr": 2, "ssim": 3}  # what is measured at other sizes, with the decimals that people are shown
 METRICS = tuple(field.name for field in fields(Quality))
@@ -106,7 +106,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
     out = io.StringIO()
     writer = csv.DictWriter(out, list(columns), lineterminator="\n")
     writer.writeheader()
-    writer.writerows({key: "" if value is None else value for key, value in row.items()} for row in rows)
+    writer.writerows({key: csv_cell(value) for key, value in row.items()} for row in rows)
     return out.getvalue()
 
 

@@ -65,7 +65,7 @@ def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] 
 def _parsed(line: bytes) -> dict[str, Any] | None:
     try:
         value = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return value if isinstance(value, dict) else None
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
 K_RULES = ("saliency", "distortion")
 GROUPS_PER_TASK = 8192
+REFILLS = 3  # times that Gaussians too faint to be seen are replaced by others, of which a few are faint again
 PLANE_WEIGHT = 1 / 16  # of squared distances from a group's plane; the unit is that of the children's features
 
 
@@ -119,6 +121,8 @@ def decode_merged(merged: MergedViews, options: DecodeOptions, rule: Rule, *, gr
         grows: Whether the fit that follows adds Gaussians up to an exact count.
     """
     asked = merged.segmentation
+    if asked.exact and not grows:
+        return _decode_exactly(merged, asked.count, options, rule)
     gaussians = _decode_count(merged, merged_count(merged, options, grows=grows), options, rule)
     if asked.exact and len(gaussians) > asked.count:  # K each would be more than the fit may grow to
         gaussians = _decode_count(merged, asked.count, options, rule)
@@ -138,6 +142,45 @@ def _decode_count(merged: MergedViews, count: int | None, options: DecodeOptions
         assert merged.saliency is not None
         children = mixed_counts(features, members, merged.saliency, options)
     return decode(features, members, options, children, rule, networks)
+
+
+def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions, rule: Rule) -> Gaussians:
+    """``count`` visible Gaussians, spent where they lower distortion most."""
+    features, members, networks = merged.features, merged.members, merged.networks
+    most = MAX_CHILDREN if networks is None else networks.networks.max_children
+    every = replace(options, min_opacity=0.0)
+    return deal_visible(
+        deal_order(features, members, most),
+        len(features),
+        count,
+        options.min_opacity,
+        lambda counts: decode(features, members, every, counts, rule, networks),
+    )
+
+
+def deal_visible(
+    order: np.ndarray, num_groups: int, total: int, min_opacity: float, make: Callable[[np.ndarray], Gaussians]
+) -> Gaussians:
+    """``total`` Gaussians: those that are too faint to be seen make way for further ones.
+
+    Args:
+        order: ``[d]`` the group that each further Gaussian goes to, see :func:`deal_order`.
+        num_groups: Groups, each of which gets at least one.
+        total: Gaussians in all; fewer where the groups do not divide into as many.
+        min_opacity: What can be seen.
+        make: The Gaussians for the number of each group ``[g]``, however faint.
+    """
+    extra = max(0, total - num_groups)
+    for _ in range(REFILLS + 1):
+        gaussians = make(1 + np.bincount(order[:extra], minlength=num_groups))
+        missing = total - int((gaussians.opacities >= min_opacity).sum())
+        if missing <= 0 or extra >= len(order):
+            break
+        extra += missing
+    if len(gaussians) <= total:
+        return gaussians
+    most_opaque = np.argsort(-gaussians.opacities, kind="stable")[:total]  # the last few may be faint
+    return gaussians[np.sort(most_opaque)]
 
 
 def mixed_counts(

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from gsmerge.errors import OUT_OF_MEMORY
 
 from .conftest import Run, listing
 
@@ -24,7 +33,9 @@ class Broken:
     [
         (KeyError("lost"), 1, "gsmerge: error: unexpected error: KeyError: 'lost'; run again with --debug\n"),
         (ValueError("two\nlines"), 1, "gsmerge: error: unexpected error: ValueError: two; run again with --debug\n"),
-        (MemoryError(), 1, "gsmerge: error: out of memory; use a smaller scene or fewer --threads\n"),
+        (MemoryError(), 3, f"gsmerge: error: {OUT_OF_MEMORY}\n"),
+        (ImportError("a.so: failed to map segment from shared object"), 3, f"gsmerge: error: {OUT_OF_MEMORY}\n"),
+        (PermissionError(13, "Denied", "a/b"), 3, "gsmerge: error: a/b: cannot be read or written (Denied)\n"),
         (KeyboardInterrupt(), 130, "gsmerge: error: interrupted\n"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
@@ -83,3 +94,122 @@ def test_a_gpu_that_is_not_there_is_wrong_usage(scene_copy: Path, run: Run, monk
     plan = run("compact", scene_copy, "--device", "auto", "--dry-run", "--json")
     assert plan.code == 0
     assert '"device": "cpu"' in plan.out
+
+
+@pytest.mark.parametrize("more", [("--report", "none/report.json"), ("--levels", 2), ("--report", "report.json")])
+def test_several_outputs_are_all_there_or_none(
+    more: tuple[object, ...], scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A report that cannot be written, a disk that is full at the second level, or at the end."""
+    from gsmerge.io import write_gaussians
+
+    def full(path: Path, *arguments: Any, **named: Any) -> None:
+        if "level1" in str(path):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_gaussians(path, *arguments, **named)
+
+    def no_room(*_: object) -> str:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("gsmerge.compact_file.write_gaussians", full)
+    monkeypatch.setattr("gsmerge.compact_file.to_json", no_room)
+    before = listing(scene_copy)
+    where = [scene_copy / word if isinstance(word, str) and word.endswith("json") else word for word in more]
+    quick = ("--superpixels", 40, "--no-robust", "--fit", "none")
+    outcome = run("compact", scene_copy, "-o", scene_copy / "out.ply", *quick, *where, "--quiet")
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1), outcome.err
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root: Path) -> None:
+    """Whenever it comes: no file is left, and one line says why."""
+    before = listing(scene_copy)
+    command = [sys.executable, "-m", "gsmerge", "compact", str(scene_copy), "-o", str(scene_copy / "out.ply"), "-q"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=root) as process:
+        while process.poll() is None and listing(scene_copy) == before:
+            time.sleep(0.002)
+        process.send_signal(signal.Signals[name])
+        _, err = process.communicate()
+    assert process.returncode == code
+    assert err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert listing(scene_copy) == before
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
+def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As under nohup."""
+    seen = []
+    monkeypatch.setattr("gsmerge.compact_file.compact", lambda *_, **__: seen.append(signal.getsignal(signal.SIGHUP)))
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        run("compact", scene_copy, "--quiet")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    run("compact", scene_copy, "--quiet")
+    assert seen[0] == signal.SIG_IGN
+    assert callable(seen[1])
+    assert signal.getsignal(signal.SIGHUP) == before
+
+
+def in_shell(command: str, cwd: Path, root: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """``gsmerge`` (as $G) in a shell."""
+    values = {**os.environ, "PYTHONPATH": str(root), "G": f"{sys.executable} -m gsmerge", **environment}
+    return subprocess.run(["sh", "-c", command], capture_output=True, text=True, cwd=cwd, env=values, check=False)
+
+
+QUICK = "--superpixels 40 --no-robust --fit none --checkpoint none"
+ODD_PLACES = {
+    "output is full": (
+        f"$G compact . -o a.ply {QUICK} --json -q >/dev/full",
+        3,
+        "what was printed could not be written",
+    ),
+    "help is full": ("$G --help >/dev/full", 3, "what was printed could not be written"),
+    "errors are full": ("$G compact none 2>/dev/full", 3, ""),
+    "notes are full": (f"$G compact . -o a.ply {QUICK} 2>/dev/full", 0, ""),
+    "output is closed": (f"$G compact . -o a.ply {QUICK} --json >&-", 0, ""),
+    "errors are closed": ("$G compact none 2>&-", 3, ""),
+    "output ends early": ("$G inspect . | head -c 10 >head && cat head", 0, ""),
+    "a name of 300 letters": ("$G compact . -o $(printf 'a%.0s' $(seq 300)).ply", 3, "File name too long"),
+    "a name of 251 letters": (f"$G compact . -q {QUICK} -o $(printf 'a%.0s' $(seq 247)).ply", 0, ""),
+    "no working directory": ("mkdir gone && cd gone && rmdir ../gone && $G compact ..", 3, "working directory"),
+    "little memory": (f"ulimit -v 400000; $G compact . -o a.ply {QUICK}", 3, "out of memory"),
+}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="devices and limits as Linux has them")
+@pytest.mark.parametrize("case", ODD_PLACES)
+def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Path) -> None:
+    command, code, line = ODD_PLACES[case]
+    done = in_shell(command, scene_copy, root)
+    assert done.returncode == code, done.stderr
+    assert line in done.stderr
+    if line:
+        assert done.stderr.startswith("gsmerge: error: ")
+        assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "value", ["NUMBA_NUM_THREADS=abc", "NUMBA_NUM_THREADS=0", "NUMBA_DISABLE_JIT=1", "NUMBA_OPT=x"]
+)
+def test_variables_that_numba_cannot_use_are_wrong_usage(value: str, scene_copy: Path, root: Path) -> None:
+    name, _, content = value.partition("=")
+    done = in_shell(f"$G compact . -o a.ply {QUICK}", scene_copy, root, **{name: content})
+    assert done.returncode == 2
+    assert name in done.stderr
+    assert done.stderr.startswith("gsmerge: error: ")
+    assert done.stderr.endswith("; unset it\n")
+    assert done.stderr.count("\n") == 1
+
+
+def test_names_that_the_terminal_cannot_show(scene_copy: Path, root: Path) -> None:
+    done = in_shell(
+        f"$G compact . -o '\N{SNOWMAN}.ply' {QUICK}; $G inspect '\N{SNOWMAN}.ply'",
+        scene_copy,
+        root,
+        PYTHONIOENCODING="ascii",
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("\\u2603.ply") == 2

@@ -70,6 +70,7 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return None
+    inputs = _without_same_labellings(inputs)
     plain = _plain(inputs)
     if plain is not None:
         return plain
@@ -91,6 +92,14 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
         return _by_colors(inputs, [first, *close])
     runner_up = min(others, key=lambda e: e.worst_px, default=None)
     return _accepted(inputs, best, runner_up)
+
+
+def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
+    """Orders of the views that only exchange views of one pose are one: nothing could tell them apart."""
+    cameras, (first, *others) = inputs.cameras, inputs.labellings
+    both = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
+    same = [np.array_equal(both[list(first)], both[list(other)]) for other in others]
+    return replace(inputs, labellings=[first, *(first if s else o for s, o in zip(same, others, strict=True))])
 
 
 def _accepted(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentScore | None) -> Recovery | None:

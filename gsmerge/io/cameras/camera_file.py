@@ -13,7 +13,9 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.types import Cameras
 
-_MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
+MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6  # beyond them no camera is, and numbers would overflow later
+_MAX_COEFFICIENT = 1e6  # of a lens; what a smaller one does to the photos is checked with them
+_MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # of the image's longer side: focal length, principal point
 _MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
@@ -28,14 +30,19 @@ C2W_OPENGL: Convention = ("camera-to-world", "OpenGL")
 CONVENTIONS = (W2C_OPENCV, C2W_OPENCV, W2C_OPENGL, C2W_OPENGL)
 
 
+COEFFICIENTS = {  # their names, in order
+    "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+
+
 @dataclass(frozen=True)
 class Lens:
     """A lens that is no pinhole."""
 
     name: str  # as the camera file calls the model
     model: Literal["perspective", "fisheye"]  # radial and tangential, as ``cv2.undistort``; as ``cv2.fisheye``
-    # the first of k1, k2, p1, p2, k3, k4, k5, k6, or of a fisheye's k1, k2, k3, k4; others are 0
-    coefficients: tuple[float, ...]
+    coefficients: tuple[float, ...]  # the first of COEFFICIENTS; others are 0
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
@@ -86,8 +93,8 @@ def make_camera_file(
     images: np.ndarray | None = None,
 ) -> CameraFile:
     """Translate poses to the one convention and check that they are poses; ``images [c,h,w,3]`` if the file holds them.
-    SceneError if there is no camera, a number is not finite, a rotation is not orthonormal, or a focal length is not
-    positive.
+    SceneError if there is no camera, a number is not finite or one that no camera has, a rotation is not orthonormal,
+    or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -99,11 +106,14 @@ def make_camera_file(
         if pose.shape not in ((3, 4), (4, 4)):
             raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
         poses[i, :3] = pose[:3]
-        _check(path, view.name, poses[i], Ks[i])
+        check_camera(path, view.name, poses[i], Ks[i])
+        _check_lens(path, view.name, view.lens)
     for w, h in (view.size for view in views):
         if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
             raise SceneError(path, f"expected a positive image size, found {w:.6g} x {h:.6g}")
     Ks, sizes = _in_pixels(Ks, [view.size for view in views])
+    for view, K, size in zip(views, Ks, sizes, strict=True):
+        check_size(path, view.name, K, size)
     lenses = tuple(view.lens for view in views)
     return CameraFile(
         path=str(path),
@@ -129,12 +139,13 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
     return Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None], sizes
 
 
-def _check(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndarray) -> None:
+def check_camera(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndarray) -> None:
+    """Refuse a pose ``[4,4]`` or intrinsics ``[3,3]`` that no camera has, as a SceneError."""
     if not (np.isfinite(pose).all() and np.isfinite(K).all()):
         raise SceneError(path, f"view {name}: expected finite numbers, found NaN or inf")
     largest = max(np.abs(pose).max(), np.abs(K).max())
-    if largest > _MAX_NUMBER:
-        raise SceneError(path, f"view {name}: expected numbers up to {_MAX_NUMBER:g}, found {largest:g}")
+    if largest > MAX_NUMBER:
+        raise SceneError(path, f"view {name}: expected numbers up to {MAX_NUMBER:g}, found {largest:g}")
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _MAX_ROTATION_ERROR:
         raise SceneError(path, f"view {name}: expected a rotation matrix, found one whose axes are not orthonormal")
@@ -145,6 +156,29 @@ def _check(path: str | os.PathLike[str], name: str, pose: np.ndarray, K: np.ndar
         raise SceneError(path, f"view {name}: expected positive focal lengths, found {K[0, 0]:g} and {K[1, 1]:g}")
     if np.abs(K[2] - (0, 0, 1)).max() > 1e-3 or abs(K[1, 0]) > 1e-3 * K[0, 0]:
         raise SceneError(path, f"view {name}: expected intrinsics whose last row is 0 0 1, found others")
+
+
+def _check_lens(path: str | os.PathLike[str], name: str, lens: Lens | None) -> None:
+    if lens is None:
+        return
+    keys = COEFFICIENTS[lens.model]
+    for key, value in zip(keys, lens.coefficients, strict=False):
+        if not abs(value) <= _MAX_COEFFICIENT:  # NaN, too
+            problem = f"view {name}: expected a lens coefficient {key} within +-{_MAX_COEFFICIENT:g}, found {value:g}"
+            raise SceneError(path, f"{problem} ({lens.name})", "correct it, or undistort the images first")
+
+
+def check_size(path: str | os.PathLike[str], name: str, K: np.ndarray, size: tuple[int, int]) -> None:
+    """Refuse intrinsics ``[3,3]`` in pixels that do not fit an image of (width, height), as a SceneError."""
+    side = max(size)
+    if min(size) <= 1:  # not known
+        return
+    focal, centre = max(K[0, 0], K[1, 1]), np.abs(K[:2, 2]).max()
+    what = "a focal length" if focal > _MAX_FOCAL_SIDES * side else "a principal point"
+    if focal > _MAX_FOCAL_SIDES * side or centre > _MAX_CENTRE_SIDES * side:
+        found = focal if what == "a focal length" else centre
+        problem = f"view {name}: expected {what} that fits an image of {size[0]} x {size[1]}, found {found:g} pixels"
+        raise SceneError(path, problem, "give fx, fy, cx, cy in pixels of that size")
 
 
 def to_viewmats(poses: np.ndarray, convention: Convention) -> np.ndarray:

@@ -9,14 +9,20 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, Lens, sizes_of, to_cameras
-from gsmerge.io.photos import Photos, photo_size, same_shape
+from gsmerge.io.cameras.camera_file import COEFFICIENTS, CameraFile, Lens, sizes_of, to_cameras
+from gsmerge.io.photos import Photos, Size, photo_size, same_shape
 from gsmerge.runtime.threads import parallel_map
+
+_MIN_SHARE = (
+    0.25  # of an undistorted photo's pixels that lie within the photo: at half of the image's diagonal r, a lens
+)
+# with k1 = 1 / r^2, stronger than any, still has a third
+_GRID = 32  # pixels a side on which that is measured
 
 
 def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
     """Photos without lens distortion and cameras that are pinholes, with the same intrinsics; and a note about it.
-    SceneError if a lens is no pinhole and there are no photos of the camera's shape.
+    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next to nothing of one.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -30,7 +36,16 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
         if not same_shape((w, h), size):
             problem = f"expected images of the cameras' {w} x {h} to undistort ({name}), found {size[0]} x {size[1]}"
             raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
-    straight = undistort_photos(photos, to_cameras(pinholes, size).Ks, camera_file.lenses)
+    Ks = to_cameras(pinholes, size).Ks
+    for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
+        share = 1.0 if lens is None else _share_inside(K, lens, size)
+        if lens is not None and share < _MIN_SHARE:
+            values = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
+            found = ", ".join(f"{key} = {value:g}" for key, value in values if value)
+            problem = f"view {view}: expected {lens.name} coefficients of a lens, found {found}, with which"
+            problem += f" {100 * (1 - share):.0f} % of the undistorted photo would lie outside of the photo"
+            raise SceneError(camera_file.path, problem, "correct them, or undistort the images first")
+    straight = undistort_photos(photos, Ks, camera_file.lenses)
     return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
 
 
@@ -45,12 +60,24 @@ def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | Non
         photo, K, lens = item
         if lens is None:
             return photo
-        centred = K.astype(np.float64).copy()
-        centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
-        size, length = (photo.shape[1], photo.shape[0]), 4 if lens.model == "fisheye" else 8
-        coefficients = np.pad(np.array(lens.coefficients, np.float64), (0, length - len(lens.coefficients)))
-        make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
-        maps = make(centred, coefficients, np.eye(3), centred, size, cv2.CV_32FC1)
+        maps = _rectify_maps(K, lens, (photo.shape[1], photo.shape[0]))
         return cv2.remap(photo, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     return parallel_map(one, list(zip(photos, Ks, lenses, strict=True)))
+
+
+def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel of a pinhole's image lies in the lens's: x and y ``[h,w]`` float32, pixels."""
+    centred = K.astype(np.float64).copy()
+    centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
+    coefficients = np.pad(lens.coefficients, (0, len(COEFFICIENTS[lens.model]) - len(lens.coefficients)))
+    make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
+    x, y = make(centred, coefficients.astype(np.float64), np.eye(3), centred, size, cv2.CV_32FC1)
+    return x, y
+
+
+def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
+    """Share of the undistorted photo's pixels that lie within the photo."""
+    small = np.diag([_GRID / size[0], _GRID / size[1], 1.0]) @ K
+    maps = _rectify_maps(small, lens, (_GRID, _GRID))
+    return float(np.all([(m >= -0.5) & (m <= _GRID - 0.5) for m in maps], 0).mean())

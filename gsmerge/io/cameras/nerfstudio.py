@@ -10,6 +10,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.similarity import Similarity
 from gsmerge.io.bounds import read_json
+from gsmerge.io.cameras.camera_file import MAX_NUMBER
 from gsmerge.io.scene_files import SceneFiles
 
 NAME = "dataparser_transforms.json"
@@ -48,13 +49,13 @@ def read_dataparser(path: Path, cameras: Path | None) -> list[Similarity]:
 
 def _square(values: Any) -> np.ndarray:
     matrix = np.asarray(values, np.float64)
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise ValueError(f"found shape {list(matrix.shape)}")
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
+        raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")
     return np.concatenate([matrix[:3], [[0.0, 0, 0, 1]]])
 
 
 def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
     R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0 or not 0 < scale < np.inf:
+    if np.abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0 or not 0 < scale < MAX_NUMBER:
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
     return Similarity(R, scale, scale * matrix[:3, 3], "moved as nerfstudio does", "other")

@@ -9,7 +9,9 @@ import mmap
 import re
 import warnings
 from collections import Counter
+from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyParseError
@@ -51,10 +53,10 @@ def open_ply(path: Path) -> PlyData:
         if start[:4] not in (b"ply\n", b"ply\r"):
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")
-        _check_header(path, start, size)
-        with warnings.catch_warnings():
+        end, text = _check_header(path, start, size)
+        with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
-            return PlyData.read(str(path), mmap="r")
+            return PlyData.read(file, mmap="r")
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except PlyElementParseError as error:
@@ -63,6 +65,35 @@ def open_ply(path: Path) -> PlyData:
         raise _truncated(path, promise, row or 0, error.message) from error
     except (PlyParseError, ValueError, ArithmeticError, MemoryError) as error:
         raise SceneError(path, f"expected a readable PLY file, found a damaged one ({error})") from error
+
+
+def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
+    """A PLY file as the parser takes it; what it does not know is no harm: bytes that are no ASCII in the header, which
+    ends at ``end``, and empty lines between rows of text.
+    """
+    if text:
+        return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
+    file = _BinaryRows(FileIO(str(path)))
+    file.end = end
+    return file
+
+
+class _TextRows(TextIOWrapper):
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]  # bytes in the base of all
+        line = super().readline(size)
+        while line and not line.strip():
+            line = super().readline(size)
+        return line
+
+
+class _BinaryRows(BufferedReader):
+    end = 0  # of the header
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if data.isascii() or self.tell() > self.end:
+            return data
+        return bytes(byte if byte < 128 else ord("?") for byte in data)
 
 
 def release_block(rows: np.ndarray, block: slice) -> None:
@@ -87,9 +118,9 @@ def header_counts(path: Path) -> tuple[int, int]:
     return int(match[1]) if match else 0, len(re.findall(rb"^property \S+ f_rest_\d+\s*$", header, re.MULTILINE))
 
 
-def _check_header(path: Path, start: bytes, size: int) -> None:
+def _check_header(path: Path, start: bytes, size: int) -> tuple[int, bool]:
     """Refuse a header (``start`` has the first bytes of ``size``) that never ends, or elements that the rest of the
-    file has not bytes enough for. Everything else is left to the parser.
+    file has not bytes enough for. Everything else is left to the parser. Returns its size, and whether rows are text.
     """
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]
     last = newline + b"end_header" + newline
@@ -120,6 +151,7 @@ def _check_header(path: Path, start: bytes, size: int) -> None:
         before, left = left, left - count * each
         if left < -1:  # the last row of a text may end without a new line
             raise _truncated(path, f"element '{name}' with {count} rows", before // each, "early end-of-file")
+    return end + len(last), text
 
 
 def _truncated(path: Path, promise: str, num_whole: int, reason: str) -> SceneError:

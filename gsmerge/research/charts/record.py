@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from itertools import product
@@ -31,7 +31,7 @@ def _holds(container: type | tuple[type, ...], *kinds: type) -> Callable[[Any], 
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 CHECKS: dict[str, Callable[[Any], bool]] = {  # of values read from JSON, by the type of their field

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import write_ply
+from gsmerge.io.atomic import remove_stale, temporary_path
 from gsmerge.research.generate.noise import Float
 from gsmerge.research.generate.options import GenerateOptions
 from gsmerge.research.generate.scene import SyntheticScene, make_scene
@@ -154,7 +154,8 @@ def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> 
 @contextmanager
 def _folder(folder: Path) -> Iterator[Path]:
     """A hidden folder next to the final one, which takes its place when the block succeeds."""
-    temporary = folder.with_name(f".{folder.name}-{secrets.token_hex(4)}")
+    remove_stale(folder.parent)
+    temporary = temporary_path(folder)
     try:
         temporary.mkdir(parents=True)
         yield temporary

@@ -49,6 +49,17 @@ def _transforms() -> dict[str, Case]:
     }  # fmt: skip
     cases = {f"width {word}": Case(edit_json(name, set_key("w", v)), EITHER) for word, v in NUMBERS.items()}
     cases |= {f"focal length {word}": Case(edit_json(name, set_key("fl_x", v)), EITHER) for word, v in NUMBERS.items()}
+    for key in ("k1", "k3", "p2"):
+        lens = {word: set_lens({key: v}) for word, v in NUMBERS.items()}
+        cases |= {f"lens {key} {word}": Case(edit_json(name, change), EITHER) for word, change in lens.items()}
+        for value in (np.nan, np.inf, 1e9, -1e9):
+            cases[f"lens {key} of {value:g}"] = Case(edit_json(name, set_lens({key: value})))
+    fisheye = {"camera_model": "OPENCV_FISHEYE"}
+    cases["fisheye k2 of NaN"] = Case(edit_json(name, set_lens({**fisheye, "k2": np.nan})))
+    cases["fisheye k1 of 1e5"] = Case(edit_json(name, set_lens({**fisheye, "k1": 1e5})))
+    cases["lens of NaN in a list"] = Case(edit_json(name, set_lens({"distortion_params": [0, np.nan, 0, 0]})))
+    for key, value in (("cx", 1e9), ("cy", -1e9), ("fl_x", 1e11), ("cx", np.nan)):
+        cases[f"{key} of {value:g}"] = Case(edit_json(name, set_key(key, value)))
     cases |= {f"position {word}": Case(edit_json(name, set_pose(v)), EITHER) for word, v in NUMBERS.items()}
     cases |= {f"pose of {w}": Case(edit_json(name, set_first("transform_matrix", v))) for w, v in poses.items()}
     cases |= {f"with {word}": Case(write(name, json.dumps(data))) for word, data in contents.items()}
@@ -59,6 +70,10 @@ def _transforms() -> dict[str, Case]:
 
 def set_key(key: str, value: Any) -> Callable[[Any], None]:
     return lambda data: data.update({key: value})
+
+
+def set_lens(values: dict[str, Any]) -> Callable[[Any], None]:
+    return lambda data: data.update({"camera_model": "OPENCV", **values})
 
 
 def all_places(value: Any) -> Callable[[Any], None]:

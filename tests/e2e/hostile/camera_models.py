@@ -196,6 +196,11 @@ def _text() -> dict[str, Case]:
 
         cases[f"{name} of 8 GB of zeros"] = Case(spoil)
     lens = b"1 OPENCV 24 16 38.755 38.755 12 8 .1 0 0 0"
+    for value in ("nan", "inf", "1e9"):
+        bad = lens.replace(b" .1 ", f" {value} ".encode())
+        cases[f"cameras.txt with a lens of {value}"] = Case(model(lambda c, i, bad=bad: (bad, i), text=True))
+        packed = struct.pack("<QiiQQ8d", 1, 1, 4, WIDTH, HEIGHT, 38.755, 38.755, 12, 8, 0, float(value), 0, 0)
+        cases[f"cameras.bin with a lens of {value}"] = Case(model(lambda c, i, p=packed: (p, i), text=False))
     cases["cameras.txt with a lens"] = Case(model(lambda c, i: (lens, i), text=True), READ)
     return cases
 

@@ -17,9 +17,20 @@ from batches import rows
 from gsmerge.batch import BatchOptions, Job, locks, plan
 from gsmerge.batch.locks import LOCKS, BusyError, run_lock, scene_lock
 from gsmerge.batch.plan import estimate_seconds, make_schedule
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
-from gsmerge.batch.summary import COLUMNS, MAX_LISTED, Totals, summary_lines, write_summary
+from gsmerge.batch.records import (
+    COLUMNS,
+    DONE,
+    FAILED,
+    RECORDS,
+    SKIPPED,
+    DoneResult,
+    RecordIndex,
+    check_folder,
+    record,
+)
+from gsmerge.batch.summary import MAX_LISTED, Totals, summary_lines, write_summary
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.io.atomic import temporary_path
 from gsmerge.options import CompactOptions
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.jsonl import append_line, each_line, read_lines
@@ -77,6 +88,57 @@ def test_an_index_reads_on_and_past_what_is_damaged(tmp_path: Path) -> None:
     index.read_on()
     assert {name: known.key for name, known in index.known.items()} == {"a.ply": "newer", "c.ply": "k"}
     assert {name: known.failed_since for name, known in index.known.items()} == {"a.ply": False, "c.ply": True}
+
+
+WRONG: dict[str, Any] = {
+    "a number": 5, "null": None, "a list": [1], "an object": {"a": 1}, "a text": "x", "true": True,
+    "a list of lists": [[]], "a huge number": 10**400, "a zero byte": "a\0b", "half a letter": "\ud800",
+    "empty": {}, "inf": math.inf,
+}  # fmt: skip
+
+
+def foreign_lines() -> list[bytes]:
+    """Lines that are no records: every entry of one with every odd value, and without it."""
+    whole = done("a.ply")
+    lines = [b"[" * 100_000, b'{"a":' * 100_000, b"9" * 10_000, b"[]", b"{}", b'{"status":"done"}']
+    for key in ("status", "scene", "output", "files", "key", "report"):
+        lines += [json.dumps({**whole, key: value}).encode() for value in WRONG.values()]
+        lines.append(json.dumps({name: value for name, value in whole.items() if name != key}).encode())
+    for key in whole["report"]:
+        lines += [json.dumps({**whole, "report": {**whole["report"], key: v}}).encode() for v in WRONG.values()]
+    for key in ("path", "sha256"):
+        lines += [json.dumps({**whole, "files": [{**whole["files"][0], key: v}]}).encode() for v in WRONG.values()]
+    return lines
+
+
+def test_whatever_a_line_holds_the_records_can_be_read(tmp_path: Path) -> None:
+    path, lines = tmp_path / RECORDS, foreign_lines()
+    for line in lines:
+        path.write_bytes(line + b"\n" + json.dumps(done("b.ply")).encode() + b"\n")
+        index = RecordIndex(tmp_path)
+        index.read_on()
+        assert "b.ply" in index.known, line[:200]
+        assert index.damaged in (0, 1)
+        index.result_paths()
+        assert not any(known.holds(tmp_path, "k") for known in index.known.values())
+        summary = {row["output"] for row in rows(write_summary(tmp_path).parent)}
+        assert "b.ply" in summary
+        assert summary <= {"b.ply", "a.ply", "x", ""}, line[:200]
+
+
+@pytest.mark.parametrize("line", [b'"output":[1]', b'"output":null', b'"report":5', b'"key":[]', b'"files":[7]'])
+def test_a_line_of_odd_types_counts_as_damaged(tmp_path: Path, line: bytes) -> None:
+    key = json.loads(b"{" + line + b"}")
+    (tmp_path / RECORDS).write_text(json.dumps(done("a.ply") | key) + "\n")
+    index = RecordIndex(tmp_path)
+    index.read_on()
+    assert (index.damaged, index.known) == (1, {})
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.ply")
+    assert not DoneResult("k", (("a.ply", SHA),)).holds(tmp_path, "k")
 
 
 APPEND = """
@@ -295,7 +357,7 @@ def test_the_summary_has_the_newest_of_every_scene(tmp_path: Path) -> None:
         append_line(tmp_path / RECORDS, one)
     append_line(tmp_path / RECORDS, done("c.ply"))
     append_line(tmp_path / RECORDS, record(FAILED, "in/c.ply", "c.ply", error="killed"))
-    (tmp_path / ".summary-00112233.csv").touch()  # of a killed run
+    temporary_path(tmp_path / "summary.csv").touch()  # of a killed run
     assert write_summary(tmp_path) == tmp_path / "summary.csv"
     actual = rows(tmp_path)
     assert list(actual[0]) == list(COLUMNS)
@@ -307,6 +369,15 @@ def test_the_summary_has_the_newest_of_every_scene(tmp_path: Path) -> None:
     write_summary(tmp_path)
     assert [r["status"] for r in rows(tmp_path)] == ["failed", "done", "done"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [RECORDS, "summary.csv"]
+
+
+def test_names_in_the_summary_are_no_formulas(tmp_path: Path) -> None:
+    names = ["=cmd|' x'!A1/s.ply", "+1.ply", "-1.ply", "@a.ply", "plain-1.ply"]
+    for name in names:
+        append_line(tmp_path / RECORDS, record(FAILED, name, name, error=name))
+    actual = rows(write_summary(tmp_path).parent)
+    for column in ("scene", "output", "error"):
+        assert sorted(row[column] for row in actual) == sorted([*(f"'{name}" for name in names[:4]), names[4]])
 
 
 def test_totals_do_not_grow_with_the_number_of_scenes(tmp_path: Path) -> None:

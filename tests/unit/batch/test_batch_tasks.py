@@ -302,7 +302,7 @@ def test_a_folder_that_cannot_be_written_fails_the_scene(
 def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
     task, context, _ = one_task(scene, out)
     with scene_lock(out, ["room.ply"]):
-        (out / ".room-00112233.ply").touch()  # its process died here
+        atomic.temporary_path(out / "room.ply").touch()  # its process died here
         (out / ".room-mine.ply").touch()
     actual = record_failure(replace(task, attempt=2), context, "killed")
     assert (actual["status"], actual["error"], actual["attempt"]) == (FAILED, "killed", 2)
@@ -313,7 +313,7 @@ def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path
 def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
     task, context, _ = one_task(scene, out)
     with scene_lock(out, ["room.ply"]):
-        (out / ".room-00112233.ply").touch()
+        atomic.temporary_path(out / "room.ply").touch()
     clean_up(task, context)
     assert list(out.iterdir()) == []
 

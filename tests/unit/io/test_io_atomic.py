@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gsmerge.errors import SceneError
-from gsmerge.io import atomic_output
-from gsmerge.io.atomic import remove_leftovers
+from gsmerge.io import atomic, atomic_output, atomic_outputs
+from gsmerge.io.atomic import remove_leftovers, temporary_path
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -89,22 +93,135 @@ def test_what_a_writer_inside_says_names_the_file_that_was_asked_for(tmp_path: P
         raise SceneError(tmp_path / "other.ply", "no such file")
 
 
+def left_by(pid: int, path: Path) -> Path:
+    """The temporary file of an output that a process has left."""
+    ours = temporary_path(path)
+    return ours.with_name(ours.name.replace(f"-{os.getpid()}-", f"-{pid}-"))
+
+
+def dead_process() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
 def test_leftovers_of_one_output_are_removed_and_nothing_else(tmp_path: Path) -> None:
-    left = [".a[1]-00112233.ply", "..a[1]-00112233-44556677.ply"]
-    others = [
-        "a[1].ply",
-        ".a[1]-0011223.ply",
-        ".a1-00112233.ply",
-        ".a[1]-00112233.png",
-        ".b-00112233.ply",
-        "a[1]-x.ply",
-    ]
-    for name in (*left, *others):
-        (tmp_path / name).touch()
+    left = [temporary_path(tmp_path / "a[1].ply") for _ in range(2)]
+    others = [temporary_path(tmp_path / name) for name in ("a1.ply", "a[1].png", "b.ply", "a[1]-x.ply", "aa[1].ply")]
+    others += [tmp_path / name for name in ("a[1].ply", ".a[1]-0011223.ply", "a[1]-x.ply")]
+    for path in (*left, *others):
+        path.touch()
     remove_leftovers(tmp_path / "a[1].ply")
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
+    assert sorted(tmp_path.iterdir()) == sorted(others)
     with pytest.raises(SceneError, match="temporary files cannot be removed"):
         remove_leftovers(tmp_path / "gone" / "a.ply")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="processes as POSIX has them")
+def test_what_dead_processes_left_is_removed_and_what_others_write_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(atomic, "_clean", set())
+    dead = [left_by(dead_process(), tmp_path / name) for name in ("out.ply", "other name.tar.gz", "no suffix")]
+    own = os.getppid()
+    kept = [left_by(own, tmp_path / "out.ply"), left_by(1, tmp_path / "out.ply"), tmp_path / ".out-00112233.ply"]
+    elsewhere = left_by(dead_process(), tmp_path / "out.ply")
+    kept.append(elsewhere.with_name(elsewhere.name.replace(atomic._place(), "00000000")))  # of another machine
+    for path in (*dead[:2], *kept):
+        path.touch()
+    dead[2].mkdir()
+    (dead[2] / "file").touch()
+    with atomic_output(tmp_path / "out.ply"):
+        pass
+    assert sorted(tmp_path.iterdir()) == sorted([*kept, tmp_path / "out.ply"])
+
+
+def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
+    with atomic_outputs(overwrite=True) as add:
+        add(folder / "a.txt").write_text("new")
+        temporary = add(folder / second)
+        temporary.write_text("new")
+        if fail:
+            raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
+
+
+def test_several_files_are_all_there_or_none(tmp_path: Path) -> None:
+    (tmp_path / "b.txt").write_text("old")
+    with pytest.raises(SceneError, match=r"b\.txt: could not be written"):
+        write_both(tmp_path, "b.txt", fail=True)
+    with pytest.raises(SceneError, match="does not exist"):
+        write_both(tmp_path, "none/b.txt")
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"b.txt": "old"}
+    write_both(tmp_path, "b.txt")
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"a.txt": "new", "b.txt": "new"}
+
+
+def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
+    with atomic_output(tmp_path / "a.txt") as outer, atomic_output(outer, overwrite=True) as inner:
+        assert inner == outer
+        inner.write_text("new")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_disk_error_of_a_writer_inside_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    with (
+        pytest.raises(SceneError, match=r"out\.txt: could not be written \(No space left"),
+        atomic_output(tmp_path / "out.txt") as temporary,
+    ):
+        write_half_and_fail(temporary, OSError(errno.ENOSPC, "No space left on device"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+    flush, replace = os.fsync, os.replace
+
+    def note_flush(descriptor: int) -> None:
+        events.append("folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file")
+        flush(descriptor)
+
+    def note_rename(*paths: Any) -> None:
+        events.append("rename")
+        replace(*paths)
+
+    monkeypatch.setattr(os, "fsync", note_flush)
+    monkeypatch.setattr(os, "replace", note_rename)
+    with atomic_outputs() as add:
+        for name in ("a.txt", "b.txt"):
+            add(tmp_path / name).write_text("new")
+    assert events == ["file", "file", "rename", "rename", "folder"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
+def test_a_link_stays_one_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "file.txt").write_text("old")
+    for name, target in (("link.txt", "far/file.txt"), ("dangling.txt", "far/new.txt")):
+        (tmp_path / name).symlink_to(target)
+        with pytest.raises(SceneError, match="exists already"), atomic_output(tmp_path / name):
+            pass
+        with atomic_output(tmp_path / name, overwrite=True) as temporary:
+            temporary.write_text("new")
+        assert (tmp_path / name).is_symlink()
+        assert (tmp_path / target).read_text() == "new"
+    assert len(list(tmp_path.rglob("*"))) == 5
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_pipes_and_devices_are_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(SceneError, match="found a pipe or a device"), atomic_output(path, overwrite=True):
+            pass
+
+
+@pytest.mark.parametrize("name", ["a" * 251 + ".ply", "\N{SNOWMAN}" * 83 + ".ply", "a." + "b" * 250, "." + "a" * 254])
+def test_names_as_long_as_there_are(tmp_path: Path, name: str) -> None:
+    with atomic_output(tmp_path / name) as temporary:
+        temporary.write_text("new")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    with pytest.raises(SceneError, match="File name too long"), atomic_output(tmp_path / ("a" * 300)):
+        pass
 
 
 def test_an_error_of_the_caller_stays_what_it_is(tmp_path: Path) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from gsmerge.errors import SceneError
+from gsmerge.io import bounds
 from gsmerge.io.bounds import check_file, check_pixels, read_text
+from gsmerge.io.content_hash import content_hash
 from gsmerge.io.formats.npz import array_names, read_arrays
-from gsmerge.io.photos import image_size, natural_key
+from gsmerge.io.photos import image_size, list_images, natural_key
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm", ".pgm"])
@@ -74,3 +76,17 @@ def test_arrays_are_read_by_name(tmp_path: Path) -> None:
 def test_natural_key_counts_any_number_of_digits() -> None:
     names = ["a10", "a2", "a02b", "a" + "1" * 5000, "a1", "b0"]
     assert sorted(names, key=natural_key) == ["a1", "a2", "a02b", "a10", "a" + "1" * 5000, "b0"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
+def test_folders_of_photos_have_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a/1.png", "a/b/2.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "a" / "up").symlink_to(tmp_path)
+    (tmp_path / "images").symlink_to("a")
+    assert [path.name for path in list_images(tmp_path / "images")] == ["1.png", "2.png"]
+    monkeypatch.setattr(bounds, "MAX_FILES", 3)
+    for read in (list_images, lambda folder: content_hash([folder])):
+        with pytest.raises(SceneError, match=r"more than 3 files and folders; name the folder .* with --images"):
+            read(tmp_path / "images")

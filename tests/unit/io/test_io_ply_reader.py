@@ -48,6 +48,32 @@ def test_values_are_activated_by_hand(tmp_path: Path) -> None:
     assert scene.valid.all()
 
 
+@pytest.mark.parametrize("comment", [b"caf\xe9", "caf\N{LATIN SMALL LETTER E WITH ACUTE}".encode(), b"\xff" * 100])
+@pytest.mark.parametrize("text", [True, False])
+def test_comments_may_hold_any_byte(tmp_path: Path, comment: bytes, text: bool) -> None:
+    path = save(tmp_path / "a.ply", columns(), text=text)
+    expected, (head, rows) = read_ply(path).gaussians, path.read_bytes().split(b"element", 1)
+    path.write_bytes(head + b"comment " + comment + b"\nobj_info " + comment + b"\nelement" + rows)
+    scene = read_ply(path)
+    assert np.array_equal(scene.gaussians.means, expected.means)
+    assert all(kept.isascii() for kept in scene.info.comments)
+    path.write_bytes(path.read_bytes().replace(b"float f_dc_0", b"float f_dc_\xe9").replace(b"comment", b"c\xe9mment"))
+    with pytest.raises(SceneError):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
+def test_empty_lines_between_rows_of_text_are_passed_over(tmp_path: Path, newline: bytes) -> None:
+    path = save(tmp_path / "a.ply", columns(), text=True)
+    expected, (head, rows) = read_ply(path).gaussians, path.read_bytes().split(b"end_header\n", 1)
+    spaced = b"\n \t\n" + rows.replace(b"\n", b"\n\n\n") + b"\n\n"
+    path.write_bytes((head + b"end_header\n" + spaced).replace(b"\n", newline))
+    assert np.array_equal(read_ply(path).gaussians.means, expected.means)
+    path.write_bytes((head + b"end_header\n" + b"\n" * 10_000).replace(b"\n", newline))
+    with pytest.raises(SceneError, match="truncated or damaged"):
+        read_ply(path)
+
+
 def test_info_of_the_common_layouts(tmp_path: Path) -> None:
     info = read_ply(save(tmp_path / "a.ply", columns())).info
     assert (info.layout, info.format, info.count, info.sh_degree) == ("17-column export", "binary little-endian", 5, 0)

@@ -153,3 +153,20 @@ def test_rows_without_finite_positions(tmp_path: Path) -> None:
     finite = np.isfinite(rows["x"])
     assert share_at_home(loaded, tiny, kept) >= 0.99 * finite.mean()
     assert int(loaded.pixel_scene().valid.sum()) >= 0.99 * finite.sum()
+
+
+@pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])  # in the order of the file, and not
+def test_two_views_of_one_pose(tmp_path: Path, names: tuple[str, str]) -> None:
+    """Nothing tells them apart, and nothing has to."""
+    one = scene_on_rays(1)
+    twice = replace(
+        one,
+        c2w=one.c2w.repeat(2, 0),
+        images=one.images.repeat(2, 0),
+        gaussians=one.gaussians[np.tile(np.arange(len(one.gaussians)), 2)],
+        names=[f"images/{name}.png" for name in names],
+    )
+    twice.save(tmp_path)
+    loaded = load_scene(tmp_path)
+    assert not isinstance(loaded.scene, UnalignedScene)
+    assert len(loaded.scene) == 2

@@ -244,6 +244,14 @@ def test_csv_has_a_row_for_each_result_and_view(actual: Evaluation) -> None:
     assert rows[-1]["lpips_vgg"] == ""
 
 
+def test_names_in_csv_are_no_formulas(actual: Evaluation) -> None:
+    for name in ("=cmd|' /C calc'!A1", "+1", "-1", "@sum", "\t=1"):
+        odd = replace(actual, results=[replace(actual.results[0], name=name)])
+        rows = list(csv.DictReader(io.StringIO(evaluation_csv(evaluation_document(odd, {})))))
+        assert {row["result"] for row in rows} == {f"'{name}"}
+        assert float(rows[0]["psnr"]) > 0
+
+
 def test_table_for_people(actual: Evaluation) -> None:
     lines = evaluation_lines(evaluation_document(actual, {"half": {"bytes": 1234}}))
     assert lines[0].startswith("against photos")

@@ -10,7 +10,7 @@ import scenes
 from gsmerge import Gaussians, PixelScene
 from gsmerge.geometry import covariances
 from gsmerge.moments import Members, feature_to_gaussians, scene_members
-from gsmerge.stages.decode import DecodeOptions, decode, mixed_counts, split_counts
+from gsmerge.stages.decode import DecodeOptions, deal_visible, decode, mixed_counts, split_counts
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -186,3 +186,21 @@ def test_faint_ones_are_left_out(scene: PixelScene, k: int) -> None:
 def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
     with pytest.raises(ValueError, match=f"k: expected 1 to 8 or mixed, got {k}"):
         decode(features, members, DecodeOptions(k=k))
+
+
+def faint_division(counts: np.ndarray) -> Gaussians:
+    """Groups whose further children are too faint to be seen, except the last two groups'."""
+    opacities = np.concatenate(
+        [[0.5] + [0.5 if i > 1 else 1e-4 * j for j in range(1, n)] for i, n in enumerate(counts)]
+    )
+    n = len(opacities)
+    columns = np.zeros((n, 3)), np.tile([1.0, 0, 0, 0], (n, 1)), np.ones((n, 3)), opacities
+    return Gaussians(*(c.astype(np.float32) for c in columns), np.zeros((n, 1, 3), "f4"), np.zeros((n, 0, 3), "f4"))
+
+
+@pytest.mark.parametrize(("total", "faint"), [(4, 0), (6, 0), (9, 0), (12, 2), (14, 4), (20, 4)])
+def test_faint_gaussians_make_way_for_others(total: int, faint: int) -> None:
+    order = np.array([0, 1, 2, 0, 3, 1, 2, 3, 2, 3])  # four groups, ten more Gaussians, four of which are faint
+    actual = deal_visible(order, 4, total, 1 / 255, faint_division)
+    assert len(actual) == min(total, 14)
+    assert int((actual.opacities < 1 / 255).sum()) == faint

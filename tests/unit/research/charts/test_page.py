@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -114,6 +115,12 @@ def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     assert outline(made).open == []
     assert "&lt;script&gt;alert(&#x27;x&#x27;)" in made
     assert "1 failed" in made
+
+
+@pytest.mark.parametrize("name", ["a $\\frac{$ b", "$x$", "_\\$", "\N{SNOWMAN}\N{CJK UNIFIED IDEOGRAPH-4E2D}", "=1|x"])
+def test_names_are_no_formulas_in_drawings(name: str, tmp_path: Path) -> None:
+    records = [replace(r, scene=name if r.scene == "fern" else r.scene, method=r.method) for r in make_grid()]
+    assert escape(name) in page_of(records, tmp_path)
 
 
 def test_pictures_are_in_the_page(tmp_path: Path) -> None:

@@ -155,3 +155,15 @@ def test_scores_are_fields() -> None:
     assert json.loads(json.dumps(made.to_dict()))["lpips_alex_target_visible"] == 15
     with pytest.raises(ValueError, match="expected one of"):
         made.score("count")
+
+
+@pytest.mark.parametrize("field", ["key", "settings", "views_asked", "count", "seconds", "stages", "pictures", "error"])
+def test_lines_of_odd_types_are_passed_over(field: str, tmp_path: Path) -> None:
+    append_run(tmp_path, record("good"))
+    whole = (tmp_path / RUNS).read_text()
+    odd = [10**400, [1], {"a": [1]}, True, "\0", [[]], float("inf")]
+    lines = [json.dumps({**record("odd").to_dict(), field: value}) for value in odd]
+    (tmp_path / RUNS).write_text("\n".join(["[" * 100_000, *lines, whole]))
+    records, notes = read_runs(tmp_path)
+    assert "good" in records
+    assert notes
