@@ -31,8 +31,8 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 
 
 @opt.command(
-    opt.argument("before", Path, "BEFORE", "The scene: a .ply or its folder."),
-    opt.argument("after", list[Path], "AFTER...", "Compact .ply files of that scene."),
+    opt.BEFORE,
+    opt.AFTER,
     f"{opt.READING} {opt.TARGETS}",
     *opt.panel(
         opt.MEASURING,
