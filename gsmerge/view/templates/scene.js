@@ -156,6 +156,7 @@ class SplatView {
   request() {
     if (this.queued || !this.frame().shown) return;
     this.queued = true;
+    this.onSettle(false);
     requestAnimationFrame(() => this.draw());
   }
 

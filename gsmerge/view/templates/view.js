@@ -13,6 +13,7 @@ const BLINK = 700; // milliseconds
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those of the first view are in the page itself
 let solid = null; // the 3D view, once it is there
+let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
 
 const view = () => data.views[state.view];
@@ -199,7 +200,7 @@ function listen() {
   id("back").addEventListener("click", () => jump(state.view));
   window.addEventListener("resize", show);
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
-  setInterval(() => {
+  blinking = setInterval(() => {
     if (state.mode === "blink" && !still.matches && !document.hidden) set("other", !state.other);
   }, BLINK);
   listenToPointers();
