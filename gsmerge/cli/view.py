@@ -24,16 +24,17 @@ from gsmerge.errors import UsageError
 def view(args: opt.Args) -> None:
     """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
     from gsmerge.io import read_ply
+    from gsmerge.report import document_head
     from gsmerge.runtime.run_log import RunLog
     from gsmerge.stages.place_cameras import add_views
     from gsmerge.types import UnalignedScene
 
     files, after = args.files(args.before), args.after
     output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
-    if output.suffix.lower() not in (".html", ".htm"):
-        raise UsageError(f"{output}: expected a name that ends in .html")
     inputs = (*input_files(files), *after, args.targets, args.target_images)
     check_outputs((output,), inputs, overwrite=args.overwrite)
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{output}: expected a name that ends in .html")
     load = args.load(files)
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
     log = RunLog()
@@ -42,7 +43,7 @@ def view(args: opt.Args) -> None:
     plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
     notes = [*load.notes, *adapted, *log.notes]
     say_notes(notes, quiet=args.silent)
-    document = {"output": str(output), "dry_run": args.dry_run, "notes": notes}
+    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": notes}
     if args.dry_run:
         print_document(document, f"would write {output}", as_json=args.json)
         return

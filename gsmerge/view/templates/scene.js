@@ -34,7 +34,7 @@ async function loadVendor() {
 }
 
 class SplatView {
-  // `frame()` says what is to be drawn; `onMove` and `onSettle` are told of camera and sorting.
+  // `frame()` says what is to be drawn; `onMove` and `onSettle` hear of camera and sorting.
   constructor(canvas, views, frame, onMove, onSettle) {
     Object.assign(this, { canvas, views, frame, onMove, onSettle });
     const options = { canvas, antialias: false, alpha: true, powerPreference: "high-performance" };

@@ -61,7 +61,7 @@ function fitStage() {
   const stacked = stage.classList.contains("stacked");
   const ratio = ((side && !stacked ? 2 : 1) * width) / ((stacked ? 2 : 1) * height);
   stage.style.aspectRatio = String(ratio);
-  stage.style.maxWidth = `${(66 * ratio).toFixed(2)}vh`;
+  stage.style.maxWidth = `${(62 * ratio).toFixed(2)}vh`;
 }
 
 function show() {
