@@ -26,9 +26,10 @@ ENGINE = "vendor/spark-three.js.gz"
 def view_page(data: ViewData) -> str:
     """The page of a scene before and after, in HTML."""
     photos = any(view.photo is not None for view in data.views)
-    sources: list[dict[str, str | None]] = [{"name": "photo", "splats": None}] if photos else []
+    sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
     sources += [
-        {"name": side.name, "splats": None if side.spz is None else f"splats-{i}"} for i, side in enumerate(data.sides)
+        {"name": side.name, "splats": None if side.spz is None else f"splats-{i}", "count": side.num_gaussians}
+        for i, side in enumerate(data.sides)
     ]
     left, right = int(photos), int(photos) + 1
     stills = [

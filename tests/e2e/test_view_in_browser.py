@@ -45,6 +45,8 @@ def opened(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     assert CHROMIUM is not None
     with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
         tab.open(page)
+        wait(tab, "solid !== null")
+        tab.run("set('solid', '1')")
         wait(tab, SETTLED)
         yield tab, (gsmerge.read_scene(scene), gsmerge.read_ply(small).gaussians)
 

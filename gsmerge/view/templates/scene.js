@@ -171,8 +171,8 @@ class SplatView {
   }
 
   // Before the first frame is shown.
-  async prepare(sources) {
-    for (const source of sources) if (this.has(source)) await this.refresh(this.results.get(source));
+  async prepare() {
+    for (const result of this.results.values()) await this.refresh(result);
   }
 
   draw() {

@@ -10,6 +10,7 @@ const state = {
 };
 const KEYS = { 1: "swipe", 2: "side", 3: "blink", 4: "difference" };
 const BLINK = 700; // milliseconds
+const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those of the first view are in the page itself
 let solid = null; // the 3D view, once it is there
@@ -155,7 +156,7 @@ function set(name, value) {
   if (name === "solid") chosen = true;
   if (name === "mode") state.other = false;
   if (name === "order") for (const card of id("strip").children) card.style.order = value === "worst" ? card.dataset.view : card.dataset.place;
-  if (name === "left" || name === "right") load();
+  if (solid && (name === "left" || name === "right")) load(solid).then(show);
   show();
 }
 
@@ -264,14 +265,13 @@ function say(words) {
   id("status").textContent = words;
 }
 
-async function load() {
-  if (!solid) return;
+// Takes in what the sides show; without a GPU nothing that would take minutes for a frame.
+async function load(made) {
   for (const source of [state.left, state.right]) {
-    const name = data.sources[source].splats;
-    if (name && !solid.has(source) && id(name)) await solid.add(source, takeBytes(name));
+    const { splats, count } = data.sources[source];
+    const drawable = splats && !(made.software && count > SOFTWARE_MOST);
+    if (drawable && !made.has(source) && id(splats)) await made.add(source, takeBytes(splats));
   }
-  await solid.prepare([state.left, state.right]);
-  show();
 }
 
 async function startScene() {
@@ -289,16 +289,20 @@ async function startScene() {
         show();
       }
     };
-    solid = new SplatView(id("canvas"), data.views, frame, moved, (settled) => stage.setAttribute("aria-busy", String(!settled)));
-    solid.look(state.view);
-    await load();
+    const settle = (settled) => stage.setAttribute("aria-busy", String(!settled));
+    const made = new SplatView(id("canvas"), data.views, frame, moved, settle);
+    made.look(state.view);
+    await load(made);
+    if (!made.software) await made.prepare();
+    solid = made;
+    if (solid.current !== state.view) solid.look(state.view);
     id("canvas").addEventListener("webglcontextlost", () => {
       [solid, state.solid] = [null, ""];
       jump(state.view);
       say("3D was lost: reload the page");
     });
-    if (!chosen) state.solid = "1";
-    say(solid.software ? "no GPU: 3D is slow and coarse" : "");
+    if (!chosen && !solid.software) state.solid = "1";
+    say(solid.software ? "no GPU: 3D is slow and coarse, and shows small scenes only" : "");
     show();
   } catch (error) {
     [solid, state.solid] = [null, ""];
