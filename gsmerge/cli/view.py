@@ -58,8 +58,9 @@ def view(args: opt.Args) -> None:
     page = view_page(data)
     write_text(output, page, overwrite=args.overwrite)
     say_notes(data.notes, quiet=args.silent)
-    document |= {"bytes": len(page), "headline": headline(data), "notes": [*notes, *data.notes]}
-    print_document(document, f"{output}: {headline(data)}", as_json=args.json, quiet=args.quiet)
+    said = headline(*data.sides[:2])
+    document |= {"bytes": len(page), "headline": said, "notes": [*notes, *data.notes]}
+    print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)
 

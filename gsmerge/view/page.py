@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.report import human_bytes
-from gsmerge.view.data import PageView, ViewData
+from gsmerge.view.data import PageView, Side, ViewData
 
 if TYPE_CHECKING:
     import jinja2
@@ -44,7 +44,7 @@ def view_page(data: ViewData) -> str:
         "view.html",
         policy=SOLID,
         data=data,
-        headline=headline(data),
+        headline=headline(*data.sides[:2]),
         sources=sources,
         left=left,
         right=right,
@@ -56,12 +56,15 @@ def view_page(data: ViewData) -> str:
     )
 
 
-def headline(data: ViewData) -> str:
+def headline(before: Side, after: Side) -> str:
     """What became of the scene, in one line: how many Gaussians, and how much closer to the photos."""
-    before, after = data.sides[:2]
-    share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
+    return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr)
+
+
+def headline_of(num_before: int, num_after: int, old: float | None, new: float | None) -> str:
+    """The same of numbers; ``old`` and ``new`` are PSNR in dB, the former infinite where the input is the reference."""
+    share = 100 * num_after / max(num_before, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
-    old, new = before.mean.psnr, after.mean.psnr
     if new is None or old is None:
         return said
     if not np.isfinite(old):

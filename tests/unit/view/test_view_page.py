@@ -105,7 +105,7 @@ def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
 )
 def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
     sides = [replace(side, mean=Quality(psnr)) for side, psnr in zip(data.sides, (before, after), strict=True)]
-    line = headline(replace(data, sides=tuple(sides)))
+    line = headline(*sides)
     assert line.endswith(words)
     assert line.startswith("50.0 % of the Gaussians")
 
