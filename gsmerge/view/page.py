@@ -65,7 +65,7 @@ def headline_of(num_before: int, num_after: int, old: float | None, new: float |
     """The same of numbers; ``old`` and ``new`` are PSNR in dB, the former infinite where the input is the reference."""
     share = 100 * num_after / max(num_before, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
-    if new is None or old is None:
+    if new is None or old is None or not np.isfinite(new):
         return said
     if not np.isfinite(old):
         return f"{said}, {new:.1f} dB from the input's own renders"

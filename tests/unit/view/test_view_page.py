@@ -101,6 +101,7 @@ def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
         (20.0, 19.0, "1.0 dB farther from the photos"),
         (float("inf"), 30.0, "30.0 dB from the input's own renders"),
         (None, None, "Gaussians"),
+        (float("inf"), float("inf"), "Gaussians"),
     ],
 )
 def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
