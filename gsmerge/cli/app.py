@@ -34,7 +34,7 @@ INTERRUPTED = 130
 COMMANDS = {
     "Compact": ("compact",),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
-    "Look and measure": ("inspect", "segment", "render", "preview", "evaluate", "report"),
+    "Look and measure": ("inspect", "view", "preview", "render", "segment", "evaluate", "report"),
     "Research": ("stress", "chart", "generate", "train"),
 }
 

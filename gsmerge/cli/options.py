@@ -221,6 +221,8 @@ def parse_superpixels(text: str) -> int | str:
     return int(text) if text.isdigit() else text
 
 
+BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply or its folder.")
+AFTER = argument("after", list[Path], "AFTER...", "Compact .ply files of that scene.")
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
 
 # Names of options that commands share

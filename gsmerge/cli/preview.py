@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import check_cameras, check_outputs, input_files
+from gsmerge.cli.paths import check_cameras, check_outputs, input_files, write_text
 from gsmerge.cli.pictures import report_pictures, write_picture
 from gsmerge.errors import UsageError
 
@@ -15,21 +15,22 @@ from gsmerge.errors import UsageError
     opt.argument("scenes", list[Path], "SCENES...", "Gaussian .ply files: before, after, ..."),
     opt.READING,
     *opt.panel(opt.OUTPUT, opt.option("views", int, "Number of views at most.", default=4, min=1)),
-    opt.output("The picture, .png.", default=opt.REQUIRED),
+    opt.output("The picture, .png, or a page with swipes, .html.", default=opt.REQUIRED),
     "overwrite dry_run threads",
 )
 def preview(args: opt.Args) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
     hints, scenes = args.hints(), args.scenes
     from gsmerge.io import place_cameras_in_scene, ply_notes, read_ply, read_ply_with_hints
-    from gsmerge.measure.preview import contact_sheet
+    from gsmerge.measure.preview import contact_sheet, view_pictures
     from gsmerge.runtime.threads import use_threads
     from gsmerge.views import pick_views
 
     files = args.files(scenes[0])
     check_outputs((args.output,), (*scenes, *input_files(files)), overwrite=args.overwrite)
-    if args.output.suffix.lower() != ".png":
-        raise UsageError(f"{args.output}: expected a name that ends in .png")
+    suffix = args.output.suffix.lower()
+    if suffix not in (".png", ".html"):
+        raise UsageError(f"{args.output}: expected a name that ends in .png or .html")
     check_cameras(files)
     plys = [read_ply_with_hints(files.ply, opacity=args.opacity, hints=hints)]
     plys += [read_ply(path, opacity=args.opacity) for path in scenes[1:]]
@@ -44,8 +45,14 @@ def preview(args: opt.Args) -> None:
         gaussians = [placed.gaussians, *(ply.gaussians for ply in plys[1:])]
         parts = [(path.name, some) for path, some in zip(scenes, gaussians, strict=True)]
         with use_threads(args.threads), announce_compilation(quiet=args.silent):
-            sheet = contact_sheet(parts, cameras, photos, max_views=args.views)
-        write_picture(args.output, sheet, overwrite=args.overwrite)
+            pictures = view_pictures(parts, cameras, photos, max_views=args.views)
+        if suffix == ".png":
+            write_picture(args.output, contact_sheet(pictures), overwrite=args.overwrite)
+        else:
+            from gsmerge.view.report_page import pictures_page
+
+            title = f"{scenes[0].name}: {len(scenes)} scene(s)"
+            write_text(args.output, pictures_page(title, pictures), overwrite=args.overwrite)
     ids = pick_views(len(cameras), args.views)
     facts = {
         "scenes": {str(path): ply.info.count for path, ply in zip(scenes, plys, strict=True)},

@@ -31,8 +31,8 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 
 
 @opt.command(
-    opt.argument("before", Path, "BEFORE", "The scene: a .ply or its folder."),
-    opt.argument("after", list[Path], "AFTER...", "Compact .ply files of that scene."),
+    opt.BEFORE,
+    opt.AFTER,
     f"{opt.READING} {opt.TARGETS}",
     *opt.panel(
         opt.MEASURING,
@@ -126,16 +126,17 @@ def _write(
     *,
     overwrite: bool,
 ) -> None:
-    from gsmerge.cli.pictures import png_bytes
-    from gsmerge.measure.comparison_page import comparison_html, comparison_markdown
+    from gsmerge.measure.comparison_page import comparison_markdown
     from gsmerge.measure.evaluate import near_plane
-    from gsmerge.measure.preview import contact_sheet
+    from gsmerge.measure.preview import view_pictures
     from gsmerge.report import to_json
 
     if path.suffix == ".html":
         parts = [("before", scene.file_gaussians), *gaussians.items()]
-        sheet = contact_sheet(parts, scene.cameras, scene.images, max_views=2, near=near_plane(scene))
-        text = comparison_html(document, png_bytes(sheet))
+        from gsmerge.view.report_page import report_page
+
+        pictures = view_pictures(parts, scene.cameras, scene.images, max_views=2, near=near_plane(scene))
+        text = report_page(document, pictures)
     else:
         text = comparison_markdown(document) if path.suffix == ".md" else to_json(document)
     write_texts({path: text}, overwrite=overwrite)

@@ -1,9 +1,7 @@
-"""A comparison -> a JSON document with a stable schema, Markdown, and one HTML file that needs nothing else."""
+"""A comparison -> a JSON document with a stable schema, its tables, and Markdown."""
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -13,11 +11,6 @@ from gsmerge.measure.scores import MASKED, evaluation_document
 from gsmerge.report import document_head, human_bytes
 
 Row = Sequence[str]
-_STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}"
-    "table{border-collapse:collapse;margin:1rem 0}td,th{padding:.3rem .8rem;border-bottom:1px solid #ddd;"
-    "text-align:right}td:first-child,th:first-child{text-align:left}img{max-width:100%}"
-)
 
 
 def comparison_document(comparison: Comparison, notes: Sequence[str] = ()) -> dict[str, Any]:
@@ -60,8 +53,8 @@ def _side(side: SceneCosts, before: SceneCosts) -> dict[str, Any]:
     return facts
 
 
-def _tables(document: Mapping[str, Any]) -> Iterator[tuple[str, Row, list[Row]]]:
-    """Heading, columns and rows of each table."""
+def comparison_tables(document: Mapping[str, Any]) -> Iterator[tuple[str, Row, list[Row]]]:
+    """Heading, columns and rows of each table, for people."""
     sides = [document["before"], *document["after"]]
     rows: list[Row] = []
     for side in sides:
@@ -108,7 +101,7 @@ def _quality_table(quality: Mapping[str, Any]) -> tuple[str, Row, list[Row]]:
 def comparison_markdown(document: Mapping[str, Any]) -> str:
     """The comparison for people, in Markdown."""
     lines = [f"# {_plain(document['before']['path'])}: before and after", ""]
-    for title, head, rows in _tables(document):
+    for title, head, rows in comparison_tables(document):
         lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
     lines += [f"- {_plain(note)}" for note in document["notes"]]
     return "\n".join(lines).rstrip() + "\n"
@@ -121,18 +114,3 @@ def _line(cells: Row) -> str:
 def _plain(text: str) -> str:
     """Text that is one line and no HTML in Markdown."""
     return " ".join(html.escape(text, quote=False).split())
-
-
-def comparison_html(document: Mapping[str, Any], picture: bytes | None = None) -> str:
-    """The comparison, with a PNG such as a contact sheet if there is one, as one HTML file, which loads nothing."""
-    title = html.escape(f"{document['before']['path']}: before and after")
-    parts = [f"<!doctype html><meta charset=utf-8><title>{title}</title><style>{_STYLE}</style><h1>{title}</h1>"]
-    for heading, head, rows in _tables(document):
-        cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-        parts.append(f"<h2>{html.escape(heading)}</h2><table><tr>{cells}</tr>{body}</table>")
-    if picture is not None:
-        data = base64.b64encode(picture).decode()
-        parts.append(f'<h2>Pictures</h2><img alt="photos and renders side by side" src="data:image/png;base64,{data}">')
-    parts += [f"<p>{html.escape(note)}</p>" for note in document["notes"]]
-    return "\n".join(parts) + "\n"

@@ -28,6 +28,7 @@ MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less sugges
 INPUT = "input"  # name of the scene itself among the results
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
 Progress = Callable[[str, int, int], None]
+OnImage = Callable[[str, str, int, np.ndarray], None]
 
 
 @dataclass(frozen=True)
@@ -224,12 +225,14 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     progress: Progress | None = None,
+    on_image: OnImage = lambda *_: None,
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out ones.
 
     ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
     ``targets`` are held-out views in that world, see :func:`gsmerge.io.read_held_out`; ``progress`` is called with
-    ("evaluate", done, total) after each result.
+    ("evaluate", done, total) after each result, ``on_image`` with (result, split, number of the view in it, render
+    ``[h,w,3]`` in [0, 1]) for each picture that is scored.
 
     Raises:
         UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
@@ -253,7 +256,7 @@ def evaluate(
         named = {INPUT: own, **results} if options.own else results
         look.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
-            scores.append(_score_result(name, gaussians, len(own), splits, options, look))
+            scores.append(_score_result(name, gaussians, len(own), splits, options, look, on_image))
             if progress:
                 progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
@@ -306,9 +309,9 @@ def _score_result(
     splits: Mapping[str, _Split],
     options: EvaluateOptions,
     look: _Look,
+    on_image: OnImage,
 ) -> ResultScores:
-    scores: list[ViewScore] = []
-    seconds = 0.0
+    scores, seconds = list[ViewScore](), 0.0
     for kind, split in splits.items():
         views = split.views
         perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
@@ -316,6 +319,7 @@ def _score_result(
             start = time.perf_counter()
             image = look.image(gaussians, views.cameras, i)
             seconds += time.perf_counter() - start
+            on_image(name, kind, i, image)
             seen, nets = split.visible[i], options.lpips if i in perceptual else ()
             both = _both(image, views.images[i], seen, nets)
             zooms = () if options.zoom == (1,) else tuple(

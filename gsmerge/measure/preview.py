@@ -34,31 +34,39 @@ def label(picture: Picture, text: str) -> Picture:
     return np.concatenate([band, picture])
 
 
-def contact_sheet(
+def view_pictures(
     scenes: Sequence[tuple[str, Gaussians]],
     cameras: Cameras,
     photos: np.ndarray | None = None,
     *,
     max_views: int = 4,
-    min_width: int = 320,
     near: float = 0.01,
-) -> Picture:
-    """One row per view, at most ``max_views``: the photo where there is one, then each scene from the same camera.
+) -> list[list[tuple[str, np.ndarray]]]:
+    """For each view, at most ``max_views``: the photo where there is one, then each scene from the same camera.
 
-    Every render is labelled with its number of Gaussians, and with its PSNR against the photo ``[c,h,w,3]``, or without
-    photos against the first scene. Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
+    Every render ``[h,w,3]`` comes with a line of text: its name, its number of Gaussians, and its PSNR against the
+    photo ``[c,h,w,3]``, or without photos against the first scene.
     """
     ids = pick_views(len(cameras), max_views)
-    factor = max(1, -(-min_width // cameras.width))
     renders = [render(gaussians, cameras[ids], near=near).images.clip(0, 1) for _, gaussians in scenes]
-    rows = []
+    views = []
     for row, view in enumerate(ids):
-        tiles = [] if photos is None else [_tile(photos[view], f"photo, view {view}", factor)]
+        pictures = [] if photos is None else [(f"photo, view {view}", photos[view])]
         for i, (name, gaussians) in enumerate(scenes):
             against = photos[view] if photos is not None else renders[0][row] if i else None
             quality = "" if against is None else f", {psnr(renders[i][row], against):.1f} dB"
-            tiles.append(_tile(renders[i][row], f"{name}: {len(gaussians):,}{quality}", factor))
-        rows.append(_join(tiles, axis=1))
+            pictures.append((f"{name}: {len(gaussians):,}{quality}", renders[i][row]))
+        views.append(pictures)
+    return views
+
+
+def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_width: int = 320) -> Picture:
+    """One row per view with its pictures under their labels.
+
+    Small ones are enlarged by a whole factor until a tile has ``min_width`` columns.
+    """
+    factor = max(1, -(-min_width // views[0][0][1].shape[1]))
+    rows = [_join([_tile(image, text, factor) for text, image in pictures], axis=1) for pictures in views]
     return _join(rows, axis=0)
 
 

@@ -75,6 +75,7 @@ def test_commands_are_the_documented_ones() -> None:
         "segment",
         "render",
         "preview",
+        "view",
         "report",
         "stress",
         "chart",

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage", "matplotlib")
+HEAVY = ("torch", "numba", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
 COMMANDS = (
-    "compact", "batch", "encode", "decode", "extend", "evaluate", "inspect", "segment", "render", "preview", "report",
-    "stress", "chart", "generate", "train",
+    "compact", "batch", "encode", "decode", "extend", "evaluate", "inspect", "segment", "render", "preview", "view",
+    "report", "stress", "chart", "generate", "train",
 )  # fmt: skip
 
 

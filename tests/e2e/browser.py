@@ -77,8 +77,8 @@ class Browser:
 
 
 @contextmanager
-def browser(executable: str, profile: Path) -> Iterator[Browser]:
-    """A browser with a profile of its own, ended with the block."""
+def browser(executable: str, profile: Path, *flags: str) -> Iterator[Browser]:
+    """A browser with a profile and further flags of its own, ended with the block."""
     to_browser, from_browser = os.pipe(), os.pipe()
 
     def connect() -> None:  # Chromium reads commands from descriptor 3 and answers on 4
@@ -86,7 +86,7 @@ def browser(executable: str, profile: Path) -> Iterator[Browser]:
         os.dup2(read, 3)
         os.dup2(write, 4)
 
-    command = [executable, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
+    command = [executable, *FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"]
     silent = subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=silent, stderr=silent, close_fds=False, preexec_fn=connect)  # noqa: PLW1509 - it only moves descriptors
     os.close(to_browser[0])

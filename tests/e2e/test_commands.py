@@ -146,7 +146,7 @@ def test_what_asks_for_nothing_is_wrong_usage(
 def test_a_preview_is_a_png(made_scene: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("preview", made_scene / "scene.ply", "-o", tmp_path / "sheet.jpg")
     assert (outcome.code, outcome.err.count("\n")) == (2, 1)
-    assert "expected a name that ends in .png" in outcome.err
+    assert "expected a name that ends in .png or .html" in outcome.err
     assert listing(tmp_path) == {}
 
 
@@ -249,6 +249,9 @@ def test_preview(scene_copy: Path, run: Run) -> None:
     sheet = cv2.imread(str(out))
     assert sheet.shape[1] >= 3 * WIDTH  # photo, before, after
     assert sheet.shape[0] >= 4 * HEIGHT
+    page = scene_copy / "preview.html"
+    assert run("preview", scene_copy / "scene.ply", scene_copy / "scene.compact.ply", "-o", page).code == 0
+    assert page.read_text(encoding="utf-8").count("data:image/webp") == 3 * 4  # photo, before, after of four views
 
 
 def test_version(run: Run) -> None:

@@ -21,6 +21,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "segment": ("overlays", "--superpixels", "100"),
     "render": ("renders",),
     "preview": ("sheet.png", "--views", "1"),
+    "view": ("page.html", "--no-open"),
 }
 COMMANDS = ("inspect", "evaluate", *WRITERS)
 
@@ -28,12 +29,14 @@ COMMANDS = ("inspect", "evaluate", *WRITERS)
 def call(command: str, scene: Path) -> list[object]:
     """The command with its scene, its output, and what makes it fast."""
     given: Path = scene / "scene.ply" if command == "preview" else scene
+    targets = ["--targets", scene / "targets"]
     if command == "inspect":
         return [command, given]
     if command == "evaluate":
-        return [command, given, "--targets", scene / "targets", "--lpips", "none"]
+        return [command, given, *targets, "--lpips", "none"]
     output, *rest = WRITERS[command]
-    return [command, given, "-o", scene / output, *rest]
+    more = [scene / "scene.ply", *targets] if command == "view" else []
+    return [command, given, *more, "-o", scene / output, *rest]
 
 
 def spoil_rows(ply: Path) -> None:
@@ -140,12 +143,14 @@ def test_folders_that_cannot_be_made_are_told_first(command: str, scene_copy: Pa
         ("preview", "images/view_000.png"),
         ("render", "images"),
         ("segment", "images"),
+        ("view", "transforms.json"),
     ],
 )
 def test_inputs_are_not_replaced(command: str, output: str, scene_copy: Path, run: Run) -> None:
     before = listing(scene_copy)
     scene = scene_copy / "scene.ply"
-    outcome = run(command, scene, "-o", scene_copy / output, "--overwrite")
+    results = [scene] if command == "view" else []
+    outcome = run(command, scene, *results, "-o", scene_copy / output, "--overwrite")
     assert outcome.code == 2
     assert "other than the input" in outcome.err
     assert listing(scene_copy) == before

@@ -39,7 +39,7 @@ def test_files_of_every_kind(scene_copy: Path, small: Path, run: Run) -> None:
     spent = json.loads((scene_copy / "run.json").read_text())["total_seconds"]
     assert document["after"][0]["merge_seconds"] == spent
     assert [speed["width"] for speed in document["before"]["speeds"][:2]] == [48, 96]
-    assert "data:image/png;base64," in outputs[1].read_text()
+    assert "data:image/webp;base64," in outputs[1].read_text()
     again = run("report", scene_copy / "scene.ply", small, "--lpips", "none", "-o", outputs[0])
     assert again.code == 2
     assert "--overwrite" in again.err

@@ -17,8 +17,8 @@ from gsmerge.research.charts.record import RunRecord
 from gsmerge.research.charts.run import describe
 from gsmerge.research.charts.series import PART_LABELS
 from gsmerge.research.charts.statistics import Interval
+from gsmerge.view.page import PICTURES, render_template
 
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 HEADS = {"psnr": "PSNR", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS Alex"}
 KINDS = {"ours above": "above", "baseline above": "below"}  # of verdicts, as CSS classes
 
@@ -51,19 +51,11 @@ def make_page(
         ("environment", "Environment", _environment(records, command)),
     ]
     sections = [section for section in sections if section[2]]
-    links = " ".join(f'<a href="#{text(name)}">{text(title)}</a>' for name, title, _ in sections)
-    body = "".join(f'<section id="{text(one)}"><h2>{text(title)}</h2>{html}</section>' for one, title, html in sections)
     names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
     words = f"{len(records)} runs on {len(scenes)} scene(s): {names}" + (f"; {len(failed)} failed" if failed else "")
-    package = files("gsmerge.research.charts")
-    style, script = (package.joinpath(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{text(POLICY)}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>gsmerge: {text(names)}</title><style>{style}</style></head><body>"
-        f'<header><h1>gsmerge experiments</h1><p class="muted">{text(words)}</p><nav>{links}</nav></header>'
-        f"<main>{body}</main><script>{script}</script></body></html>\n"
+    style = files("gsmerge.research.charts").joinpath("page.css").read_text(encoding="utf-8")
+    return render_template(
+        "charts.html", policy=PICTURES, title=f"gsmerge: {names}", words=words, style=style, sections=sections
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 import scenes
 
 from gsmerge.measure.comparison import Comparison, SceneCosts, Storage, break_even, compare
-from gsmerge.measure.comparison_page import comparison_document, comparison_html, comparison_markdown
+from gsmerge.measure.comparison_page import comparison_document, comparison_markdown
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.measure.speed import Speed, measure_speeds, overdraw, resized
 from gsmerge.render import plan_view, prepare
@@ -101,14 +101,6 @@ def test_documents(actual: Comparison) -> None:
     for table in tables:
         widths = {len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}
         assert len(widths) == 1, table
-
-
-def test_html_loads_nothing_and_escapes_names(actual: Comparison) -> None:
-    page = comparison_html(comparison_document(actual), b"\x89PNG")
-    assert "a|b&lt;i&gt;" in page
-    assert "<i>" not in page
-    assert all(actual.startswith("data:") for actual in re.findall(r"(?:src|href)=\"?([^\"> ]*)", page))
-    assert "http" not in page
 
 
 def test_without_merge_seconds_nothing_is_earned_back(scene: PixelScene) -> None:

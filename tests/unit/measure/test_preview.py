@@ -33,7 +33,9 @@ def test_pick_views(views: int, most: int, ids: list[int]) -> None:
 
 def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
     photos = np.full((2, 12, 20, 3), 0.2, np.float32)
-    sheet = preview.contact_sheet([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos, min_width=20)
+    sheet = preview.contact_sheet(
+        preview.view_pictures([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos), min_width=20
+    )
     tile_height, tile_width = 12 + preview.BAND, 20
     assert sheet.shape == (2 * tile_height + preview.GAP, 3 * tile_width + 2 * preview.GAP, 3)
     middle = preview.BAND + 6
@@ -45,7 +47,7 @@ def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
 
 
 def test_small_renders_are_enlarged_by_whole_pixels() -> None:
-    sheet = preview.contact_sheet([("one", blob(0.5))], cameras(1), min_width=50)
+    sheet = preview.contact_sheet(preview.view_pictures([("one", blob(0.5))], cameras(1)), min_width=50)
     assert sheet.shape == (3 * 12 + preview.BAND, 3 * 20, 3)
 
 

@@ -82,7 +82,7 @@ def test_the_page_fetches_nothing(page: str) -> None:
     assert "://" not in page
     assert not re.search(r"url\((?!#)", page)
     assert "@import" not in page
-    assert "default-src &#x27;none&#x27;" in page
+    assert "default-src &#39;none&#39;" in page
 
 
 def test_every_reference_inside_the_page_is_there(page: str) -> None:

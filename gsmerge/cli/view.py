@@ -1,0 +1,74 @@
+"""``gsmerge view``: a scene and its compact versions as one page, in stills and in 3D."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from gsmerge.cli import options as opt
+from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
+from gsmerge.cli.held_out import file_names, held_out_views
+from gsmerge.cli.paths import check_outputs, input_files, write_text
+from gsmerge.errors import UsageError
+
+
+@opt.command(
+    opt.BEFORE,
+    opt.AFTER,
+    f"{opt.READING} {opt.TARGETS}",
+    opt.output("The page, .html.", wording="AFTER.compare.html, beside it"),
+    *opt.panel(opt.OUTPUT, opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True)),
+    "overwrite dry_run threads",
+)
+def view(args: opt.Args) -> None:
+    """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
+    from gsmerge.io import read_ply
+    from gsmerge.report import document_head
+    from gsmerge.runtime.run_log import RunLog
+    from gsmerge.stages.place_cameras import add_views
+    from gsmerge.types import UnalignedScene
+
+    files, after = args.files(args.before), args.after
+    output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
+    inputs = (*input_files(files), *after, args.targets, args.target_images)
+    check_outputs((output,), inputs, overwrite=args.overwrite)
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{output}: expected a name that ends in .html")
+    load = args.load(files)
+    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
+    log = RunLog()
+    if isinstance(scene, UnalignedScene):
+        scene = add_views(scene, log)
+    plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
+    notes = [*load.notes, *adapted, *log.notes]
+    say_notes(notes, quiet=args.silent)
+    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": notes}
+    if args.dry_run:
+        print_document(document, f"would write {output}", as_json=args.json)
+        return
+    from gsmerge.view.data import collect
+    from gsmerge.view.page import headline, view_page
+
+    sizes = [load.ply.file_bytes, *(ply.info.file_bytes for ply in plys.values())]
+    gaussians = {name: ply.gaussians for name, ply in plys.items()}
+    with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+        title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
+        data = collect(title, scene, gaussians, sizes, held_out, threads=args.threads, progress=progress)
+    page = view_page(data)
+    write_text(output, page, overwrite=args.overwrite)
+    say_notes(data.notes, quiet=args.silent)
+    said = headline(*data.sides[:2])
+    document |= {"bytes": len(page), "headline": said, "notes": [*notes, *data.notes]}
+    print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
+    if args.open and not _open(output):
+        say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)
+
+
+def _open(page: Path) -> bool:
+    """Show a page in the browser; False where there is no screen, on which a text browser would take the terminal."""
+    if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        return False
+    import webbrowser
+
+    return webbrowser.open(page.absolute().as_uri())

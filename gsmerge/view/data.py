@@ -1,0 +1,208 @@
+"""What the page of a scene before and after shows: stills, cameras, scores, and Gaussians for the browser."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+import cv2
+import numpy as np
+
+from gsmerge.io.formats import spz_writer
+from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
+from gsmerge.measure.preview import Picture, to_picture
+from gsmerge.stages.prepare import scene_frame
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.views import even_views
+
+MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
+MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
+MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
+MIN_OPACITY = 1 / 255  # what is fainter is not drawn
+WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
+DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
+
+
+@dataclass(frozen=True)
+class Side:
+    """The scene itself or one of its results."""
+
+    name: str
+    num_gaussians: int
+    file_bytes: int
+    mean: Quality  # over the views that count: the held-out ones where there are any
+    spz: bytes | None  # the Gaussians in the page's frame; None: too many for a page
+    sh_degree: int  # of the harmonics that the page has
+    file_sh_degree: int  # of those in the file
+
+
+@dataclass(frozen=True)
+class PageView:
+    """A view that the page can jump to."""
+
+    name: str
+    place: int  # among all views, the input views first
+    held_out: bool
+    camera: Cameras  # one, in the page's frame
+    distance: float  # of what it looks at, in units of that frame
+    photo: bytes | None  # WebP
+    stills: tuple[bytes, ...]  # WebP, one for each side
+    scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
+
+
+@dataclass(frozen=True)
+class ViewData:
+    """What a page shows.
+
+    Args:
+        title: Name of the scene.
+        sides: The scene itself, then its results.
+        views: The worst of the first result first.
+        num_views: Views that were measured, which may be more.
+        reference: What scores compare with, in words.
+        notes: Warnings and limits, one sentence each.
+    """
+
+    title: str
+    sides: tuple[Side, ...]
+    views: tuple[PageView, ...]
+    num_views: int
+    reference: str
+    notes: tuple[str, ...]
+
+    @property
+    def held_out(self) -> bool:
+        """Whether the means are over held-out views."""
+        return any(view.held_out for view in self.views)
+
+
+def collect(
+    title: str,
+    scene: PixelScene | UnalignedScene,
+    results: Mapping[str, Gaussians],
+    file_bytes: Sequence[int],
+    held_out: Views | None = None,
+    *,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> ViewData:
+    """Draw and measure a scene and its results in all views.
+
+    Args:
+        title: Name of the scene.
+        scene: With at least one view.
+        results: Gaussians by name, in the scene's world.
+        file_bytes: Sizes of the scene's file and of those of the results.
+        held_out: Views that were no input.
+        threads: Threads to use; None: all processors.
+        progress: As of :func:`gsmerge.evaluate`.
+    """
+    splits = {"context": (scene.cameras.numpy(), scene.images, scene.names)}
+    splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
+    stills: dict[tuple[str, str, int], bytes] = {}
+
+    def keep(result: str, split: str, view: int, image: np.ndarray) -> None:
+        stills[result, split, view] = encode_still(to_picture(image))
+
+    options = EvaluateOptions((), threads=threads)
+    evaluation = evaluate(scene, results, held_out, options, progress=progress, on_image=keep)
+    frame = scene_frame(scene)
+    named = {INPUT: scene.file_gaussians, **{name: some.numpy() for name, some in results.items()}}
+    sides = [
+        _side(one, frame.enter(named[one.name]), size, "context" if held_out is None else "target")
+        for one, size in zip(evaluation.results, file_bytes, strict=True)
+    ]
+    means = frame.enter(named[evaluation.results[1].name]).means
+    views: list[PageView] = []
+    for split, (cameras, photos, names) in splits.items():
+        for i, name in enumerate(short_names(names)):
+            camera = frame.enter_cameras(cameras[[i]])
+            views.append(PageView(
+                name=name,
+                place=len(views),
+                held_out=split == "target",
+                camera=camera,
+                distance=middle_depth(means, camera),
+                photo=None if photos is None else encode_still(to_picture(photos[i])),
+                stills=tuple(stills[one.name, split, i] for one in evaluation.results),
+                scores=tuple(one.scores[len(views)].masked for one in evaluation.results),
+            ))  # fmt: skip
+    shown = _shown(views)
+    notes = (*evaluation.notes, *_limits(sides, len(shown), len(views)))
+    return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes)
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names of photos without folders and endings, where that tells them apart."""
+    stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
+    return stems if len(set(stems)) == len(stems) else list(names)
+
+
+def encode_still(picture: Picture) -> bytes:
+    """A picture as WebP."""
+    _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
+    return bytes(data.tobytes())
+
+
+def middle_depth(means: np.ndarray, camera: Cameras) -> float:
+    """Median depth of the points ``[n,3]`` that one camera has in its picture; 1 where there is none."""
+    points = means[:: max(1, len(means) // DEPTH_SAMPLE)].astype(np.float64)
+    x, y, z = (points @ camera.viewmats[0, :3, :3].T + camera.viewmats[0, :3, 3]).T
+    fx, fy, cx, cy = camera.Ks[0][[0, 1, 0, 1], [0, 1, 2, 2]]
+    with np.errstate(all="ignore"):
+        u, v = fx * x / z + cx, fy * y / z + cy
+    inside = (z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    return float(np.median(z[inside])) if inside.any() else 1.0
+
+
+def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:
+    spz, degree = page_spz(gaussians)
+    mean = result.mean(split)[1]
+    return Side(result.name, result.num_gaussians, file_bytes, mean, spz, degree, gaussians.sh_degree)
+
+
+def page_spz(gaussians: Gaussians) -> tuple[bytes | None, int]:
+    """Those that are drawn as ``.spz`` with as many harmonics as fit, and their degree; None where there are too many.
+
+    Args:
+        gaussians: In the page's frame, where what is seen is about 1 large: browsers keep means in 16 bits.
+    """
+    drawn = gaussians.opacities >= MIN_OPACITY
+    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
+        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
+    count = int(drawn.sum())
+    if count > MAX_GAUSSIANS:
+        return None, 0
+    sizes = {degree: (20 + 3 * ((degree + 1) ** 2 - 1)) * count for degree in range(spz_writer.MAX_DEGREE + 1)}
+    degree = max((d for d, size in sizes.items() if d <= gaussians.sh_degree and size <= MAX_SPZ_BYTES), default=0)
+    kept = replace(gaussians, shN=gaussians.shN[:, : (degree + 1) ** 2 - 1])[drawn]
+    return spz_writer.spz_bytes(kept), degree
+
+
+def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
+    """At most ``MAX_VIEWS`` of them and the worst, the worst of the first result first."""
+
+    def quality(view: PageView) -> float:
+        score = view.scores[1].psnr
+        return np.inf if score is None else score
+
+    ids = set(even_views(len(views), min(len(views), MAX_VIEWS)))
+    ids.add(min(range(len(views)), key=lambda i: quality(views[i])))
+    return tuple(sorted((views[i] for i in sorted(ids)), key=quality))
+
+
+def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
+    """What the page leaves out."""
+    notes = []
+    for side in sides:
+        if side.spz is None:
+            notes.append(
+                f"{side.name}: {side.num_gaussians:,} Gaussians are too many for a page, which takes"
+                f" {MAX_GAUSSIANS:,}: stills only"
+            )
+        elif side.sh_degree < side.file_sh_degree:
+            notes.append(f"{side.name}: in 3D with harmonics up to degree {side.sh_degree} of {side.file_sh_degree}")
+    if num_shown < num_views:
+        notes.append(f"{num_shown} of {num_views} views are shown, the worst among them; means are over all")
+    return notes

@@ -1,0 +1,124 @@
+"""Pages: templates and styles of this package, filled; everything that they show is in the one file."""
+
+from __future__ import annotations
+
+import base64
+import json
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsmerge import __version__
+from gsmerge.report import human_bytes
+from gsmerge.view.data import PageView, Side, ViewData
+
+if TYPE_CHECKING:
+    import jinja2
+
+PICTURES = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+# Spark decodes in WebAssembly, sorts in a worker, and has both as data: addresses in its own text
+SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
+ENGINE = "vendor/spark-three.js.gz"
+
+
+def view_page(data: ViewData) -> str:
+    """The page of a scene before and after, in HTML."""
+    photos = any(view.photo is not None for view in data.views)
+    sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
+    sources += [
+        {"name": side.name, "splats": None if side.spz is None else f"splats-{i}", "count": side.num_gaussians}
+        for i, side in enumerate(data.sides)
+    ]
+    left, right = int(photos), int(photos) + 1
+    stills = [
+        [None if still is None else data_uri(still, "image/webp") for still in (view.photo, *view.stills)[not photos :]]
+        for view in data.views
+    ]
+    first = {side: stills[0][side] for side in (left, right)}  # in the page itself, to be seen at once
+    stills[0][left] = stills[0][right] = None
+    splats = {f"splats-{i}": base64_text(side.spz) for i, side in enumerate(data.sides) if side.spz is not None}
+    engine = files("gsmerge.view").joinpath(ENGINE).read_bytes() if splats else None
+    return render_template(
+        "view.html",
+        policy=SOLID,
+        data=data,
+        headline=headline(*data.sides[:2]),
+        sources=sources,
+        left=left,
+        right=right,
+        first=first,
+        json_data={"sources": sources, "photos": photos, "views": [_view(view) for view in data.views]},
+        stills=stills,
+        splats=splats,
+        engine=engine and base64_text(engine),
+    )
+
+
+def headline(before: Side, after: Side) -> str:
+    """What became of the scene, in one line: how many Gaussians, and how much closer to the photos."""
+    return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr)
+
+
+def headline_of(num_before: int, num_after: int, old: float | None, new: float | None) -> str:
+    """The same of numbers; ``old`` and ``new`` are PSNR in dB, the former infinite where the input is the reference."""
+    share = 100 * num_after / max(num_before, 1)
+    said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
+    if new is None or old is None or not np.isfinite(new):
+        return said
+    if not np.isfinite(old):
+        return f"{said}, {new:.1f} dB from the input's own renders"
+    return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} the photos"
+
+
+def _view(view: PageView) -> dict[str, Any]:
+    """A view for the page's script: row-major world to camera, intrinsics in pixels."""
+    camera = view.camera
+    return {
+        "name": view.name,
+        "held_out": view.held_out,
+        "viewmat": camera.viewmats[0].reshape(-1).tolist(),
+        "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
+        "width": camera.width,
+        "height": camera.height,
+        "distance": view.distance,
+        "scores": [[_finite(score.psnr), _finite(score.ssim)] for score in view.scores],
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON knows no infinity, which is the PSNR of equal pictures."""
+    return None if value is None or value == float("inf") else round(value, 4)
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    """A file as an address that holds it."""
+    return f"data:{kind};base64,{base64_text(content)}"
+
+
+def base64_text(content: bytes) -> str:
+    """Bytes in the 64 characters that HTML leaves alone."""
+    return base64.b64encode(content).decode("ascii")
+
+
+def render_template(name: str, **values: Any) -> str:
+    """A template with these values, which are escaped unless it says otherwise."""
+    text = _environment().get_template(name).render(version=__version__, **values)
+    return text.encode("utf-8", "replace").decode("utf-8")  # names of files may hold halves of characters
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    import jinja2
+
+    def number(value: float | None, digits: int) -> str:
+        return "-" if value is None or value == float("inf") else f"{value:.{digits}f}"
+
+    loader = jinja2.PackageLoader("gsmerge.view")
+    made = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    made.filters |= {"bytes": human_bytes, "number": number}
+    made.policies["json.dumps_function"] = lambda value, **_: json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return made

@@ -1,0 +1,151 @@
+"""The page of ``gsmerge view`` in a real browser: stills, 3D as our own renderer draws it, jumps, the swipe."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import gsmerge
+from gsmerge.measure.evaluate import near_plane
+from gsmerge.render.metrics import psnr
+
+from .browser import Browser, browser
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium installed")
+SIZE = WIDTH, HEIGHT = 192, 128
+PATIENCE = 120.0  # seconds: 3D on a processor that other tests use as well
+SETTLED = "state.solid === '1' && stage.getAttribute('aria-busy') === 'false'"
+# The picture alone, one pixel of the photo for one of the screen
+BARE = (
+    "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = 'none';"
+    f"stage.style.borderRadius = 0; stage.style.width = '{WIDTH}px'; stage.style.margin = 0; scrollTo(0, 0);"
+)
+
+
+@pytest.fixture(scope="module")
+def opened(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, Any]]:
+    from gsmerge.cli import main
+
+    folder = tmp_path_factory.mktemp("view")
+    scene = make_scene(folder / "room", num_views=3, width=WIDTH, height=HEIGHT)
+    small, page = scene / "small<b>.ply", folder / "page.html"
+    assert main(["compact", str(scene), "-o", str(small), "--effort", "draft", "-q"]) == 0
+    targets = ["--targets", str(scene / "targets")]
+    assert main(["view", str(scene), str(small), *targets, "-o", str(page), "--no-open", "-q"]) == 0
+    assert CHROMIUM is not None
+    with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
+        tab.open(page)
+        wait(tab, "solid !== null")
+        tab.run("set('solid', '1')")
+        wait(tab, SETTLED)
+        yield tab, (gsmerge.read_scene(scene), gsmerge.read_ply(small).gaussians)
+
+
+def wait(tab: Browser, condition: str) -> None:
+    end = time.monotonic() + PATIENCE
+    while not tab.run(condition):
+        assert time.monotonic() < end, tab.run("id('status').textContent")
+        time.sleep(0.05)
+
+
+def picture(tab: Browser) -> np.ndarray:
+    """``[h,w,3]`` what the stage shows, in [0, 1]."""
+    wait(tab, f"({SETTLED}) || state.solid === '' && [...document.images].every(image => image.complete)")
+    box = tab.run("JSON.parse(JSON.stringify(stage.getBoundingClientRect()))")
+    clip = {"x": box["x"], "y": box["y"], "width": WIDTH, "height": HEIGHT, "scale": 1}
+    data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return np.asarray(image[..., ::-1], np.float32) / 255
+
+
+def test_3d_is_what_we_render_at_every_input_view(opened: tuple[Browser, Any]) -> None:
+    tab, (scene, small) = opened
+    tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); clearInterval(blinking)")
+    inputs = tab.run("data.views.map((view, i) => [view.held_out, view.name, i]).filter(one => !one[0])")
+    assert len(inputs) == 3
+    for _, name, index in inputs:
+        view = next(i for i, path in enumerate(scene.names) if path.endswith(f"{name}.png"))
+        tab.run(f"jump({index})")
+        for other, gaussians in (("false", scene.gaussians), ("true", small)):
+            drawn = gsmerge.render(gaussians, scene.cameras[[view]], near=near_plane(scene)).images[0].clip(0, 1)
+            for solid, least in (("'1'", 30), ("''", 35)):  # as the browser draws it, and the still
+                tab.run(f"set('solid', {solid}); set('other', {other})")
+                assert psnr(picture(tab), drawn) > least
+    assert tab.run("state.atCamera") is True
+
+
+def test_leaving_a_camera_and_coming_back(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.run(f"{BARE} set('mode', 'blink'); set('solid', '1'); jump(0)")
+    there = picture(tab)
+    tab.run("solid.orbit(0.3, 0.1); solid.dolly(1.2)")
+    wait(tab, "state.atCamera === false && id('back').hidden === false")
+    assert psnr(picture(tab), there) < 30
+    tab.run("id('back').click()")
+    assert psnr(picture(tab), there) > 45
+
+
+def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.run(f"{BARE} jump(0); set('solid', ''); set('other', false); set('mode', 'blink')")
+    left = picture(tab)
+    tab.run("set('other', true)")
+    right = picture(tab)
+    for solid in ("''", "'1'"):
+        tab.run(f"set('solid', {solid}); set('mode', 'swipe'); swipeTo(0.25)")
+        both, cut = picture(tab), WIDTH // 4
+        assert psnr(both[:, : cut - 2], left[:, : cut - 2]) > 30
+        assert psnr(both[:, cut + 2 :], right[:, cut + 2 :]) > 30
+        assert psnr(both[:, cut + 2 :], left[:, cut + 2 :]) < 30
+
+
+def test_a_difference_of_a_scene_with_itself_is_black(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.run(f"{BARE} jump(0); set('mode', 'difference'); set('pixels', 'photo')")
+    for solid in ("''", "'1'"):
+        tab.run(f"set('solid', {solid})")
+        assert picture(tab).mean() > 0.02
+        tab.run("set('left', state.right)")
+        assert picture(tab).mean() < 0.005
+        tab.run("set('left', state.right - 1)")
+
+
+def test_keys(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.run("jump(0); set('solid', ''); set('mode', 'swipe'); swipeTo(0.5)")
+    for key, code in (("ArrowLeft", 37), ("ArrowDown", 40), ("2", 50), ("s", 83)):
+        tab.press(key, code)
+    assert tab.run("[state.at, state.view, state.mode, state.solid]") == [0.48, 1, "side", "1"]
+    assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
+
+
+def test_it_fits_a_phone(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
+    for mode in ("swipe", "side"):
+        tab.run(f"set('mode', '{mode}')")
+        assert tab.run("document.documentElement.scrollWidth") == 390
+    assert tab.run("id('strip').scrollWidth > id('strip').clientWidth")
+    tab.call("Emulation.clearDeviceMetricsOverride")
+
+
+def test_nothing_is_fetched_and_nothing_complains(opened: tuple[Browser, Any]) -> None:
+    """After all that the others did."""
+    tab, _ = opened
+    assert [url[:60] for url in tab.requests() if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in tab.requests() if url.startswith("file:")][1:] == []
+    assert [one for one in tab.complaints() if '"level": "warning"' not in one] == []  # of the driver, about its speed
+    assert [event for event in tab.events if event.get("method") == "Runtime.consoleAPICalled"] == []
+    assert tab.run("document.querySelectorAll('b b, select b').length") == 0
+    assert tab.run("id('right-tag').textContent").endswith(".ply")

@@ -1,0 +1,167 @@
+"""What a page shows: pictures, cameras, numbers, Gaussians."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians, PixelScene, evaluate, render
+from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
+from gsmerge.measure.preview import to_picture
+from gsmerge.render.metrics import psnr
+from gsmerge.view import data
+from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, page_spz, short_names
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120), noise=0.05)
+
+
+@pytest.fixture(scope="module")
+def half(scene: PixelScene) -> Gaussians:
+    return scene.gaussians[::2]
+
+
+@pytest.fixture(scope="module")
+def held_out() -> Views:
+    other = scenes.make_scene(scenes.room(), scenes.arc(2, 180, 108))
+    assert other.images is not None
+    return Views(other.cameras, other.images, ("x/a.png", "x/b.png"))
+
+
+@pytest.fixture(scope="module")
+def actual(scene: PixelScene, half: Gaussians, held_out: Views) -> ViewData:
+    return collect("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
+
+
+def decoded(still: bytes | None) -> np.ndarray:
+    assert still is not None
+    image = cv2.imdecode(np.frombuffer(still, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return np.asarray(image[..., ::-1], np.float32) / 255
+
+
+def test_numbers_are_those_of_evaluate(actual: ViewData, scene: PixelScene, half: Gaussians, held_out: Views) -> None:
+    expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=()))
+    by_place = sorted(actual.views, key=lambda view: view.place)
+    for side, result in enumerate(expected.results):
+        assert [view.scores[side] for view in by_place] == [score.masked for score in result.scores]
+        assert actual.sides[side].mean == result.mean("target")[1]
+    assert [side.name for side in actual.sides] == ["input", "half", "all"]
+    assert [side.file_bytes for side in actual.sides] == [300, 200, 100]
+    assert [view.held_out for view in by_place] == [False, False, False, True, True]
+
+
+def test_the_worst_view_comes_first(actual: ViewData) -> None:
+    values = [view.scores[1].psnr for view in actual.views]
+    assert len(values) == actual.num_views == 5
+    assert values == sorted(values, key=lambda value: value or 0)
+
+
+def test_stills_are_our_renders(actual: ViewData, scene: PixelScene, half: Gaussians, held_out: Views) -> None:
+    for view in actual.views:
+        split, i = (held_out, view.place - 3) if view.held_out else (scene, view.place)
+        assert split.images is not None
+        renders = [
+            render(some, split.cameras[[i]], near=near_plane(scene)).images[0].clip(0, 1)
+            for some in (scene.gaussians, half)
+        ]
+        for still, picture in zip((view.photo, *view.stills), (split.images[i], *renders), strict=False):
+            assert psnr(decoded(still), picture) > 34  # 41 where pictures are not as small and colourful
+
+
+def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: PixelScene) -> None:
+    """What a view sees in the world it sees in the page's frame."""
+    spz = actual.sides[1].spz
+    assert spz is not None
+    raw = gzip.decompress(spz)
+    count, _, fraction = struct.unpack_from("<IBB", raw, 8)
+    drawn = half.means[half.opacities >= data.MIN_OPACITY]
+    assert count == len(drawn)
+    triples = np.frombuffer(raw, np.uint8, 9 * count, 16).reshape(-1, 3)
+    fixed = np.pad(triples, ((0, 0), (0, 1))).view("<i4")[:, 0]
+    means = ((fixed + 2**23) % 2**24 - 2**23).reshape(-1, 3) / 2.0**fraction
+    view = next(view for view in actual.views if view.place == 1)
+    ours = means @ view.camera.viewmats[0, :3, :3].T + view.camera.viewmats[0, :3, 3]
+    world = drawn @ scene.cameras.viewmats[1, :3, :3].T + scene.cameras.viewmats[1, :3, 3]
+    assert np.allclose(ours[:, :2] / ours[:, 2:], world[:, :2] / world[:, 2:], atol=1e-3)
+    assert view.distance == pytest.approx(np.median(ours[:, 2]), rel=0.3)
+
+
+def test_too_many_gaussians_are_left_out(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
+    actual = collect("room", scene, {"half": half}, (2, 1))
+    assert actual.sides[0].spz is None
+    assert actual.sides[1].spz is not None
+    assert any("input: " in note and "stills only" in note for note in actual.notes)
+
+
+def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    curved = replace(half, shN=np.full((len(half), 15, 3), 0.1, np.float32))
+    assert page_spz(curved)[1] == 3
+    monkeypatch.setattr(data, "MAX_SPZ_BYTES", 45 * len(half))
+    content, degree = page_spz(curved)
+    assert degree == 2
+    assert content is not None
+    assert len(gzip.decompress(content)) < 45 * len(half)
+
+
+def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
+    means, opacities = half.means.copy(), half.opacities.copy()
+    means[0, 1], opacities[1] = np.nan, 0.003
+    content, _ = page_spz(replace(half, means=means, opacities=opacities))
+    whole, _ = page_spz(half)
+    assert content is not None
+    assert whole is not None
+    counts = [struct.unpack_from("<I", gzip.decompress(one), 8)[0] for one in (content, whole)]
+    assert counts[0] == counts[1] - 2
+
+
+def test_many_views_are_thinned(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(data, "MAX_VIEWS", 1)
+    actual = collect("room", scene, {"half": half}, (2, 1))
+    everything = evaluate(scene, {"half": half}, None, EvaluateOptions(lpips=())).results[1].scores
+    assert 1 <= len(actual.views) <= 2
+    assert actual.views[0].scores[1].psnr == min(score.masked.psnr or 0 for score in everything)
+    assert any(f"{len(actual.views)} of 3 views" in note for note in actual.notes)
+
+
+def test_without_photos_results_are_compared_with_the_input(scene: PixelScene, half: Gaussians) -> None:
+    actual = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
+    assert [view.photo for view in actual.views] == [None] * 3
+    assert actual.reference == "renders of the input"
+
+
+@pytest.mark.parametrize(
+    ("names", "short"),
+    [
+        (("images/a.png", "images/b.png"), ["a", "b"]),
+        (("left\\0.png", "right\\0.png"), ["left\\0.png", "right\\0.png"]),
+        (("a.png", "a.jpg"), ["a.png", "a.jpg"]),
+        ((), []),
+    ],
+)
+def test_short_names(names: tuple[str, ...], short: list[str]) -> None:
+    assert short_names(names) == short
+
+
+def test_depth_of_nothing() -> None:
+    camera = scenes.arc(1)
+    assert middle_depth(np.zeros((0, 3)), camera) == 1
+    behind = camera.centres[0] - 5 * camera.viewmats[0, 2, :3]
+    assert middle_depth(behind[None], camera) == 1
+    ahead = camera.centres[0] + 5 * camera.viewmats[0, 2, :3]
+    assert middle_depth(ahead[None], camera) == pytest.approx(5)
+
+
+def test_a_still_keeps_red_red() -> None:
+    red = np.zeros((16, 16, 3), np.float32)
+    red[..., 0] = 1
+    assert psnr(decoded(encode_still(to_picture(red))), red) > 30

@@ -1,0 +1,123 @@
+"""The page: complete in one file, and nothing in it that a name could have put there."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from dataclasses import replace
+from importlib.resources import files
+
+import pytest
+import scenes
+
+from gsmerge.measure.evaluate import Quality
+from gsmerge.view.data import ViewData, collect
+from gsmerge.view.page import headline, view_page
+
+EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
+NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
+
+
+@pytest.fixture(scope="module")
+def data() -> ViewData:
+    scene = replace(scenes.make_scene(scenes.room(), scenes.arc(3)), names=NAMES)
+    return collect(EVIL, scene, {EVIL: scene.gaussians[::2]}, (2_000_000, 1000))
+
+
+@pytest.fixture(scope="module")
+def page(data: ViewData) -> str:
+    return view_page(data)
+
+
+def block(page: str, name: str) -> str:
+    found = re.search(rf'<script type="[a-z/]+" id="{name}">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_it_loads_nothing(page: str) -> None:
+    addresses = re.findall(r"""(?:src|href)=["']([^"']+)["']|url\(([^)]+)\)""", _written(page))
+    assert len(addresses) >= 3
+    assert all(one.startswith(("data:", '"${')) for pair in addresses for one in pair if one)
+    assert re.findall(r"https?:|[\"']//", _written(page)) == []
+    assert "Content-Security-Policy" in page
+    assert "default-src &#39;none&#39;" in page
+
+
+def _written(page: str) -> str:
+    """The page without what is in base64: pictures and programs."""
+    return re.sub(r'(<script type="text/plain" id="[\w-]+">)[^<]*', r"\1", re.sub(r"base64,[\w+/=]+", "base64,", page))
+
+
+def test_names_are_escaped(page: str) -> None:
+    text = _written(page)
+    assert "<b onload" not in text
+    assert "<i>" not in text
+    assert text.count("&lt;/script&gt;&lt;b onload=&#34;x&#34;&gt;&amp;{{ 7 * 7 }}") >= 3
+    assert text.count("<script") == text.count("</script>")
+
+
+def test_what_the_script_reads(page: str, data: ViewData) -> None:
+    read = json.loads(block(page, "data"))
+    assert [source["name"] for source in read["sources"]] == ["photo", "input", EVIL]
+    assert [view["name"] for view in read["views"]] == [view.name for view in data.views]
+    first = read["views"][0]
+    assert len(first["viewmat"]) == 16
+    assert (first["width"], first["height"]) == (data.views[0].camera.width, data.views[0].camera.height)
+    stills = json.loads(block(page, "stills"))
+    assert stills[0][1:] == [None, None]  # those are in the page itself
+    address = stills[1][2]
+    assert base64.b64decode(address.removeprefix("data:image/webp;base64,")) == data.views[1].stills[1]
+    assert page.index("data:image/webp") < page.index("<script")
+    for i, side in enumerate(data.sides):
+        assert base64.b64decode(block(page, f"splats-{i}")) == side.spz
+    assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
+
+
+def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
+    page = view_page(replace(data, sides=tuple(replace(side, spz=None) for side in data.sides)))
+    assert 'id="engine"' not in page
+    assert "class SplatView" not in page
+    assert len(page) < 200_000
+
+
+def test_without_photos(data: ViewData) -> None:
+    page = view_page(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
+    assert [source["name"] for source in json.loads(block(page, "data"))["sources"]] == ["input", EVIL]
+    assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
+    assert "odd?" in view_page(replace(data, title="odd\udcff"))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (20.0, 25.04, "5.0 dB closer to the photos"),
+        (20.0, 19.0, "1.0 dB farther from the photos"),
+        (float("inf"), 30.0, "30.0 dB from the input's own renders"),
+        (None, None, "Gaussians"),
+        (float("inf"), float("inf"), "Gaussians"),
+    ],
+)
+def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
+    sides = [replace(side, mean=Quality(psnr)) for side, psnr in zip(data.sides, (before, after), strict=True)]
+    line = headline(*sides)
+    assert line.endswith(words)
+    assert line.startswith("50.0 % of the Gaussians")
+
+
+def test_the_renderer_is_the_one_that_was_vendored() -> None:
+    """Who changes it runs tools/vendor_viewer.py, which writes down where it came from."""
+    vendor = files("gsmerge.view").joinpath("vendor")
+    sources = json.loads(vendor.joinpath("SOURCES.json").read_text())
+    script = gzip.decompress(vendor.joinpath(sources["script"]["file"]).read_bytes())
+    assert hashlib.sha256(script).hexdigest() == sources["script"]["sha256"]
+    assert len(script) == sources["script"]["bytes"]
+    assert set(sources["packages"]) >= {"@sparkjsdev/spark", "three"}
+    for package in ("spark", "three", "fflate"):
+        assert "MIT" in vendor.joinpath(f"LICENSE.{package}").read_text()

@@ -1,0 +1,99 @@
+"""Makes gsmerge/view/vendor: Spark and three.js in one compressed script, their licences, and where they came from.
+
+python tools/vendor_viewer.py
+
+Only who changes a version needs this; it runs on Linux x86-64 and takes npm, which fetches four packages, and no Node
+program of them is run. Equal versions give equal bytes, and a test compares the script with its hash in SOURCES.json.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import subprocess
+import tarfile
+import tempfile
+from pathlib import Path
+
+VENDOR = Path(__file__).parents[1] / "gsmerge" / "view" / "vendor"
+SCRIPT = "spark-three.js.gz"
+# npm package -> version, and its hash as the registry and `npm view PACKAGE dist.integrity` give it
+PACKAGES = {
+    "@sparkjsdev/spark": (
+        "2.2.0",
+        "sha512-wf5F2YAmPXnjm20/MgXYer9FQTXz2JOCo05HwxFkaD7Guk9rHVPIwdJ6fq0oF9ME0heMvYj+TxS6DTrucvy6KA==",
+    ),
+    "three": (
+        "0.187.0",
+        "sha512-Qiu7R+Cmh8CstZsY1uJOSWnVlfo7ZtNLV7mF8Jltk3LB3AtDu9cRZlcnRKkAk8Y4z6KKw35z7Y7Urd7jWY8etA==",
+    ),
+    "fflate": (  # which Spark contains
+        "0.8.2",
+        "sha512-cPJU47OaAoCbg0pBvzsgpTPhmhqI5eJjh/JIu8tPj5q+T7iLvW/JAYUqmE7KOB4R1ZyEhzBaIQpQpardBF5z8A==",
+    ),
+    "@esbuild/linux-x64": (
+        "0.28.2",
+        "sha512-4xTZr1FUmSoQW4XIWmit3tzQrUTZM+N3P0XV8xROKYF50XfI7xeO90+1bZvNwxIufQ9hDQVRJH5YhgPVF8A/HQ==",
+    ),
+}
+LICENCES = {"@sparkjsdev/spark": "LICENSE.spark", "three": "LICENSE.three", "fflate": "LICENSE.fflate"}
+# What the page's own script uses of the two
+ENTRY = """
+export { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+export {
+  BufferAttribute, BufferGeometry, FramebufferTexture, LineSegments, Matrix4, Mesh, PerspectiveCamera, PlaneGeometry,
+  Points, Scene, ShaderMaterial, Vector3, WebGLRenderer,
+} from "three";
+"""
+
+
+def main() -> None:
+    """Fetch, check, bundle, compress."""
+    with tempfile.TemporaryDirectory() as work:
+        modules = Path(work) / "node_modules"
+        for package in PACKAGES:
+            unpack(fetch(package, Path(work)), modules / package)
+        entry, bundle = Path(work) / "entry.js", Path(work) / "bundle.js"
+        entry.write_text(ENTRY, encoding="utf-8")
+        esbuild = modules / "@esbuild" / "linux-x64" / "bin" / "esbuild"
+        options = ("--bundle", "--minify", "--format=iife", "--global-name=Vendor", "--legal-comments=none")
+        subprocess.run([esbuild, entry, *options, f"--outfile={bundle}"], cwd=work, check=True)
+        script = bundle.read_bytes()
+        VENDOR.mkdir(parents=True, exist_ok=True)
+        VENDOR.joinpath(SCRIPT).write_bytes(gzip.compress(script, 9, mtime=0))
+        for package, name in LICENCES.items():
+            VENDOR.joinpath(name).write_bytes(modules.joinpath(package, "LICENSE").read_bytes())
+    sources = {
+        "made_by": f"tools/{Path(__file__).name}",
+        "script": {"file": SCRIPT, "bytes": len(script), "sha256": hashlib.sha256(script).hexdigest()},
+        "packages": {name: {"version": version, "integrity": it} for name, (version, it) in PACKAGES.items()},
+    }
+    VENDOR.joinpath("SOURCES.json").write_text(json.dumps(sources, indent=2) + "\n", encoding="utf-8")
+    print(f"{VENDOR}: {len(script):,} bytes, {VENDOR.joinpath(SCRIPT).stat().st_size:,} compressed")
+
+
+def fetch(package: str, folder: Path) -> Path:
+    """The package's tarball, its hash checked."""
+    version, integrity = PACKAGES[package]
+    call = ["npm", "pack", "--silent", "--ignore-scripts", f"{package}@{version}"]
+    name = subprocess.run(call, cwd=folder, check=True, capture_output=True, text=True).stdout.split()[-1]
+    digest = hashlib.sha512(folder.joinpath(name).read_bytes()).digest()
+    if integrity != f"sha512-{base64.b64encode(digest).decode()}":
+        raise SystemExit(f"{package}@{version}: expected {integrity}, got another file")
+    return folder / name
+
+
+def unpack(tarball: Path, folder: Path) -> None:
+    """The tarball's one folder, as ``folder``."""
+    folder.mkdir(parents=True)
+    with tarfile.open(tarball) as archive:
+        for member in archive.getmembers():
+            member.name = member.name.partition("/")[2]
+            if member.isfile():
+                archive.extract(member, folder, filter="data")
+
+
+if __name__ == "__main__":
+    main()
