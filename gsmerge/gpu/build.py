@@ -39,6 +39,8 @@ from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.decode import decode_merged
+from gsmerge.stages.fit import fit as fit_on_cpu
+from gsmerge.stages.fit.photos import fit_photos, photo_scale
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match as match_on_cpu
 from gsmerge.stages.merge import MergedViews
@@ -136,12 +138,24 @@ class DeviceScene:
         log.choices |= {"device": self.device.type} | ({"on_cpu": reasons} if reasons else {})
         if scene.images is None or not options.fit.needs_photos:
             return download_gaussians(shapes)
-        with self.stage(log, "fit"):
-            log.choices["begun_with"] = len(shapes)
-            shapes, report = fit(
-                shapes, self.photos, options.fit, count, options.seed, log.fit_progress, other, exact=exact
-            )
-            gaussians = download_gaussians(shapes)
+        scale, problem = photo_scale(scene, options.fit)
+        log.choices["begun_with"] = len(shapes)
+        if scale > 1:
+            reasons["fit"] = f"photo_scale {scale:.3g}"
+            log.choices["on_cpu"] = reasons
+            start, other_start = download_gaussians(shapes), None if other is None else download_gaussians(other)
+            with log.stage("fit"):
+                photos = fit_photos(scene, options.fit, log)
+                gaussians, report = fit_on_cpu(
+                    start, photos, options.fit, count, options.seed, log.fit_progress, other_start, exact=exact
+                )
+        else:
+            log.notes += [] if problem is None else [problem]
+            with self.stage(log, "fit"):
+                shapes, report = fit(
+                    shapes, self.photos, options.fit, count, options.seed, log.fit_progress, other, exact=exact
+                )
+                gaussians = download_gaussians(shapes)
         log.add_fit(report)
         return gaussians
 

@@ -24,7 +24,7 @@ START = 0.57  # share of the Gaussians that a run which grows begins with
 
 def fit(
     gaussians: Gaussians,
-    photos: tuple[Photos, Photos],
+    photos: tuple[Photos, ...],
     options: FitOptions,
     count: int = 0,
     seed: int = 0,
@@ -39,7 +39,7 @@ def fit(
 
     Args:
         gaussians: Canonical Gaussians.
-        photos: The input views at full and at half size.
+        photos: The input views, see :func:`gsmerge.stages.fit.fit_photos`. Larger ones are fitted to on the CPU alone.
         options: What to fit.
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
@@ -51,12 +51,12 @@ def fit(
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    device = _device(options, photos[0])
+    device = "cpu" if len(photos) > 2 else _device(options, photos[0])
     if device != "cpu":
         from gsmerge.gpu.fit import fit_gaussians  # torch; it stands above all stages, and is loaded for its use alone
 
         return fit_gaussians(
-            gaussians, photos, options, count, seed, progress, baseline_start, exact=exact, device=device
+            gaussians, photos[:2], options, count, seed, progress, baseline_start, exact=exact, device=device
         )
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
