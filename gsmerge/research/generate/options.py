@@ -158,9 +158,7 @@ class GenerateOptions:
     views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours
     width: int = 320  # of the views, pixels: 16 to 2048
     height: int = 240  # the same
-    photo_scale: int = (
-        1  # times the views' size that the photos have, 1 to 8; Gaussians are predicted at the views' own
-    )
+    photo_scale: int = 1  # times the views' size that the photos have, 1 to 8; the network sees the views' own
     style: str = MIXED  # one of STYLES, or "mixed": each in turn
     path: str = MIXED  # one of PATHS, or "mixed": any
     noise: float = 1.0  # factor on the errors: 0 to 10

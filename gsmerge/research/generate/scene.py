@@ -61,14 +61,14 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     poses = [pose(s) for s in places]
     gain = find_exposure([radiance(view, p, _shrink(lens), 1)[0] for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
-    photos = parallel_map(
-        partial(_photo, view, lens, options.photo_scale, noise, gain), list(zip(poses, seeds, strict=True))
-    )
+    photo = partial(_photo, view, lens, large, noise, gain)
+    photos = parallel_map(photo, list(zip(poses, seeds, strict=True)))
     world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
     moved = [_move_pose(pose, world, noise.unit) for pose in poses]
     seen = []
-    for (photo, depth, normals), true_pose in zip(photos[::2], moved[::2], strict=True):
-        image = cv2.resize(photo, (lens.width, lens.height), interpolation=cv2.INTER_AREA) if large != lens else photo
+    for (image, depth, normals), true_pose in zip(photos[::2], moved[::2], strict=True):
+        if large != lens:
+            image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
         depth = np.minimum(depth, FAR) * noise.unit
         estimate = _perturb_pose(true_pose, noise, float(np.median(depth)), rng)
         rotated = (normals @ world[:3, :3].T).astype(np.float32)
@@ -108,10 +108,9 @@ def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num
 
 
 def _photo(
-    view: LitStage, grid: Lens, scale: int, noise: Noise, gain: float, given: tuple[Array, int]
+    view: LitStage, grid: Lens, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
 ) -> tuple[Float, Array, Float]:
     """The photo from a pose, with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
-    lens = _scale(grid, scale)
     pose, seed = given
     rng = np.random.default_rng(seed)
     linear, _ = radiance(view, pose, lens, SAMPLES)

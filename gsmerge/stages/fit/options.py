@@ -63,9 +63,9 @@ class FitOptions:
             more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
         half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.2 less
             where ``photo_scale`` is above 1.
-        photo_scale: Times the views' size at which the steps after that look at photos that are larger, in turn with the
-            views' own size; never larger than the photos are. ``"auto"``: up to 2 with effort ``"default"`` and
-            ``"best"`` where the photos are at least 1.25 times as large, on the CPU; 1 otherwise.
+        photo_scale: Times the views' size at which two of every five steps after that look at larger photos, as far as
+            the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and ``"best"`` where the photos are
+            at least 1.25 times as large, on the CPU; 1 otherwise.
         average_share: Share of the steps, the last ones, over which the parameters are averaged.
         ssim_lambda: Share of structural similarity in the loss, the rest is L1.
         opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what

@@ -55,8 +55,9 @@ def fit(
     if device != "cpu":
         from gsmerge.gpu.fit import fit_gaussians  # torch; it stands above all stages, and is loaded for its use alone
 
+        pair = photos[0], photos[1]
         return fit_gaussians(
-            gaussians, photos[:2], options, count, seed, progress, baseline_start, exact=exact, device=device
+            gaussians, pair, options, count, seed, progress, baseline_start, exact=exact, device=device
         )
     if exact and not options.grows:
         options = replace(options, min_contribution=0.0)
