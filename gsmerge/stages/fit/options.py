@@ -10,7 +10,7 @@ Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
 STEPS = {"draft": 12, "fast": 30, "default": 220, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
-EARLIER = 0.2  # share of the steps by which half-size photos end sooner where larger ones follow
+EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
@@ -61,7 +61,7 @@ class FitOptions:
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
-        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.2 less
+        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.1 less
             where ``photo_scale`` is above 1.
         photo_scale: Times the views' size at which two of every five steps after that look at larger photos, as far as
             the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and ``"best"`` where the photos are
