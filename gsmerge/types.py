@@ -186,21 +186,17 @@ class LargePhotos:
     ids: tuple[int, ...]  # the number by which each view's photo is read
     read: Callable[[int], np.ndarray]  # number -> [height,width,3] uint8 sRGB; several threads may call it
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
         """The photos of some views."""
         return replace(self, Ks=self.Ks[list(views)], ids=tuple(self.ids[view] for view in views))
 
 
 def _expect_views(scene: PixelScene | UnalignedScene) -> None:
-    cameras = scene.cameras
     if scene.images is not None:
-        _expect("images", scene.images, (len(cameras), cameras.height, cameras.width, 3))
-    for what, some in (("view names", scene.names), ("large photos", scene.large_photos)):
-        if some is not None and len(some) != len(cameras):
-            raise ValueError(f"expected {len(cameras)} {what}, got {len(some)}")
+        _expect("images", scene.images, (len(scene.cameras), scene.cameras.height, scene.cameras.width, 3))
+    for what, some in (("view names", scene.names), ("large photos", getattr(scene.large_photos, "ids", None))):
+        if some is not None and len(some) != len(scene.cameras):
+            raise ValueError(f"expected {len(scene.cameras)} {what}, got {len(some)}")
 
 
 def _arrays(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
