@@ -50,9 +50,9 @@ class Photos:
         return self.images.shape[2]
 
     def image(self, view: int) -> np.ndarray:
-        """``[h,w,3]`` float32 photo, sRGB in [0, 1]."""
+        """``[h,w,3]`` photo, sRGB in [0, 1]."""
         image = self.images[view]
-        return image if image.dtype == np.float32 else np.multiply(image, np.float32(1 / 255), dtype=np.float32)
+        return np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
 
     def camera(self, view: int) -> dict[str, Any]:
         """The arguments that :func:`gsmerge.render.plan_view` needs to render into a photo."""
