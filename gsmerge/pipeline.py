@@ -26,7 +26,7 @@ from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
 from gsmerge.stages.decode import MIXED, decode_merged
 from gsmerge.stages.encode import encode
-from gsmerge.stages.fit import fit
+from gsmerge.stages.fit import fit, fit_photos
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
@@ -108,7 +108,7 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
     if scene.images is None or not options.fit.needs_photos:
         return gaussians
     with log.stage("fit"):
-        photos = scene_photos(scene), scene_photos(scene, 2)
+        photos = fit_photos(scene, options.fit, log)
         log.choices["begun_with"] = len(gaussians)
         gaussians, report = fit(
             gaussians, photos, options.fit, count, options.seed, log.fit_progress, analytic, exact=exact

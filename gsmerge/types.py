@@ -9,7 +9,7 @@ rotate local to world, world-to-camera matrices with OpenCV axes, pixel centres 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -176,11 +176,27 @@ class Cameras:
         return -(rotation.swapaxes(1, 2) @ shift[:, :, None])[:, :, 0]
 
 
-def _expect_views(cameras: Cameras, images: Array | None, names: tuple[str, ...]) -> None:
-    if images is not None:
-        _expect("images", images, (len(cameras), cameras.height, cameras.width, 3))
-    if len(names) != len(cameras):
-        raise ValueError(f"expected {len(cameras)} view names, got {len(names)}")
+@dataclass(frozen=True, eq=False)
+class LargePhotos:
+    """Photos of V views with more pixels than the scene's own, read one at a time; poses are those of its cameras."""
+
+    Ks: np.ndarray  # [v,3,3] intrinsics at their size
+    width: int
+    height: int
+    ids: tuple[int, ...]  # the number by which each view's photo is read
+    read: Callable[[int], np.ndarray]  # number -> [height,width,3] uint8 sRGB; several threads may call it
+
+    def __getitem__(self, views: Sequence[int]) -> LargePhotos:
+        """The photos of some views."""
+        return replace(self, Ks=self.Ks[list(views)], ids=tuple(self.ids[view] for view in views))
+
+
+def _expect_views(scene: PixelScene | UnalignedScene) -> None:
+    if scene.images is not None:
+        _expect("images", scene.images, (len(scene.cameras), scene.cameras.height, scene.cameras.width, 3))
+    for what, some in (("view names", scene.names), ("large photos", getattr(scene.large_photos, "ids", None))):
+        if some is not None and len(some) != len(scene.cameras):
+            raise ValueError(f"expected {len(scene.cameras)} {what}, got {len(some)}")
 
 
 def _arrays(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
@@ -203,6 +219,7 @@ class PixelScene:
         valid: ``[v,h,w]`` bool, False where there is no finite Gaussian.
         names: The views' names (image file names where known).
         missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
+        large_photos: The photos with more pixels than the grid; None where they have no more.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -214,6 +231,7 @@ class PixelScene:
     valid: np.ndarray
     names: tuple[str, ...]
     missing: np.ndarray | None = None
+    large_photos: LargePhotos | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
@@ -222,7 +240,7 @@ class PixelScene:
         _expect("valid", self.valid, (v, h, w))
         if self.missing is not None:
             _expect("missing", self.missing, (v, h, w))
-        _expect_views(self.cameras, self.images, self.names)
+        _expect_views(self)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -266,6 +284,7 @@ class UnalignedScene:
         cameras: The V views; none where none are known.
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
         names: The views' names (image file names where known).
+        large_photos: The photos with more pixels than the views; None where they have no more.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -275,9 +294,10 @@ class UnalignedScene:
     cameras: Cameras
     images: np.ndarray | None
     names: tuple[str, ...]
+    large_photos: LargePhotos | None = None
 
     def __post_init__(self) -> None:
-        _expect_views(self.cameras, self.images, self.names)
+        _expect_views(self)
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -87,8 +87,9 @@ def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> Pixel
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]
     names = tuple(scene.names[i] for i in ids)
+    large = None if scene.large_photos is None else scene.large_photos[ids]
     if isinstance(scene, UnalignedScene):
-        return replace(scene, cameras=scene.cameras[ids], images=images, names=names)
+        return replace(scene, cameras=scene.cameras[ids], images=images, names=names, large_photos=large)
     size = scene.pixels_per_view
     rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
     return replace(
@@ -99,4 +100,5 @@ def subset(scene: PixelScene | UnalignedScene, view_ids: Sequence[int]) -> Pixel
         valid=scene.valid[ids],
         names=names,
         missing=None if scene.missing is None else scene.missing[ids],
+        large_photos=large,
     )

@@ -8,10 +8,9 @@ import numpy as np
 
 from gsmerge.baselines.baseline import merge_groups, most_important, own_gaussians, view_shares
 from gsmerge.render import contributions, plan_view, prepare
-from gsmerge.render.photos import scene_photos
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit import FitOptions, fit
+from gsmerge.stages.fit import FitOptions, fit, fit_photos
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import grid_labels, superpixels
 from gsmerge.types import Cameras, Gaussians, Groups
@@ -42,7 +41,7 @@ def _fit_input(prepared: PreparedScene, options: FitOptions, log: RunLog) -> Gau
     """All Gaussians, fitted to the photos."""
     gaussians = own_gaussians(prepared.scene)
     with log.stage("fit"):
-        photos = scene_photos(prepared.scene), scene_photos(prepared.scene, 2)
+        photos = fit_photos(prepared.scene, options, log)
         gaussians, report = fit(gaussians, photos, options, len(gaussians), prepared.options.seed, log.fit_progress)
     log.add_fit(report)
     return gaussians

@@ -216,6 +216,14 @@ def parse_k(text: str) -> int | str:
     return int(text)
 
 
+def parse_photo_scale(text: str) -> float | str:
+    """``--photo-scale``: a number from 1, or auto."""
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"expected a number from 1 or auto, got {text!r}") from error
+
+
 def parse_superpixels(text: str) -> int | str:
     """``--superpixels``: a number, or a share."""
     return int(text) if text.isdigit() else text
@@ -231,7 +239,7 @@ READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
 COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
 MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
-FIT = "fit effort device fit_steps time_budget"
+FIT = "fit effort device fit_steps photo_scale time_budget"
 NETWORKS = "recipe checkpoint require_checkpoint"
 RUN = "seed threads"
 
@@ -317,6 +325,9 @@ _TABLE = (
         option("device", ("cpu", "cuda", "auto"), "Where the stages run; cuda needs gsmerge[cuda]. auto: a GPU "
                "where there is one and the scene is large enough.", wording="cpu"),
         option("fit_steps", int, "Steps of the full fit.", wording="by effort", rare=True, min=1),
+        option("photo_scale", str, "Fit to photos that are larger than the views at up to so many times the views' "
+               "size, for sharper results up close; auto: up to 2.", wording="auto", rare=True,
+               parser=parse_photo_scale, metavar="NUMBER|auto"),
         option("time_budget", float, "Seconds that the full fit may take.", rare=True, min=0.0),
     ),
     panel(

@@ -35,6 +35,7 @@ def plan_document(
     from gsmerge.options import to_schema
     from gsmerge.runtime.estimate import estimate_run, fit_of, is_robust
     from gsmerge.runtime.threads import available_threads
+    from gsmerge.stages.fit.photos import photo_scale
     from gsmerge.stages.group import budget_count, largest_count, superpixels_per_view
 
     photos, grid = scene.images is not None, (len(scene), scene.cameras.height, scene.cameras.width)
@@ -61,6 +62,7 @@ def plan_document(
         "estimate": estimate_run(
             grid, options, pixels, photos=photos, threads=settings.threads or available_threads(),
             fit_steps=settings.fit.steps, num_rest=3 * scene.gaussians.shN.shape[1],
+            photo_scale=photo_scale(scene, settings.fit)[0],
         ),
         "options": to_schema(options),
         "notes": list(notes),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, say_notes
-from gsmerge.cli.paths import check_cameras, check_outputs, input_files, write_text
+from gsmerge.cli.paths import check_cameras, check_outputs, input_files, write_texts
 from gsmerge.cli.pictures import report_pictures, write_picture
 from gsmerge.errors import UsageError
 
@@ -52,7 +52,7 @@ def preview(args: opt.Args) -> None:
             from gsmerge.view.report_page import pictures_page
 
             title = f"{scenes[0].name}: {len(scenes)} scene(s)"
-            write_text(args.output, pictures_page(title, pictures), overwrite=args.overwrite)
+            write_texts({args.output: pictures_page(title, pictures)}, overwrite=args.overwrite)
     ids = pick_views(len(cameras), args.views)
     facts = {
         "scenes": {str(path): ply.info.count for path, ply in zip(scenes, plys, strict=True)},

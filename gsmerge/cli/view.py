@@ -9,7 +9,7 @@ from pathlib import Path
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
 from gsmerge.cli.held_out import file_names, held_out_views
-from gsmerge.cli.paths import check_outputs, input_files, write_text
+from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
 
@@ -56,7 +56,7 @@ def view(args: opt.Args) -> None:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(title, scene, gaussians, sizes, held_out, threads=args.threads, progress=progress)
     page = view_page(data)
-    write_text(output, page, overwrite=args.overwrite)
+    write_texts({output: page}, overwrite=args.overwrite)
     say_notes(data.notes, quiet=args.silent)
     said = headline(*data.sides[:2])
     document |= {"bytes": len(page), "headline": said, "notes": [*notes, *data.notes]}

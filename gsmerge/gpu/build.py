@@ -37,6 +37,8 @@ from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.decode import decode_merged
+from gsmerge.stages.fit import fit as fit_on_cpu
+from gsmerge.stages.fit.photos import fit_photos, photo_scale
 from gsmerge.stages.fit.stage import fit_with
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match as match_on_cpu
@@ -135,11 +137,23 @@ class DeviceScene:
         log.choices |= {"device": self.device.type} | ({"on_cpu": reasons} if reasons else {})
         if scene.images is None or not options.fit.needs_photos:
             return gaussians.numpy()
-        with self.stage(log, "fit"):
-            log.choices["begun_with"] = len(gaussians)
-            settings = options.fit, count, options.seed, log.fit_progress, other
-            gaussians, report = fit_with(ON_DEVICE, gaussians, self.photos, *settings, exact=exact)
-            gaussians = gaussians.numpy()
+        scale, problem = photo_scale(scene, options.fit)
+        log.choices["begun_with"] = len(gaussians)
+        if scale > 1:
+            reasons["fit"] = f"photo_scale {scale:.3g}"
+            log.choices["on_cpu"] = reasons
+            start, other_start = gaussians.numpy(), None if other is None else other.numpy()
+            with log.stage("fit"):
+                photos = fit_photos(scene, options.fit, log)
+                gaussians, report = fit_on_cpu(
+                    start, photos, options.fit, count, options.seed, log.fit_progress, other_start, exact=exact
+                )
+        else:
+            log.notes += [] if problem is None else [problem]
+            with self.stage(log, "fit"):
+                settings = options.fit, count, options.seed, log.fit_progress, other
+                gaussians, report = fit_with(ON_DEVICE, gaussians, self.photos, *settings, exact=exact)
+                gaussians = gaussians.numpy()
         log.add_fit(report)
         return gaussians
 

@@ -47,25 +47,26 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     Raises:
         SceneError: If an image is missing or cannot be read, or two differ in size.
     """
-    return as_floats(decode_images(source, names))
+    return as_floats(decode_images(match_images(source, names)))
 
 
-def decode_images(source: ImageSource, names: Sequence[str]) -> list[np.ndarray]:
-    """:func:`read_images` as c arrays ``[h,w,3]`` uint8."""
-    paths = match_images(source, names)
+def decode_images(paths: Sequence[Path]) -> list[np.ndarray]:
+    """The images of these files, ``[h,w,3]`` uint8 each. SceneError if one cannot be read, or two differ in size."""
     sizes = [image_size(path) for path in paths]
     for path, (w, h) in zip(paths, sizes, strict=True):
         if (w, h) != sizes[0]:
             w0, h0 = sizes[0]
             raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
 
-    def read(path: Path) -> np.ndarray:
-        try:
-            return _decode(path, np.fromfile(path, np.uint8), sizes[0])
-        except OSError as error:
-            raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    return parallel_map(lambda path: decode_image(path, sizes[0]), paths)
 
-    return parallel_map(read, paths)
+
+def decode_image(path: Path, size: Size) -> np.ndarray:
+    """``[h,w,3]`` uint8 sRGB from a file whose header says that size. SceneError if it cannot be read."""
+    try:
+        return _decode(path, np.fromfile(path, np.uint8), size)
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
 
 
 def as_floats(images: Photos) -> np.ndarray:

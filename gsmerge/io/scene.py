@@ -26,9 +26,9 @@ from gsmerge.io.hints import AUTO, ReadHints, make_hints
 from gsmerge.io.photos import as_floats, photo_size
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.io.unaligned_scene import make_unaligned, usable_rows
-from gsmerge.io.views import limit_photo_size, read_scene_cameras, stored_photos
+from gsmerge.io.views import find_large_photos, limit_photo_size, read_scene_cameras, stored_photos
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, LargePhotos, PixelScene, UnalignedScene
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
@@ -149,19 +149,28 @@ def align_scene(
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     known = camera_file.order if exporter is None else exporter.order
     order = known if hints.order == "auto" else hints.order
-    pictures = stored_photos(files, camera_file) if photos else None
+    pictures, as_read = stored_photos(files, camera_file) if photos else None, camera_file
     camera_file, pictures, notes = as_pinholes(camera_file, pictures)
-    pictures, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    fit = fit_cameras(ply, camera_file, pictures, order=order, scale=hints.scene_scale)
+    limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
+    fit = fit_cameras(ply, camera_file, limited, order=order, scale=hints.scene_scale)
     notes += [*smaller, *fit.notes]
+    sizes = pictures, photo_size(limited), fit.transform
     if fit.recovery is not None:
-        return _aligned(ply, files, fit, fit.recovery, hints, notes)
+        large = find_large_photos(files, as_read, *sizes, fit.inputs.cameras)
+        return _aligned(ply, files, fit, fit.recovery, hints, notes, large)
     scene, camera_file, problem, more = make_unaligned(ply, files, fit, hints)
+    scene = replace(scene, large_photos=find_large_photos(files, as_read, *sizes, scene.cameras))
     return _unaligned(ply, files, camera_file, scene, problem, hints, notes + more)
 
 
 def _aligned(
-    ply: PlyScene, files: SceneFiles, fit: CameraFit, recovery: Recovery, hints: ReadHints, notes: list[str]
+    ply: PlyScene,
+    files: SceneFiles,
+    fit: CameraFit,
+    recovery: Recovery,
+    hints: ReadHints,
+    notes: list[str],
+    large: LargePhotos | None,
 ) -> SceneLoad:
     inputs, camera_file = fit.inputs, fit.camera_file
     layout, frame, cameras = recovery.best.layout, recovery.best.frame, inputs.cameras
@@ -170,6 +179,7 @@ def _aligned(
         cameras = replace(cameras, viewmats=frame.move_viewmats(inputs.cameras.viewmats))
     views = Views(cameras, inputs.images, camera_file.names, tuple(dict.fromkeys(layout.views)))
     scene = to_grid(ply.gaussians, ply.valid, layout, cameras, inputs.images, camera_file.names)
+    scene = replace(scene, large_photos=None if large is None else large[layout.views])
     scene, filled = _fill(scene, recovery, inputs)
     scene, rotated = _with_rotations(scene, hints, exporters)
     if layout.per_pixel == 1:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.estimate_cameras import estimate_cameras
-from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
+from gsmerge.io.cameras.lens import undistort_photos
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras
 from gsmerge.io.cameras.sharp import SOURCE as SHARP
@@ -19,18 +21,21 @@ from gsmerge.io.photos import (
     Photos,
     PhotoTransform,
     Size,
+    decode_image,
     decode_images,
     find_image,
     image_size,
     list_images,
+    match_images,
     photo_size,
     resize_to,
 )
 from gsmerge.io.scene_files import SceneFiles
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
 _FLOAT_PIXEL = 12  # bytes
+_ROUNDING = 1e-6  # pixels
 
 
 def read_scene_cameras(ply: PlyScene, files: SceneFiles) -> CameraFile:
@@ -65,12 +70,9 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
 
 
 def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    if files.images is None:
-        folder = Path(camera_file.path).parent
-        paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
-        return decode_images(paths, camera_file.names) if len(paths) == len(camera_file) else None
-    if files.images.suffix not in (".npz", CHUNK):
-        return decode_images(files.images, camera_file.names)
+    paths = _photo_paths(files, camera_file)
+    if paths is not None or files.images is None:
+        return decode_images(paths) if paths else None
     own = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if own else read_cameras(files.images, scene=files.ply.stem)).images
     if own and stored is None and files.images.suffix == CHUNK:
@@ -79,6 +81,64 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
         count = 0 if stored is None else len(stored)
         raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {count}")
     return stored
+
+
+def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | None:
+    """The photo file of every camera; None where there are none, or they are inside another file."""
+    if files.images is None:
+        folder = Path(camera_file.path).parent
+        paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
+        return paths if len(paths) == len(camera_file) else None
+    return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
+
+
+def find_large_photos(
+    files: SceneFiles,
+    camera_file: CameraFile,
+    photos: Photos | None,
+    size: Size | None,
+    transform: PhotoTransform | None,
+    cameras: Cameras,
+) -> LargePhotos | None:
+    """The photos at the size of their files, where that is larger than the scene's; None where it is not.
+
+    Files are read again when a photo is asked for; what other files hold inside stays in memory.
+
+    Args:
+        files: Of the scene.
+        camera_file: As it was read, with lenses.
+        photos: The photos as :func:`stored_photos` gave them, undistorted.
+        size: Theirs when they were fitted to the rows.
+        transform: What was done to them then.
+        cameras: Of the scene's grid, in the order of the camera file.
+    """
+    paths = _photo_paths(files, camera_file) if photos is not None else None
+    stored = photo_size(photos) if paths is None else image_size(paths[0])
+    if photos is None or stored is None or size is None:
+        return None
+    fitted = transform or resize_to(size, size)
+    scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
+    cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
+    shown = np.array([cameras.width, cameras.height]) / grid  # of unaligned scenes, whose views may be reduced again
+    if (scale * shown).max() >= 1:
+        return None
+    first = np.floor(cut / scale).astype(int)
+    last = np.minimum(np.ceil((cut + grid) / scale - _ROUNDING).astype(int), stored)
+    to_file = np.eye(3)
+    to_file[(0, 1), (0, 1)] = 1 / (scale * shown)
+    to_file[:2, 2] = cut / scale - first
+    rows, columns = slice(first[1], last[1]), slice(first[0], last[0])
+    Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if camera_file.lenses else None
+
+    def read(view: int) -> np.ndarray:
+        photo = photos_inside[view] if paths is None else decode_image(paths[view], stored)
+        if paths is not None and Ks is not None:
+            photo = undistort_photos([photo], Ks[view : view + 1], camera_file.lenses[view : view + 1])[0]
+        return photo[rows, columns]
+
+    photos_inside = photos if paths is None else ()
+    width, height = (int(side) for side in last - first)
+    return LargePhotos(to_file @ cameras.Ks, width, height, tuple(range(len(cameras))), read)
 
 
 def limit_photo_size(

@@ -251,8 +251,7 @@ def evaluate(
     with use_threads(options.threads):
         frame = scene_frame(scene)
         look = _Look(NEAR * frame.unit, options.antialiased, frame.origin)
-        splits = _splits(scene, own, targets, options, look)
-        scores = []
+        splits, scores = _splits(scene, own, targets, options, look), []
         named = {INPUT: own, **results} if options.own else results
         look.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):

@@ -75,6 +75,9 @@ def decode_stored(
         return DecodeResult(decode_scene(encoded, k=k, budget=budget, threads=threads), None, plan.notes)
     assert isinstance(stored, OnlineState)
     log = RunLog(progress)
+    notes = plan.notes
+    if options.photo_scale not in ("auto", 1):
+        notes = *notes, f"photo_scale {options.photo_scale:g} is 1: a state stores its photos at the size of its views"
     max_count = int(plan.counts.sum())
     start_count = max(len(encoded), int(start_share(options) * max_count)) + encoded.num_kept
     canonical = replace(encoded, frame=Frame(np.zeros(3), 1.0))
@@ -88,5 +91,5 @@ def decode_stored(
     if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
         note = "the fit was not accepted: held-out parts of the photos did not get better"
         gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)
-        return DecodeResult(gaussians, report, (*plan.notes, note))
-    return DecodeResult(stored.frame.leave(gaussians), report, plan.notes)
+        return DecodeResult(gaussians, report, (*notes, note))
+    return DecodeResult(stored.frame.leave(gaussians), report, notes)

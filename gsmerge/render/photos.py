@@ -29,7 +29,7 @@ EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 class Photos:
     """V photos of one size."""
 
-    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]
+    images: np.ndarray  # [v,h,w,3] float32, sRGB in [0, 1]; uint8 of photos larger than the grid, see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
     Ks: np.ndarray  # [v,3,3] intrinsics at this size
     # Low-pass variance in square pixels of this size: it stays that of the full-size image, so that scales are judged
@@ -48,6 +48,11 @@ class Photos:
     def width(self) -> int:
         """Columns."""
         return self.images.shape[2]
+
+    def image(self, view: int) -> np.ndarray:
+        """``[h,w,3]`` photo, sRGB in [0, 1]."""
+        image = self.images[view]
+        return np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
 
     def camera(self, view: int) -> dict[str, Any]:
         """The arguments that :func:`gsmerge.render.plan_view` needs to render into a photo."""

@@ -25,6 +25,7 @@ COST_OTHER_BASELINE = 0.2
 COST_UNMERGED_STEP = 0.15  # for each step of the full fit of an input that was not merged
 # Processor seconds per step of the full fit and million pixels of one view:
 COST_FULL_FIT = 0.2
+COST_LARGE_PHOTOS = 0.2  # more for each pixel of a larger photo, as a share
 
 # Memory, in bytes.
 BYTES_FIXED = 250_000_000  # interpreter, numba and kernels
@@ -33,12 +34,21 @@ BYTES_PER_VALUE = 4.5  # of higher harmonics, per Gaussian: those of the scene, 
 BYTES_PER_PIXEL = 90  # the photo as floats and what segmentation and rendering hold of it
 
 
-def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *, photos: bool, fit_steps: int) -> float:
+def work_seconds(
+    pixels: int,
+    view_pixels: float,
+    options: Mapping[str, Any],
+    *,
+    photos: bool,
+    fit_steps: int,
+    photo_scale: float = 1.0,
+) -> float:
     """Processor seconds that a scene takes, without imports, within a factor of about two.
 
     Args:
         pixels: Of all views together, or Gaussians where they are more.
         options: All settings by flat name, with the checkpoint that is used.
+        photo_scale: Times the views' size at which the full fit looks at larger photos.
     """
     method, fit, views = options["method"], fit_of(options, photos=photos), pixels / max(view_pixels, 1)
     if method == "gsmerge":
@@ -49,7 +59,8 @@ def work_seconds(pixels: int, view_pixels: float, options: Mapping[str, Any], *,
     work += COST_READ + score_cost(views) * photos
     work += COST_COLOR_FIT * (fit == "color") + COST_FIT_RENDERS * (fit == "full")
     steps = fit_steps if fit == "full" else 0
-    seconds = pixels / 1e6 * work + view_pixels / 1e6 * COST_FULL_FIT * steps
+    step = COST_FULL_FIT * (1 + COST_LARGE_PHOTOS * (photo_scale**2 - 1))
+    seconds = pixels / 1e6 * work + view_pixels / 1e6 * step * steps
     return seconds + pixels / 1e6 * COST_UNMERGED_STEP * steps * (method == "unmerged-fit")
 
 
@@ -96,19 +107,23 @@ def estimate_run(
     threads: int,
     fit_steps: int,
     num_rest: int = 0,
+    photo_scale: float = 1.0,
 ) -> dict[str, Any]:
     """Seconds and bytes of a run, right within a factor of about two once the kernels are compiled.
 
     Args:
         grid: Views, height and width.
-        options: As of :func:`work_seconds`, and so are ``num_pixels`` (its ``pixels``), ``photos`` and ``fit_steps``.
+        options: As of :func:`work_seconds`, and so are ``num_pixels`` (its ``pixels``), ``photos``, ``fit_steps`` and
+            ``photo_scale``.
         num_rest: Columns of higher harmonics.
 
     Returns:
         ``seconds``, ``memory_bytes``, and ``machine_memory_bytes``, None where the system does not report it.
     """
     views, height, width = grid
-    seconds = work_seconds(num_pixels, height * width, options, photos=photos, fit_steps=fit_steps)
+    seconds = work_seconds(
+        num_pixels, height * width, options, photos=photos, fit_steps=fit_steps, photo_scale=photo_scale
+    )
     return {
         "seconds": round(IMPORT_SECONDS + seconds / max(1, min(threads, views)), 1),
         "memory_bytes": memory_bytes(num_pixels, photos=photos, num_rest=num_rest),

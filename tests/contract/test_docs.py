@@ -184,7 +184,19 @@ def cli_defaults() -> Iterator[tuple[str, str]]:
 def test_defaults_in_help_are_the_library_s() -> None:
     library = gsmerge.CompactOptions().to_dict()
     in_help = dict(cli_defaults())
-    known = {"k", "superpixels", "segmentation", "method", "effort", "robust", "match", "fit", "fit_steps", "seed"}
+    known = {
+        "k",
+        "superpixels",
+        "segmentation",
+        "method",
+        "effort",
+        "robust",
+        "match",
+        "fit",
+        "fit_steps",
+        "seed",
+        "photo_scale",
+    }
     known |= {"levels", "device", "checkpoint", "geometry", "k_low", "k_high", "k_rule", "min_opacity"}
     known |= {"neighbors", "overlap", "iou", "similarity", "max_color"}
     assert set(in_help) == known

@@ -18,7 +18,7 @@ from gsmerge.io.alignment.score import AlignmentInput, color_error
 from gsmerge.io.cameras.camera_file import CameraFile, with_convention
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.formats.ply import PlyScene
-from gsmerge.io.photos import Photos, as_floats, natural_key, photo_size
+from gsmerge.io.photos import Photos, PhotoTransform, as_floats, natural_key, photo_size
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
@@ -33,6 +33,7 @@ class CameraFit:
     recovery: Recovery | None  # None where the rows belong to no pixels that could be recovered
     camera_file: CameraFile  # as it was read in the end
     notes: list[str]  # what was adapted
+    transform: PhotoTransform | None = None  # what was done to the photos
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def fit_cameras(
         small = small_photos_error(ply.info, camera_file, source.size)
         if small is not None:
             raise small
-    return CameraFit(inputs, recovery, camera_file, notes)
+    return CameraFit(inputs, recovery, camera_file, notes, plain.transform)
 
 
 def _make_input(source: _Source, camera_file: CameraFile, fit: GridFit, *, photos: bool = True) -> AlignmentInput:
@@ -142,7 +143,9 @@ def _other_size(source: _Source, camera_file: CameraFile, *, exact_frames: bool 
         return None
     near = max(_ALIKE * px, px + _ALIKE_PX)
     alike = [(fit, r) for fit, r in recovered if fit.size == grid and r.best.worst_px <= near]
-    fits = [CameraFit(make_input(fit), recovery, camera_file, list(fit.notes)) for fit, recovery in alike]
+    fits = [
+        CameraFit(make_input(fit), recovery, camera_file, list(fit.notes), fit.transform) for fit, recovery in alike
+    ]
     if len(fits) == 1:
         return fits[0]
     errors = [color_error(fit.inputs, recovery.best.layout) for fit, (_, recovery) in zip(fits, alike, strict=True)]

@@ -158,6 +158,7 @@ class GenerateOptions:
     views: tuple[int, int] = (6, 6)  # range of their number in a scene; one target is between any two neighbours
     width: int = 320  # of the views, pixels: 16 to 2048
     height: int = 240  # the same
+    photo_scale: int = 1  # times the views' size that the photos have, 1 to 8; the network sees the views' own
     style: str = MIXED  # one of STYLES, or "mixed": each in turn
     path: str = MIXED  # one of PATHS, or "mixed": any
     noise: float = 1.0  # factor on the errors: 0 to 10
@@ -170,6 +171,8 @@ class GenerateOptions:
         for name in ("width", "height"):
             if not 16 <= getattr(self, name) <= 2048:
                 raise ValueError(f"{name}: expected 16 to 2048 pixels, got {getattr(self, name)}")
+        if not 1 <= self.photo_scale <= 8:
+            raise ValueError(f"photo_scale: expected 1 to 8, got {self.photo_scale}")
         for name, known in (("style", STYLES), ("path", PATHS)):
             if getattr(self, name) not in (MIXED, *known):
                 raise ValueError(f"{name}: expected {', '.join((MIXED, *known))}, got {getattr(self, name)!r}")
@@ -179,4 +182,6 @@ class GenerateOptions:
     def to_dict(self) -> dict[str, Any]:
         """All settings as JSON types."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        if self.photo_scale == 1:  # as in records from before there was the setting
+            del plain["photo_scale"]
         return plain

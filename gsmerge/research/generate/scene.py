@@ -39,8 +39,8 @@ class SyntheticScene:
 
     gaussians: Gaussians  # one for each pixel, view-major and row-major
     cameras: Cameras  # as the network estimates them
-    images: tuple[Float, ...]  # the photos, [h,w,3] sRGB in [0, 1] each
-    targets: Cameras  # true cameras half-way between the views
+    images: tuple[Float, ...]  # the photos, [h,w,3] sRGB in [0, 1] each; larger than the views with a photo_scale
+    targets: Cameras  # true cameras half-way between the views, of the photos' size
     target_images: tuple[Float, ...]  # their photos
     style: str
     path: str
@@ -55,16 +55,20 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
     noise = draw_noise(options.ranges, rng, options.noise)
     lens = Lens(options.width, options.height, max(options.width, options.height) * rng.uniform(0.58, 1.75))
-    view, pose = _find_stage(rng, style, path, lens, num_views)
+    large = _scale(lens, options.photo_scale)  # of the photos; the network sees them at the views' size
+    view, pose = _find_stage(rng, style, path, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
     gain = find_exposure([radiance(view, p, _shrink(lens), 1)[0] for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
-    photos = parallel_map(partial(_photo, view, lens, noise, gain), list(zip(poses, seeds, strict=True)))
+    photo = partial(_photo, view, lens, large, noise, gain)
+    photos = parallel_map(photo, list(zip(poses, seeds, strict=True)))
     world = np.linalg.inv(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
     moved = [_move_pose(pose, world, noise.unit) for pose in poses]
     seen = []
     for (image, depth, normals), true_pose in zip(photos[::2], moved[::2], strict=True):
+        if large != lens:
+            image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
         depth = np.minimum(depth, FAR) * noise.unit
         estimate = _perturb_pose(true_pose, noise, float(np.median(depth)), rng)
         rotated = (normals @ world[:3, :3].T).astype(np.float32)
@@ -74,12 +78,16 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         gaussians=Gaussians.concat(parts),
         cameras=_cameras([view.c2w for view, _ in seen], lens),
         images=tuple(image for image, _, _ in photos[::2]),
-        targets=_cameras(moved[1::2], lens),
+        targets=_cameras(moved[1::2], large),
         target_images=tuple(image for image, _, _ in photos[1::2]),
         style=style,
         path=path,
         noise=noise,
     )
+
+
+def _scale(lens: Lens, factor: int) -> Lens:
+    return Lens(factor * lens.width, factor * lens.height, factor * lens.focal)
 
 
 def _shrink(lens: Lens) -> Lens:
@@ -100,9 +108,9 @@ def _find_stage(rng: np.random.Generator, style: str, path: str, lens: Lens, num
 
 
 def _photo(
-    view: LitStage, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
+    view: LitStage, grid: Lens, lens: Lens, noise: Noise, gain: float, given: tuple[Array, int]
 ) -> tuple[Float, Array, Float]:
-    """The photo from a pose, with the errors of lens, sensor and exposure, and exact depth and normals."""
+    """The photo from a pose, with the errors of lens, sensor and exposure, and exact depth and normals of the grid."""
     pose, seed = given
     rng = np.random.default_rng(seed)
     linear, _ = radiance(view, pose, lens, SAMPLES)
@@ -112,7 +120,7 @@ def _photo(
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
     image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
-    hits = trace(view.shapes, pose, lens, 1)
+    hits = trace(view.shapes, pose, grid, 1)
     return np.round(image * 255) / np.float32(255), hits.depth, hits.normals
 
 

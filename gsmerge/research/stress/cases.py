@@ -115,7 +115,7 @@ def change_exposure(given: StressScene, share: float) -> StressScene:
     sh0 = ((0.5 + SH_C0 * g.sh0) * rows - 0.5) / SH_C0
     gaussians = replace(g, sh0=sh0, shN=g.shN * rows)
     images = (scene.images * gains[:, None, None, None]).clip(0, 1)
-    return replace(given, scene=replace(scene, gaussians=gaussians, images=images))
+    return replace(given, scene=replace(scene, gaussians=gaussians, images=images, large_photos=None))
 
 
 def break_rows(given: StressScene) -> StressScene:

@@ -1,7 +1,8 @@
 """gaussians -> fitted gaussians: colours alone, or all parameters, against the input photos."""
 
 from gsmerge.stages.fit.options import Fit, FitOptions, LearningRates
+from gsmerge.stages.fit.photos import fit_photos
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.stage import fit, start_share, visible_mask
 
-__all__ = ["Fit", "FitOptions", "FitReport", "LearningRates", "fit", "start_share", "visible_mask"]
+__all__ = ["Fit", "FitOptions", "FitReport", "LearningRates", "fit", "fit_photos", "start_share", "visible_mask"]

@@ -24,7 +24,7 @@ from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import LONG_STEPS, FitOptions, LearningRates
+from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, LearningRates
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
 from gsmerge.types import Array, Gaussians
@@ -35,6 +35,7 @@ FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unl
 MANY_STEPS = 150
 DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
 LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS, whatever the views
+LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them the views' own size gets worse
 PROBE = 6  # steps that are timed to plan a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
@@ -56,22 +57,31 @@ class Plan:
     """How a run goes.
 
     Args:
-        photos: At full and at half size.
+        photos: At full and at half size, and larger ones where there are any.
         weights: ``[h,w]`` float32 of each photo at either size: 0 on held-out blocks, ``HIDDEN`` on pixels that
             neither steps nor scores use, 1 elsewhere.
-        step_weights: The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too.
+        step_weights: The same as a step uses them: 0 on hidden pixels; at full size 1 on held-out blocks, too, and
+            larger photos count everywhere.
         options: What a step does.
         dropout: Share of the Gaussians that a step leaves out.
+        half_part: Share of the steps, the first ones, on half-size photos.
     """
 
-    photos: tuple[Photos, Photos]
+    photos: tuple[Photos, ...]
     weights: tuple[list[np.ndarray], list[np.ndarray]]
-    step_weights: tuple[list[np.ndarray], list[np.ndarray]]
+    step_weights: tuple[list[np.ndarray], ...]
     options: FitOptions
     dropout: float
+    half_part: float
+
+    def level_at(self, step: int, progress: float) -> int:
+        """Which photos a step looks at: half-size ones first, then full-size ones, and larger ones in between."""
+        if progress < self.half_part:
+            return 1
+        return 2 if len(self.photos) > 2 and step % 5 in LARGE_STEPS else 0
 
 
-def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
+def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
     """Held-out blocks, hidden pixels, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
@@ -82,7 +92,11 @@ def plan_run(photos: tuple[Photos, Photos], options: FitOptions, seed: int, mask
         weights = _hidden(weights[0], masks[0]), _hidden(weights[1], masks[1])
     everywhere = [np.where(weight == HIDDEN, np.float32(0), np.float32(1)) for weight in weights[0]]
     trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
-    return Plan(photos, weights, (everywhere, trained), options, dropout)
+    ones = [[np.ones((p.height, p.width), np.float32)] * len(p) for p in photos[2:]]
+    half_part = options.half_res_part
+    if len(photos) > 2 and options.half_res_share is None:
+        half_part -= EARLIER
+    return Plan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part)
 
 
 def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
@@ -92,7 +106,7 @@ def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
 
 def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rng: np.random.Generator) -> float:
     """One Adam step on one view -> mean squared error of its training pixels."""
-    level = 1 if progress < plan.options.half_res_part else 0
+    level = plan.level_at(step, progress)
     photos = plan.photos[level]
     weight = plan.step_weights[level][view]
     background, opacities = rng.random(3, dtype=np.float32), None
@@ -103,7 +117,7 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     all_colors = state.view_colors()
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
-    gradient, error = image_gradient(image, photos.images[view], weight, plan.options.ssim_lambda)
+    gradient, error = image_gradient(image, photos.image(view), weight, plan.options.ssim_lambda)
     g = gradients_of(drawn, colors, image, transmittance, gradient, NO_LOSS, with_viewmat=False)
     rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
     g.opacities[:] += np.float32(plan.options.opacity_reg / count)
@@ -129,7 +143,8 @@ def look_of(step: int, level: int, eps2d: float) -> dict[str, Any]:
 
     Args:
         step: From 1.
-        level: 0 for full-size photos; 1 for half-size ones, whose steps are few and coarse, and all draw one way.
+        level: 0 for full-size photos. Half-size ones (1) and larger ones (2) are all drawn one way: the first are
+            coarse, the others what an enlarged view shows.
         eps2d: Low-pass of the photos, square pixels.
     """
     share, antialiased = (1.0, False) if level else LOOKS[step % len(LOOKS)]
@@ -148,14 +163,14 @@ def initial_scores(state: State, plan: Plan) -> tuple[float, np.ndarray, np.ndar
 
     The share of its box that a Gaussian may use is ``single_view_share`` to 1, by how many photos show it: the
     effective number of them, (sum w)^2 / sum w^2 of its blending weights w in them. Its least scale is ``min_scale``
-    pixels of the full-size photo that it is nearest to (the 3D filter of Mip-Splatting); none where no photo shows it.
+    pixels of the largest photo that it is nearest to (the 3D filter of Mip-Splatting); none where no photo shows it.
     """
     photos, colors, rates = plan.photos[1], state.view_colors(), plan.options.rates
     everywhere = np.ones((photos.height, photos.width, 1), np.float32)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         drawn = plan_view(state.splats, **photos.camera(view))
-        focal = plan.photos[0].Ks[view][[0, 1], [0, 1]].max()
+        focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in plan.photos)
         return composite(drawn, colors)[0], splat_adjoint(drawn, everywhere)[:, 0], drawn.ids, drawn.depths / focal
 
     images, sums, squares = [], np.zeros(len(state.x)), np.zeros(len(state.x))
@@ -213,7 +228,7 @@ class TailMean:
 
 def fit_full(
     gaussians: Gaussians,
-    photos: tuple[Photos, Photos],
+    photos: tuple[Photos, ...],
     options: FitOptions,
     count: int = 0,
     seed: int = 0,
@@ -228,7 +243,7 @@ def fit_full(
 
     Args:
         gaussians: Canonical Gaussians.
-        photos: The input views at full and at half size.
+        photos: The input views at full and at half size, and larger where their photos are and the fit is to see them.
         options: Steps, rates, limits.
         count: Number of Gaussians to grow to, where the run is long enough; at least as many as there are.
         seed: Order of the views, backgrounds, dropout, held-out blocks.
@@ -247,7 +262,7 @@ def fit_full(
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
             state = grow_to(state, photos[1], count)
-        if part >= options.half_res_part and not judged:
+        if part >= plan.half_part and not judged:
             after, judged = holdout_score(state, plan), True
             if after <= before:
                 break
@@ -274,9 +289,10 @@ def fit_full(
 def affordable_steps(seconds: float, plan: Plan) -> int:
     """Steps that fit into the time budget, from the time of the first PROBE ones at half size.
 
-    A step at full size costs up to three times as much.
+    A step at full size costs up to three times as much, one on larger photos more by their pixels.
     """
-    budget, coarse = plan.options.time_budget, plan.options.half_res_part
+    budget, coarse = plan.options.time_budget, plan.half_part
     assert budget is not None
-    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse))
+    pixels = [p.height * p.width for p in (plan.photos[0], plan.photos[-1] if len(plan.photos) > 2 else plan.photos[0])]
+    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + pixels[1] / pixels[0]) / 2)
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

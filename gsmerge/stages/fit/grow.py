@@ -21,7 +21,7 @@ def error_masses(state: State, photos: Photos) -> np.ndarray:
     def one_view(view: int) -> np.ndarray:
         plan = plan_view(state.splats, **photos.camera(view))
         image, _ = composite(plan, state.view_colors())
-        return splat_adjoint(plan, np.abs(image - photos.images[view]).mean(-1, keepdims=True))[:, 0]
+        return splat_adjoint(plan, np.abs(image - photos.image(view)).mean(-1, keepdims=True))[:, 0]
 
     masses = np.zeros(len(state.x))
     for of_view in in_turn(one_view, range(len(photos))):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,6 +10,7 @@ Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
 STEPS = {"draft": 12, "fast": 30, "default": 220, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
+EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
@@ -40,7 +42,7 @@ class LearningRates:
     quats_lr: float = 0.03
     opacities_lr: float = 0.3
     colors_lr: float = 0.03
-    decay: float = 0.2
+    decay: float = 0.4
     beta1: float = 0.5
     beta2: float = 0.9
     max_mean_shift: float = 2.0
@@ -62,7 +64,11 @@ class FitOptions:
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
             more, where the fit would memorise the photos, otherwise 0.05 from 600 steps on and 0 below.
-        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all.
+        half_res_share: Share of the steps on half-size photos; None: 0.7, from 600 steps on 0.5, below 20 all; 0.1 less
+            where ``photo_scale`` is above 1.
+        photo_scale: Times the views' size at which two of every five steps after that look at larger photos, as far as
+            the photos are that large. ``"auto"``: up to 2 with effort ``"default"`` and ``"best"`` where the photos are
+            at least 1.25 times as large, on the CPU; 1 otherwise.
         average_share: Share of the steps, the last ones, over which the parameters are averaged.
         ssim_lambda: Share of structural similarity in the loss, the rest is L1.
         opacity_reg: Weight of the mean opacity in the loss of the full fit (3DGS-MCMC, Kheradmand et al. 2024): what
@@ -93,8 +99,9 @@ class FitOptions:
     time_budget: float | None = None
     dropout: float | None = None
     half_res_share: float | None = None
-    average_share: float = 0.1
-    ssim_lambda: float = 0.2
+    photo_scale: float | Literal["auto"] = "auto"
+    average_share: float = 0.2
+    ssim_lambda: float = 0.35
     opacity_reg: float = 0.03
     scale_reg: float = 0.01
     rates: LearningRates = field(default_factory=LearningRates)
@@ -152,6 +159,8 @@ class FitOptions:
         for name in ("min_gain", "max_gain"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.photo_scale != "auto" and (isinstance(self.photo_scale, str) or not 1 <= self.photo_scale < math.inf):
+            raise ValueError(f'photo_scale: expected "auto" or a number from 1, got {self.photo_scale!r}')
         if not self.huber > 0:
             raise ValueError(f"huber: expected more than 0, got {self.huber}")
         if self.dropout is not None and not 0 <= self.dropout < 1:

@@ -39,7 +39,7 @@ class FitBackend(Generic[PhotosT]):
 
 def fit(
     gaussians: Gaussians,
-    photos: tuple[Photos, Photos],
+    photos: tuple[Photos, ...],
     options: FitOptions,
     count: int = 0,
     seed: int = 0,
@@ -54,7 +54,7 @@ def fit(
 
     Args:
         gaussians: Canonical Gaussians.
-        photos: The input views at full and at half size.
+        photos: The input views, see :func:`gsmerge.stages.fit.fit_photos`. Larger ones are fitted to on the CPU alone.
         options: What to fit.
         count: Number of Gaussians that the full fit may grow to.
         seed: Everything random.
@@ -66,20 +66,19 @@ def fit(
     Returns:
         The Gaussians that stay, fitted, and what was done; None if nothing was asked for.
     """
-    device = _device(options, photos[0])
+    device = "cpu" if len(photos) > 2 else _device(options, photos[0])
     if device != "cpu":
         from gsmerge.gpu.fit import fit_gaussians  # torch; it stands above all stages, and is loaded for its use alone
 
-        return fit_gaussians(
-            gaussians, photos, options, count, seed, progress, baseline_start, exact=exact, device=device
-        )
+        settings = options, count, seed, progress, baseline_start
+        return fit_gaussians(gaussians, (photos[0], photos[1]), *settings, exact=exact, device=device)
     return fit_with(ON_CPU, gaussians, photos, options, count, seed, progress, baseline_start, exact=exact)
 
 
 def fit_with(
     backend: FitBackend[PhotosT],
     gaussians: Gaussians,
-    photos: tuple[PhotosT, PhotosT],
+    photos: tuple[PhotosT, ...],
     options: FitOptions,
     count: int = 0,
     seed: int = 0,
@@ -93,7 +92,7 @@ def fit_with(
         options = replace(options, min_contribution=0.0)
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
-    full, half = photos
+    full, half = photos[:2]
     keep = backend.visible_mask(gaussians, half, options.min_contribution)
     kept, close = gaussians[keep], CLOSE
     if options.fit == "none":

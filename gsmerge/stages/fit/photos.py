@@ -1,0 +1,85 @@
+"""scene -> the photos that a fit looks at: at full and at half size, and larger where its photos are larger."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gsmerge.render.photos import EPS2D, Photos, scene_photos
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.fit.options import FitOptions
+from gsmerge.types import PixelScene, UnalignedScene
+
+AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
+MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
+ALIKE = 0.01  # of the scale: the rounding of sizes
+
+
+def fit_photos(scene: PixelScene | UnalignedScene, options: FitOptions, log: RunLog) -> tuple[Photos, ...]:
+    """The photos at full and at half size, and at the scale of the options where they look at larger ones.
+
+    The log's choices get ``photo_scale`` where it is not 1, its notes what differs from what was asked for.
+    """
+    photos = scene_photos(scene), scene_photos(scene, 2)
+    scale, problem = photo_scale(scene, options)
+    if problem is not None:
+        log.notes.append(problem)
+    if scale == 1:
+        return photos
+    large = large_photos(scene, scale)
+    size = f"{large.width} x {large.height}"
+    log.choices["photo_scale"] = round(scale, 4)
+    log.notes.append(
+        f"the photos are larger than the views of {photos[0].width} x {photos[0].height}: the fit looks at them at"
+        f" {size} as well, which takes time; --photo-scale 1 does without"
+    )
+    return *photos, large
+
+
+def photo_scale(scene: PixelScene | UnalignedScene, options: FitOptions) -> tuple[float, str | None]:
+    """Times the views' size at which a fit to a scene looks at its photos, 1 or more; and why it is less than asked."""
+    wanted, largest = options.photo_scale, largest_scale(scene)
+    covered = options.fit == "full" and options.half_res_part < 1
+    if wanted == "auto":
+        worth = covered and options.effort in ("default", "best") and options.device == "cpu"
+        return (min(largest, AUTO_SCALE) if worth and largest >= MIN_AUTO_SCALE else 1.0), None
+    if wanted == 1:
+        return 1.0, None
+    if not covered:
+        return 1.0, f"photo_scale {wanted:g} is 1: larger photos need the full fit, with steps on photos of full size"
+    if wanted > largest * (1 + ALIKE):
+        return largest, f"photo_scale {wanted:g} is {largest:.3g}: the photos are no larger"
+    return float(min(wanted, largest)), None
+
+
+def largest_scale(scene: PixelScene | UnalignedScene) -> float:
+    """Times the views' size that the photos have along either side, at least 1."""
+    large = scene.large_photos
+    if large is None or scene.images is None or len(scene) == 0:
+        return 1.0
+    focals = (0, 1), (0, 1)
+    return max(1.0, float((large.Ks[0][focals] / scene.cameras.Ks[0][focals]).min()))
+
+
+def large_photos(scene: PixelScene | UnalignedScene, scale: float) -> Photos:
+    """The photos at ``scale`` times the views' size, at most :func:`largest_scale`, read one by one.
+
+    As uint8, because they may be as large as the scene. Their low-pass is that of a viewer of this size: the views' own
+    size is seen with its own in the steps between.
+
+    Raises:
+        ValueError: If the scene has no larger photos.
+    """
+    large, cameras = scene.large_photos, scene.cameras
+    if large is None:
+        raise ValueError("expected a scene with photos larger than its views, got one without")
+    focals = (0, 1), (0, 1)
+    shares = scale * cameras.Ks[0][focals] / large.Ks[0][focals]
+    width, height = (max(1, round(side * by)) for side, by in zip((large.width, large.height), shares, strict=True))
+
+    def read(photo: int) -> np.ndarray:
+        return np.asarray(cv2.resize(large.read(photo), (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    Ks = large.Ks * np.array([[width / large.width], [height / large.height], [1.0]])
+    return Photos(np.stack(parallel_map(read, large.ids)), cameras.viewmats.astype(np.float64), Ks, EPS2D)
