@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,11 +96,16 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
 
 
 def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
-    """Orders of the views that only exchange views of one pose are one: nothing could tell them apart."""
-    cameras, (first, *others) = inputs.cameras, inputs.labellings
-    both = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
-    same = [np.array_equal(both[list(first)], both[list(other)]) for other in others]
-    return replace(inputs, labellings=[first, *(first if s else o for s, o in zip(same, others, strict=True))])
+    """Orders that only exchange views of one pose with equal photos, or without any, are one: either is right."""
+    cameras, images, (first, *others) = inputs.cameras, inputs.images, inputs.labellings
+    facts = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
+
+    def same(other: Sequence[int]) -> bool:
+        moved = [(a, b) for a, b in zip(first, other, strict=True) if a != b]
+        alike = images is None or all(np.array_equal(images[a], images[b]) for a, b in moved)
+        return alike and all(np.array_equal(facts[a], facts[b]) for a, b in moved)
+
+    return replace(inputs, labellings=[first, *(first if same(other) else other for other in others)])
 
 
 def _accepted(inputs: AlignmentInput, best: AlignmentScore, runner_up: AlignmentScore | None) -> Recovery | None:
