@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
@@ -11,7 +11,9 @@ Fit = Literal["none", "color", "full"]
 STEPS = {"draft": 12, "fast": 30, "default": 220, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
-HASTY_STEPS = 20  # shorter runs have no time for full-size photos
+HASTY_STEPS = 20  # shorter runs have no time for full-size photos, and take steps of their own:
+HASTY_FACTORS = {"scales_lr": 1.1, "opacities_lr": 1.33, "colors_lr": 0.67}
+HASTY_FORGETTING = 0.06  # of what the second moment forgets in a step: it is no more than their mean
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -52,6 +54,12 @@ class LearningRates:
     min_scale: float = 0.5
 
 
+def hasty_rates(rates: LearningRates) -> LearningRates:
+    """The rates of runs below HASTY_STEPS, for some of longer runs."""
+    factors = {name: factor * getattr(rates, name) for name, factor in HASTY_FACTORS.items()}
+    return replace(rates, **factors, beta2=1 - HASTY_FORGETTING * (1 - rates.beta2))
+
+
 @dataclass(frozen=True)
 class FitOptions:
     """What is fitted to the photos.
@@ -75,7 +83,8 @@ class FitOptions:
             the photos do not need fades, instead of standing in front of other views.
         scale_reg: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
             a step takes a third less time.
-        rates: Steps and limits of the full fit.
+        rates: Steps and limits of the full fit; runs below 20 steps make other steps of them, see
+            :func:`hasty_rates`.
         iterations: Conjugate-gradient steps of the colour fit.
         prior_weight: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
         huber: Colour error beyond which a pixel counts less (moving things, reflections).
