@@ -25,7 +25,7 @@ from gsmerge.stages.assign import assign_members
 from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
 from gsmerge.stages.decode import MIXED, decode_merged
-from gsmerge.stages.encode import encode
+from gsmerge.stages.encode import encode, weaken_contradicted
 from gsmerge.stages.fit import fit, fit_photos
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
@@ -161,6 +161,8 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
                 photos, aligned = scene_photos(scene, 2), isinstance(scene, PixelScene)
                 robust = choose_merge(features, coarse, photos, options.robust, leave_out=aligned)
                 features = robust.features
+        elif networks is None and options.encode.agreement and options.fit.grows:
+            features = weaken_contradicted(features, members, scene.cameras)
         with log.stage("match"):
             matches = match(features, options.match, networks)
             merged = merge(features, matches, networks)

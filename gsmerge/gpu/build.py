@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -37,6 +37,7 @@ from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.decode import decode_merged
+from gsmerge.stages.encode import agreement_factors
 from gsmerge.stages.fit import fit as fit_on_cpu
 from gsmerge.stages.fit.photos import fit_photos, photo_scale
 from gsmerge.stages.fit.stage import fit_with
@@ -201,7 +202,13 @@ class DeviceScene:
         valid = to_device(prepared.scene.valid, self.device)
         numbers = torch.where(valid, cut.labels + first[:, None, None], -1).reshape(-1)
         rows = group_rows(numbers, sum(cut.counts))
-        return encode(self.members, rows, torch.searchsorted(first, rows.groups, right=True) - 1)
+        features = encode(self.members, rows, torch.searchsorted(first, rows.groups, right=True) - 1)
+        if not (prepared.options.encode.agreement and prepared.options.fit.grows):
+            return features
+        assert prepared.members is not None
+        means, sh0, views = (tensor.cpu().numpy() for tensor in (features.means, features.sh0, features.views))
+        factors = agreement_factors(means, sh0, views, prepared.members, prepared.scene.cameras)
+        return replace(features, gains=features.gains * to_device(factors, self.device))
 
     def _decode_on_cpu(self, prepared: PreparedScene, merged: Features, cut: Superpixels) -> Gaussians:
         """Gaussians by the stage, for what :func:`gsmerge.gpu.decode.covers` leaves out."""
