@@ -10,17 +10,29 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats import compressed, spz_writer
-from gsmerge.io.formats.arrays import Columns, to_bytes, to_columns
-from gsmerge.io.formats.ply_file import BLOCK_BYTES, LOGIT_COMMENT, MAX_LOGIT, MEANS, NORMALS, QUATS, SCALES, SH0
+from gsmerge.io.formats import compressed, sog_writer, splat, spz_writer
+from gsmerge.io.formats.arrays import Columns, to_columns
+from gsmerge.io.formats.ply_file import (
+    BLOCK_BYTES,
+    LOGIT_COMMENT,
+    MAX_LOGIT,
+    MEANS,
+    MIP_COMMENT,
+    NORMALS,
+    QUATS,
+    SCALES,
+    SH0,
+)
 from gsmerge.types import Gaussians
 
-# ``.splat``: 32 bytes per Gaussian and no header, the format of antimatter15/splat that most viewers read. Quaternions
-# wxyz are bytes 128 + 128 q; there is no room for harmonics above degree 0.
-SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
-
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
-OUTPUT_FORMATS = {".compressed.ply": compressed.MAX_DEGREE, ".ply": 4, ".spz": spz_writer.MAX_DEGREE, ".splat": 0}
+OUTPUT_FORMATS = {
+    ".compressed.ply": compressed.MAX_DEGREE,
+    ".ply": 4,
+    ".spz": spz_writer.MAX_DEGREE,
+    ".sog": sog_writer.MAX_DEGREE,
+    ".splat": splat.MAX_DEGREE,
+}
 
 
 def output_format(path: str | os.PathLike[str]) -> str:
@@ -52,7 +64,7 @@ def write_gaussians(
     comments: Sequence[str] = (),
     ending: str | None = None,
 ) -> None:
-    """Write Gaussians as ``.ply``, ``.compressed.ply``, ``.spz`` or ``.splat``, by the ending of the name.
+    """Write Gaussians as ``.ply``, ``.compressed.ply``, ``.spz``, ``.sog`` or ``.splat``, by the ending of the name.
 
     All but ``.ply`` quantise; none of them changes the frame of the Gaussians.
 
@@ -60,7 +72,7 @@ def write_gaussians(
         path: The file; complete or not there at all.
         gaussians: Finite values.
         overwrite: Replace an existing file.
-        comments: Lines for the header of the two that have one.
+        comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Format to write instead of the name's.
 
     Raises:
@@ -74,11 +86,16 @@ def write_gaussians(
         return
     _check_comments(comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
-        if ending == ".compressed.ply":
-            content = compressed.compressed_bytes(gaussians, comments)
-        else:
-            content = spz_writer.spz_bytes(gaussians) if ending == ".spz" else _splat_bytes(gaussians)
-        temporary.write_bytes(content)
+        temporary.write_bytes(_quantised(gaussians, ending, comments))
+
+
+def _quantised(gaussians: Gaussians, ending: str, comments: Sequence[str]) -> bytes:
+    if ending == ".compressed.ply":
+        return compressed.compressed_bytes(gaussians, comments)
+    if ending == ".splat":
+        return splat.splat_bytes(gaussians)
+    write = spz_writer.spz_bytes if ending == ".spz" else sog_writer.sog_bytes
+    return write(gaussians, mip=MIP_COMMENT in comments)
 
 
 def write_ply(
@@ -172,12 +189,3 @@ def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
         count -= 1
     return count
-
-
-def _splat_bytes(gaussians: Gaussians) -> bytes:
-    columns = to_columns(gaussians, OUTPUT_FORMATS[".splat"])
-    rows = np.empty(len(columns), SPLAT_ROW)
-    rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
-    rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
-    rows["quats"] = to_bytes(128 * columns.quats + 128)
-    return rows.tobytes()
