@@ -47,12 +47,15 @@ class StoredRows:
     layout: str  # for people
     format: str
     encoding: str | None  # of the opacities: "logit", "raw", or None where the file does not say
+    sizes: dict[str, int] | None = None  # bytes by attribute; None: those of the rows
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
 
 
-def to_rows(columns: Columns, name: str, *, mip: bool = False) -> StoredRows:
-    """What a quantised file of that format holds; ``mip`` if its Gaussians want a filter of their own."""
+def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
+    """What a quantised file of that format holds, in so many bytes by attribute; ``mip`` if its Gaussians want a
+    filter of their own.
+    """
     count, num_higher = columns.harmonics.shape[:2]
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
     harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
@@ -64,6 +67,7 @@ def to_rows(columns: Columns, name: str, *, mip: bool = False) -> StoredRows:
         layout=f"{name}, SH degree {round((num_higher + 1) ** 0.5) - 1}",
         format="quantised",
         encoding="raw",
+        sizes=sizes,
         comments=(MIP_COMMENT,) if mip else (),
     )
 

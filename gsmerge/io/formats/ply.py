@@ -61,7 +61,7 @@ class PlyInfo:
     count: int  # Gaussians, the unusable ones included
     file_bytes: int
     # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
-    # types for an ascii file
+    # types for an ascii file; before gzip for .spz, and of the textures for .sog, where sh0 includes the opacities
     bytes_by_attribute: dict[str, int]
     # all columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and ``byte_columns`` stored
     # as bytes
@@ -129,8 +129,10 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
 
 
 def read_gaussians(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
-    """Read a file of Gaussians: ``.spz`` (versions 1 to 3), ``.splat`` or ``.sog`` (version 2) by the ending of the
-    name, and everything else as :func:`read_ply`; ``opacity`` is for those.
+    """Read a file of Gaussians in the format that the ending of its name says.
+
+    Those are ``.spz`` (versions 1 to 3), ``.splat`` and ``.sog`` (version 2). Everything else is read as by
+    :func:`read_ply`; ``opacity`` is for those.
 
     Raises:
         SceneError: If the file cannot be read, is damaged, or holds no finite Gaussian.
@@ -178,7 +180,7 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
         format=stored.format,
         count=len(rows),
         file_bytes=path.stat().st_size,
-        bytes_by_attribute=bytes_by_attribute(rows, extra),
+        bytes_by_attribute=stored.sizes or bytes_by_attribute(rows, extra),
         columns=names,
         extra_columns=extra,
         extra_elements=stored.extra_elements,

@@ -33,7 +33,10 @@ def read_rows(path: Path) -> StoredRows:
             if not 0 < count <= MAX_PER_BYTE * size:
                 raise SceneError(path, f"expected Gaussians in {size} bytes, found {count} promised")
             mip = meta.get("antialias") is True or meta.get("model") == "antialiased"
-            return to_rows(_columns(sog, meta, count), f".sog version {VERSION}", mip=mip)
+            columns = _columns(sog, meta, count)
+            keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
+            sizes = {key: sum(archive.getinfo(name).compress_size for name in meta[key]["files"]) for key in keys}
+            return to_rows(columns, f".sog version {VERSION}", sizes, mip=mip)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except zipfile.BadZipFile as error:

@@ -49,4 +49,5 @@ def read_rows(path: Path) -> StoredRows:
             sh0=rgb_to_sh0(colors[:, :3]),
             harmonics=np.zeros((len(rows), 0, 3)),
         )
-    return to_rows(columns, ".splat")
+    sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}
+    return to_rows(columns, ".splat", {name: each * len(rows) for name, each in sizes.items()})

@@ -20,6 +20,7 @@ from gsmerge.io.formats.spz_writer import COLOR_SCALE, HEADER, MAGIC, MAX_DEGREE
 from gsmerge.types import SH_C0
 
 VERSIONS = (1, 2, 3)
+ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the stream
 MAX_RATIO = 1032  # of gzip: no stream unpacks to more
 
 
@@ -53,11 +54,12 @@ def read_rows(path: Path) -> StoredRows:
         raise SceneError(path, problem, "copy or export it again")
     ends = np.cumsum([0, *widths]) * count
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(count, -1) for at, end in pairwise(ends)]
-    return to_rows(_columns(parts, version, fraction), f".spz version {version}", mip=bool(flags & MIP_FLAG))
+    sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
+    return to_rows(_columns(parts, version, fraction), f".spz version {version}", sizes, mip=bool(flags & MIP_FLAG))
 
 
 def _widths(version: int, degree: int) -> tuple[int, ...]:
-    """Bytes per Gaussian of positions, opacities, colours, scales, rotations and harmonics."""
+    """Bytes per Gaussian of the attributes."""
     return 6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1)
 
 

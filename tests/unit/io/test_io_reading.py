@@ -56,6 +56,8 @@ def test_what_the_file_is_called(gaussians: Gaussians, tmp_path: Path) -> None:
         assert (info.layout, info.count, info.opacity_encoding) == (layout, len(gaussians), "raw")
         assert info.file_bytes == (tmp_path / f"a{ending}").stat().st_size
         assert not info.opacity_guessed
+        if ending != ".spz":  # whose sizes are those before gzip
+            assert 0.5 * info.file_bytes < sum(info.bytes_by_attribute.values()) <= info.file_bytes
 
 
 @pytest.mark.parametrize("version", [1, 2])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -157,7 +159,7 @@ def corners() -> Gaussians:
     )
 
 
-@pytest.mark.parametrize("ending", OUTPUT_FORMATS)
+@pytest.mark.parametrize("ending", [".ply", *QUANTISED])
 def test_extremes_stay_finite(ending: str, tmp_path: Path) -> None:
     write_gaussians(tmp_path / f"a{ending}", corners())
     actual = read_back(tmp_path / f"a{ending}")
@@ -210,7 +212,7 @@ def test_names_ask_for_formats(name: str, ending: str) -> None:
 @pytest.mark.parametrize("name", ["a", "a.ksplat", "ply", "a.ply.gz", "spz/a"])
 def test_other_names_are_refused(name: str) -> None:
     with pytest.raises(
-        UsageError, match=r"expected a name that ends in \.compressed\.ply, \.ply, \.spz, \.sog or \.splat"
+        UsageError, match=r"expected a name that ends in \.compressed\.ply, \.ply, \.spz, \.sog, \.splat or \.glb"
     ):
         output_format(name)
 
@@ -242,3 +244,56 @@ def test_comments_reach_the_headers(tmp_path: Path) -> None:
     assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.compressed.ply").info.comments
     with pytest.raises(ValueError, match="printable lines of ASCII"):
         write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The document of a binary glTF, and the attributes of its only primitive."""
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack_from("<4sII I4s", data)
+    assert (magic, version, size, kind, length % 4) == (b"glTF", 2, len(data), b"JSON", 0)
+    document, content = json.loads(data[20 : 20 + length]), data[28 + length :]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert (primitive["mode"], primitive["extensions"]["KHR_gaussian_splatting"]["kernel"]) == (0, "ellipse")
+    attributes = {}
+    for name, index in primitive["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        values = np.frombuffer(content[view["byteOffset"] :][: view["byteLength"]], dtype)
+        attributes[name] = values.reshape(accessor["count"], {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]])
+        assert view["byteOffset"] % 4 == 0
+    return document, attributes
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_glb_holds_everything(degree: int, scene: PixelScene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, degree)
+    write_gaussians(tmp_path / "a.glb", gaussians)
+    document, actual = read_glb(tmp_path / "a.glb")
+    prefix, n = "KHR_gaussian_splatting:", len(gaussians)
+    np.testing.assert_array_equal(actual["POSITION"], gaussians.means)
+    np.testing.assert_allclose(actual[f"{prefix}ROTATION"][:, [3, 0, 1, 2]], gaussians.quats, atol=1e-6)
+    np.testing.assert_allclose(actual[f"{prefix}SCALE"], gaussians.scales, rtol=1e-5)
+    np.testing.assert_allclose(actual[f"{prefix}OPACITY"][:, 0], gaussians.opacities)
+    np.testing.assert_array_equal(actual[f"{prefix}SH_DEGREE_0_COEF_0"], gaussians.sh0[:, 0])
+    places = [(d, i) for d in range(1, degree + 1) for i in range(2 * d + 1)]
+    harmonics = [actual[f"{prefix}SH_DEGREE_{d}_COEF_{i}"] for d, i in places]
+    np.testing.assert_array_equal(np.stack([np.zeros((n, 3)), *harmonics], 1)[:, 1:], gaussians.shN)
+    assert len(actual) == 6 + len(places)
+    assert actual["COLOR_0"].shape == (n, 4)
+    low = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]["min"]
+    np.testing.assert_array_equal(low, gaussians.means.min(0))
+    assert document["nodes"][0]["rotation"] == [0, 0, 1, 0]  # y up
+
+
+def test_no_normals_is_the_same_without_twelve_bytes(scene: PixelScene, tmp_path: Path) -> None:
+    gaussians = drawn(scene, 1)
+    for name, normals in {"with": True, "without": False}.items():
+        write_gaussians(tmp_path / f"{name}.ply", gaussians, normals=normals)
+    wide, narrow = (read_ply(tmp_path / f"{name}.ply") for name in ("with", "without"))
+    assert wide.info.layout == "INRIA, SH degree 1"
+    assert narrow.info.layout == "INRIA, SH degree 1 (no normals)"
+    line = len("property float nx\n")
+    assert wide.info.file_bytes - narrow.info.file_bytes == 12 * len(gaussians) + 3 * line
+    for name, array in vars(wide.gaussians).items():
+        np.testing.assert_array_equal(getattr(narrow.gaussians, name), array)
