@@ -26,8 +26,6 @@ from gsmerge.io.formats.codebooks import fit_codebook, fit_palette, nearest_code
 from gsmerge.io.formats.sog_writer import sog_bytes
 from gsmerge.io.formats.spz_writer import spz_bytes
 
-ENDINGS = (".spz", ".splat", ".sog")
-
 
 @pytest.fixture(scope="module")
 def gaussians() -> Gaussians:
