@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
     from gsmerge.io import read_cameras as read_cameras
+    from gsmerge.io import read_gaussians as read_gaussians
     from gsmerge.io import read_ply as read_ply
     from gsmerge.io import read_scene as read_scene
     from gsmerge.io import to_cameras as to_cameras
@@ -55,7 +56,15 @@ _PUBLIC = {
     "errors": ("GsmergeError", "SceneError"),
     "measure.evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "measure.inspect": ("inspect",),
-    "io": ("read_cameras", "read_ply", "read_scene", "to_cameras", "write_gaussians", "write_ply"),
+    "io": (
+        "read_cameras",
+        "read_gaussians",
+        "read_ply",
+        "read_scene",
+        "to_cameras",
+        "write_gaussians",
+        "write_ply",
+    ),
     "online.compactor": ("Compactor",),
     "options": ("CompactOptions",),
     "pipeline": ("CompactReport", "CompactResult", "compact"),

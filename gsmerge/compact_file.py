@@ -61,6 +61,7 @@ def compact_files(
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
     report_path: Path | None = None,
+    normals: bool = True,
 ) -> dict[str, Any]:
     """Read a scene, compact it and write the result, its further levels of detail beside it, and the report: all of
     them or none.
@@ -76,6 +77,7 @@ def compact_files(
         hashed: Hash the input for the report.
         seconds_before: Wall time by name of what the caller did before.
         report_path: A file for the report; None: none is written.
+        normals: As of :func:`gsmerge.write_gaussians`.
 
     Returns:
         The report, see :func:`gsmerge.report.report_document`.
@@ -97,7 +99,9 @@ def compact_files(
         coarser = [(level_output(out, i), level) for i, level in enumerate(result.coarser, 1)]
         at |= {path: add(path) for path, _ in coarser}
         for path, one in ((out, result), *coarser):
-            write_gaussians(at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending)
+            write_gaussians(
+                at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending, normals=normals
+            )
         lost = lost_harmonics(out, result.gaussians.sh_degree)
         document = report_document(
             result.report,

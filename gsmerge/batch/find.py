@@ -11,6 +11,7 @@ from pathlib import Path
 from gsmerge.batch.options import BatchOptions
 from gsmerge.compact_file import level_output
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_text
 from gsmerge.io.content_hash import stem_of
 from gsmerge.io.formats.ply_file import header_counts
@@ -103,11 +104,11 @@ def find_scenes(given: Sequence[str], out: Path) -> Iterator[Path]:
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
             yield from _require_some(_walk(path, skip), argument, "in the folder")
-        elif path.suffix == ".ply" and path.is_file():
+        elif path.suffix in SCENE_SUFFIXES and path.is_file():
             yield path
         elif glob.has_magic(argument) and not path.exists():
             yield from _require_some(_matches(argument, skip), argument, "that match")
-        elif path.is_file() and path.suffix != ".ply":
+        elif path.is_file():
             yield from _require_some(_listed(path, skip), argument, "in the list")
         else:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
@@ -145,7 +146,7 @@ def _matches(pattern: str, skip: str) -> Iterator[Path]:
         path = Path(name)
         if path.is_dir():
             yield from _walk(path, skip)
-        elif path.suffix == ".ply":
+        elif path.suffix in SCENE_SUFFIXES:
             yield path
 
 

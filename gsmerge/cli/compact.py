@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 @opt.command(
     opt.SCENE,
     f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
-    opt.output("The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.", "SCENE.compact.ply"),
-    f"overwrite report dry_run {opt.RUN}",
+    opt.output(
+        "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name.", "SCENE.compact.ply"
+    ),
+    f"no_normals overwrite report dry_run {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -57,6 +59,7 @@ def compact(args: opt.Args) -> None:
         document = compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
+            normals=not args.no_normals,
         )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)

@@ -22,8 +22,9 @@ from gsmerge.errors import SceneError
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
     "effort device fit_steps time_budget",
-    opt.output("The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.", "ENCODED.compact.ply"),
-    f"overwrite dry_run {opt.RUN}",
+    opt.output("The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name.",
+               "ENCODED.compact.ply"),
+    f"no_normals overwrite dry_run {opt.RUN}",
 )  # fmt: skip
 def decode(args: opt.Args) -> None:
     """Write a compact scene from an encoded one, as compact --fit none, or from a state, fitted to its photos."""
@@ -73,7 +74,10 @@ def decode(args: opt.Args) -> None:
         if not all(np.isfinite(getattr(decoded.gaussians, name)).all() for name in ("means", "scales", "quats")):
             raise SceneError(path, "expected Gaussians of finite numbers, found others", "encode the scene again")
         done, ending = perf_counter(), output_format(out)
-        write_gaussians(temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending)
+        write_gaussians(
+            temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending,
+            normals=not args.no_normals,
+        )  # fmt: skip
     seconds = {"import": imported - start, "read": read - imported, "decode": done - read}
     seconds["write"] = perf_counter() - done
     document |= {

@@ -54,7 +54,7 @@ def evaluate(args: opt.Args) -> None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
     if args.align and args.targets is None:
         raise UsageError("--align: expected held-out views, whose photos to align with; name them with --targets")
-    from gsmerge.io import read_ply
+    from gsmerge.io import read_gaussians
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_csv, evaluation_document, evaluation_lines
@@ -72,7 +72,7 @@ def evaluate(args: opt.Args) -> None:
     load = args.load(files)
     require_views(load)
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, args.views)
-    plys = {name: read_ply(path) for name, path in zip(file_names(paths), paths, strict=True)}
+    plys = {name: read_gaussians(path) for name, path in zip(file_names(paths), paths, strict=True)}
     notes = [*load.notes, *adapted, *missing]
     say_notes(notes, quiet=args.silent)
     gaussians = {name: ply.gaussians for name, ply in plys.items()}

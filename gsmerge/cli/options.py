@@ -341,6 +341,8 @@ _TABLE = (
         option("output", Path, "", "--output", "-o"),
         switch("antialiased", "Lower the opacity of small Gaussians by what the low-pass adds to them, as some viewers "
                "do (Mip-Splatting)."),
+        switch("no_normals", "Leave the three columns of zeros out of a .ply, 12 of its 68 bytes per Gaussian; a "
+               "--budget in bytes counts them.", rare=True),
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
         switch("dry_run", "Print what would be done; write nothing."),

@@ -119,7 +119,7 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
 
 def source_of(ply: Path) -> Path | None:
     """The scene that a file was compacted from, if it is beside it: ``scene.ply`` for ``scene.compact.ply``."""
-    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?\.ply", ply.name)
+    match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat)", ply.name)
     source = None if match is None else ply.with_name(f"{match[1]}.ply")
     return source if source is not None and source.is_file() else None
 

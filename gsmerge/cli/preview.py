@@ -21,7 +21,7 @@ from gsmerge.errors import UsageError
 def preview(args: opt.Args) -> None:
     """Put renders of several scenes from the same cameras side by side, with the photos where there are any."""
     hints, scenes = args.hints(), args.scenes
-    from gsmerge.io import place_cameras_in_scene, ply_notes, read_ply, read_ply_with_hints
+    from gsmerge.io import place_cameras_in_scene, ply_notes, read_gaussians, read_ply_with_hints
     from gsmerge.measure.preview import contact_sheet, view_pictures
     from gsmerge.runtime.threads import use_threads
     from gsmerge.views import pick_views
@@ -33,7 +33,7 @@ def preview(args: opt.Args) -> None:
         raise UsageError(f"{args.output}: expected a name that ends in .png or .html")
     check_cameras(files)
     plys = [read_ply_with_hints(files.ply, opacity=args.opacity, hints=hints)]
-    plys += [read_ply(path, opacity=args.opacity) for path in scenes[1:]]
+    plys += [read_gaussians(path, opacity=args.opacity) for path in scenes[1:]]
     placed = place_cameras_in_scene(plys[0], files, hints=hints)
     used = list(placed.views.used)
     cameras, photos = placed.views.cameras[used], placed.views.images

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def render(args: opt.Args) -> None:
     """Render a scene from every camera, one PNG each."""
-    from gsmerge.io import find_scene_files, read_ply
+    from gsmerge.io import find_scene_files, read_gaussians
     from gsmerge.measure.preview import to_picture
     from gsmerge.render import render as render_views
     from gsmerge.runtime.threads import use_threads
@@ -45,7 +45,7 @@ def render(args: opt.Args) -> None:
     like = files if source is None else find_scene_files(source, cameras=args.cameras or files.cameras)
     check_folder(args.output, (*input_files(files), *input_files(like)), overwrite=args.overwrite)
     check_cameras(like)
-    ply = read_ply(files.ply, opacity=args.opacity)
+    ply = read_gaussians(files.ply, opacity=args.opacity)
     placed = _place(ply, like)
     views, notes = placed.views.cameras, placed.notes
     pictures = [args.output / f"{stem}.png" for stem in picture_stems(placed.views.names)]
@@ -70,10 +70,10 @@ def render(args: opt.Args) -> None:
 
 def _place(ply: PlyScene, like: SceneFiles) -> CamerasInScene:
     """The Gaussians, and the cameras in the frame of the scene ``like``."""
-    from gsmerge.io import ReadHints, place_cameras_in_scene, ply_notes, read_ply
+    from gsmerge.io import ReadHints, place_cameras_in_scene, ply_notes, read_gaussians
 
     hints = ReadHints(max_side=MAX_SIDE)
     if str(like.ply) == ply.info.path:
         return place_cameras_in_scene(ply, like, hints=hints, photos=False)
-    placed = place_cameras_in_scene(read_ply(like.ply), like, hints=hints, photos=False)
+    placed = place_cameras_in_scene(read_gaussians(like.ply), like, hints=hints, photos=False)
     return replace(placed, gaussians=ply.gaussians, notes=(*ply_notes(ply.info), *placed.notes))

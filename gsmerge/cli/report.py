@@ -51,7 +51,7 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 )  # fmt: skip
 def report(args: opt.Args) -> None:
     """Compare a scene with its compact versions: bytes, render time, overdraw, quality, break-even frames."""
-    from gsmerge.io import read_ply
+    from gsmerge.io import read_gaussians
     from gsmerge.measure.comparison import compare
     from gsmerge.measure.comparison_page import comparison_document, comparison_markdown
     from gsmerge.measure.evaluate import INPUT, EvaluateOptions
@@ -72,7 +72,7 @@ def report(args: opt.Args) -> None:
     log = RunLog()
     if isinstance(scene, UnalignedScene):
         scene = add_views(scene, log)
-    plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
+    plys = {name: read_gaussians(path) for name, path in zip(file_names(after), after, strict=True)}
     notes = [*load.notes, *adapted, *log.notes, *missing]
     say_notes(notes, quiet=args.silent)
     storage = {INPUT: _storage(load.ply), **{name: _storage(ply.info) for name, ply in plys.items()}}

@@ -23,7 +23,7 @@ from gsmerge.errors import UsageError
 )
 def view(args: opt.Args) -> None:
     """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
-    from gsmerge.io import read_ply
+    from gsmerge.io import read_gaussians
     from gsmerge.report import document_head
     from gsmerge.runtime.run_log import RunLog
     from gsmerge.stages.place_cameras import add_views
@@ -40,7 +40,7 @@ def view(args: opt.Args) -> None:
     log = RunLog()
     if isinstance(scene, UnalignedScene):
         scene = add_views(scene, log)
-    plys = {name: read_ply(path) for name, path in zip(file_names(after), after, strict=True)}
+    plys = {name: read_gaussians(path) for name, path in zip(file_names(after), after, strict=True)}
     notes = [*load.notes, *adapted, *log.notes]
     say_notes(notes, quiet=args.silent)
     document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": notes}

@@ -9,10 +9,12 @@ from gsmerge.io.bounds import read_json as read_json
 from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
 from gsmerge.io.cameras.camera_file import to_cameras as to_cameras
 from gsmerge.io.cameras.read import read_cameras as read_cameras
+from gsmerge.io.formats.ply import SCENE_SUFFIXES as SCENE_SUFFIXES
 from gsmerge.io.formats.ply import PlyInfo as PlyInfo
 from gsmerge.io.formats.ply import PlyScene as PlyScene
 from gsmerge.io.formats.ply import kept_comments as kept_comments
 from gsmerge.io.formats.ply import ply_notes as ply_notes
+from gsmerge.io.formats.ply import read_gaussians as read_gaussians
 from gsmerge.io.formats.ply import read_ply as read_ply
 from gsmerge.io.formats.writing import OUTPUT_FORMATS as OUTPUT_FORMATS
 from gsmerge.io.formats.writing import lost_harmonics as lost_harmonics

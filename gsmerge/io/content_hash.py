@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import CameraFile, SceneFiles, read_cameras
+from gsmerge.io import SCENE_SUFFIXES, CameraFile, SceneFiles, read_cameras
 from gsmerge.io.bounds import walk_files
 from gsmerge.io.cameras.json_files import FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.nerfstudio import NAME as DATAPARSER
@@ -71,7 +71,7 @@ def cameras_of(path: Path, scene: str | None = None) -> CameraFile | None:
 
 def stem_of(scene: Path) -> str:
     """A scene's name; of a file without the extension. Folders may have dots in theirs."""
-    return scene.stem if scene.suffix == ".ply" else scene.name
+    return scene.stem if scene.suffix in SCENE_SUFFIXES else scene.name
 
 
 def filled(template: str | None, scene: Path) -> Path | None:

@@ -21,7 +21,7 @@ from gsmerge.io.alignment.similarity import IDENTITY
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, to_cameras
 from gsmerge.io.cameras.lens import as_pinholes
 from gsmerge.io.exporters import Exporter, choose_exporters, find_exporter
-from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_ply
+from gsmerge.io.formats.ply import OpacityChoice, PlyInfo, PlyScene, ply_notes, read_gaussians
 from gsmerge.io.hints import AUTO, ReadHints, make_hints
 from gsmerge.io.photos import as_floats, photo_size
 from gsmerge.io.scene_files import SceneFiles, find_scene_files
@@ -86,7 +86,7 @@ def read_scene(
         path: The ``.ply``, or a folder that has it.
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
-        opacity: How opacities are stored; see :func:`gsmerge.io.read_ply`.
+        opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: Fields of :class:`gsmerge.io.ReadHints`: ``exporter``, ``quats``, ``order``, ``scene_scale``,
             ``max_side``.
 
@@ -125,7 +125,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 def read_ply_with_hints(path: Path, *, opacity: OpacityChoice, hints: ReadHints) -> PlyScene:
     """The file's rows, with opacities read as given, or as the given exporter stores them."""
     exporter = find_exporter(hints.exporter)
-    return read_ply(path, opacity=opacity if exporter is None or opacity != "auto" else exporter.opacity)
+    return read_gaussians(path, opacity=opacity if exporter is None or opacity != "auto" else exporter.opacity)
 
 
 def align_scene(

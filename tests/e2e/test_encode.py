@@ -155,7 +155,7 @@ def test_half_a_file_is_refused_and_nothing_is_lost(encoded: Path, tmp_path: Pat
     assert (tmp_path / "out.ply").read_text() == "precious"
 
 
-@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".splat"])
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat", ".glb"])
 def test_other_formats_by_name(ending: str, encoded: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
     one, other = tmp_path / f"one{ending}", tmp_path / f"other{ending}"
     assert run("decode", encoded, "-o", one).code == 0
@@ -163,6 +163,37 @@ def test_other_formats_by_name(ending: str, encoded: Path, made_scene: Path, tmp
     assert one.read_bytes() == other.read_bytes()
     assert document["output"]["bytes"] == other.stat().st_size
     assert not one.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\ncomment opacity")
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat"])
+def test_results_are_read_in_any_format(ending: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / f"a{ending}"
+    assert run("compact", made_scene, "--fit", "none", *SMALL, "-o", out).code == 0
+    inspected = json.loads(run("inspect", out, "--json").out)
+    assert inspected["bytes"] == out.stat().st_size
+    assert run("preview", made_scene, out, "-o", tmp_path / "a.png").code == 0
+    table = run("evaluate", made_scene, out, "--lpips", "none").out
+    assert f"a{ending}" in table
+
+
+@pytest.mark.parametrize("ending", [".spz", ".splat"])
+def test_one_per_pixel_in_other_formats(ending: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    whole, out = tmp_path / f"whole{ending}", tmp_path / "out.ply"
+    gsmerge.write_gaussians(whole, gsmerge.read_scene(made_scene).gaussians)
+    places = ("--cameras", made_scene / "transforms.json", "--images", made_scene / "images")
+    outcome = run("compact", whole, *places, "--fit", "none", *SMALL, "-o", out, "--json")
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["output"]["num_gaussians"] > 10
+
+
+def test_no_normals(encoded: Path, tmp_path: Path, run: Run) -> None:
+    sizes = []
+    for name, extra in {"a": (), "b": ("--no-normals",)}.items():
+        assert run("decode", encoded, "-o", tmp_path / f"{name}.ply", *extra).code == 0
+        sizes.append(gsmerge.read_ply(tmp_path / f"{name}.ply").info)
+    assert sizes[0].bytes_by_attribute["normals"] == 12 * sizes[0].count
+    assert "normals" not in sizes[1].bytes_by_attribute
+    assert sizes[1].count == sizes[0].count
 
 
 def test_levels_in_other_formats(made_scene: Path, tmp_path: Path, run: Run) -> None:

@@ -9,6 +9,7 @@ from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file, make_pinhole
+from gsmerge.io.formats.ply import READERS
 from gsmerge.io.formats.ply_file import open_ply
 
 SOURCE = "SHARP"
@@ -21,6 +22,8 @@ def read_sharp(path: Path) -> CameraFile | None:
 
     The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are damaged.
     """
+    if path.suffix.lower() in READERS:
+        return None
     data = open_ply(path)
     if "vertex" not in data or not all(name in data for name in _ELEMENTS):
         return None

@@ -1,4 +1,6 @@
-"""Gaussians as float64 arrays in the units of most file formats: what all writers start from."""
+"""Gaussians in the units of most file formats: as float64 arrays, what all writers start from, and as rows of a PLY
+file, where all readers end.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.geometry import sh0_to_rgb
-from gsmerge.io.formats.ply_file import MAX_LOG_SCALE
+from gsmerge.io.formats.ply_file import MAX_LOG_SCALE, MEANS, MIP_COMMENT, QUATS, SCALES, SH0
 from gsmerge.types import Array, Gaussians, as_array
 
 
@@ -35,6 +37,39 @@ class Columns:
     def select(self, order: np.ndarray) -> Columns:
         """The rows in another order."""
         return Columns(*(column[order] for column in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class StoredRows:
+    """Gaussians as a file stores them: ``rows`` has the columns of :mod:`gsmerge.io.formats.ply_file`."""
+
+    rows: np.ndarray
+    layout: str  # for people
+    format: str
+    encoding: str | None  # of the opacities: "logit", "raw", or None where the file does not say
+    sizes: dict[str, int] | None = None  # bytes by attribute; None: those of the rows
+    comments: tuple[str, ...] = ()
+    extra_elements: tuple[str, ...] = ()
+
+
+def to_rows(columns: Columns, name: str, sizes: dict[str, int], *, mip: bool = False) -> StoredRows:
+    """What a quantised file of that format holds, in so many bytes by attribute; ``mip`` if its Gaussians want a
+    filter of their own.
+    """
+    count, num_higher = columns.harmonics.shape[:2]
+    names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(3 * num_higher)), "opacity", *SCALES, *QUATS)
+    harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
+    parts = (columns.means, columns.sh0, harmonics, columns.opacities[:, None], columns.log_scales, columns.quats)
+    with np.errstate(over="ignore"):
+        table = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+    return StoredRows(
+        rows=table.view([(column, np.float32) for column in names])[:, 0],
+        layout=f"{name}, SH degree {round((num_higher + 1) ** 0.5) - 1}",
+        format="quantised",
+        encoding="raw",
+        sizes=sizes,
+        comments=(MIP_COMMENT,) if mip else (),
+    )
 
 
 def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Columns:
@@ -71,6 +106,15 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """The nearest of 0 to 255, uint8."""
     return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
+
+
+def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Unit quaternions ``[n,4]`` of what :func:`smallest_three` returns."""
+    quats = np.empty((len(largest), 4))
+    is_largest = np.arange(4) == largest[:, None]
+    quats[~is_largest] = others.reshape(-1)
+    quats[is_largest] = np.sqrt(np.clip(1 - (others**2).sum(1), 0, None))
+    return quats
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import morton_codes, rgb_to_sh0
-from gsmerge.io.formats.arrays import smallest_three, to_bytes, to_columns
+from gsmerge.io.formats.arrays import from_smallest_three, smallest_three, to_bytes, to_columns
 from gsmerge.io.formats.ply_file import MEANS, QUATS, REQUIRED, SCALES, SH0
 from gsmerge.types import Gaussians
 
@@ -96,10 +96,7 @@ def _fill_rotations(rows: np.ndarray, words: np.ndarray) -> None:
     """Two bits name the largest component of wxyz; the others follow at 10 bits each, over +-sqrt(1/2)."""
     largest = (words >> np.uint32(30)).astype(np.int64)
     others = (np.stack(_shares(words, (10, 10, 10)), 1) - 0.5) * np.sqrt(2.0)
-    quats = np.empty((len(words), 4))
-    is_largest = np.arange(4) == largest[:, None]
-    quats[~is_largest] = others.reshape(-1)
-    quats[is_largest] = np.sqrt(np.clip(1 - (others**2).sum(1), 0, None))
+    quats = from_smallest_three(largest, others)
     for i, name in enumerate(QUATS):
         rows[name] = quats[:, i]
 

@@ -1,8 +1,9 @@
-"""Reading Gaussian splats from PLY: log scales, logits and channel-major harmonics end here."""
+"""Reading Gaussian splats from files: log scales, logits and channel-major harmonics end here."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,8 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
+from gsmerge.io.formats import sog_reader, splat, spz_reader
+from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.compressed import is_compressed, unpack
 from gsmerge.io.formats.ply_file import (
     BLOCK_BYTES,
@@ -21,6 +24,7 @@ from gsmerge.io.formats.ply_file import (
     MEANS,
     NORMALS,
     QUATS,
+    RENDER_COMMENT,
     REQUIRED,
     RGB,
     SCALES,
@@ -36,14 +40,20 @@ from gsmerge.io.formats.ply_file import (
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
 
-RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
-
 OpacityChoice = Literal["auto", "logit", "raw"]
+
+# What reads a file of Gaussians, by its ending; all other files are taken for PLY
+READERS: dict[str, Callable[[Path], StoredRows]] = {
+    ".spz": spz_reader.read_rows,
+    ".splat": splat.read_rows,
+    ".sog": sog_reader.read_rows,
+}
+SCENE_SUFFIXES = (".ply", *READERS)
 
 
 @dataclass(frozen=True)
 class PlyInfo:
-    """What the PLY file at ``path`` holds."""
+    """What the file of Gaussians at ``path`` holds; of another format than PLY, as rows of a PLY file of float32."""
 
     path: str
     layout: str  # name of the column layout, as "17-column export" or "INRIA, SH degree 3"
@@ -51,7 +61,7 @@ class PlyInfo:
     count: int  # Gaussians, the unusable ones included
     file_bytes: int
     # bytes of the rows by attribute (means, normals, sh0, shN, opacities, scales, quats, extra); of the values' binary
-    # types for an ascii file
+    # types for an ascii file; before gzip for .spz, and of the textures for .sog, where sh0 includes the opacities
     bytes_by_attribute: dict[str, int]
     # all columns of the vertex element, in the file's order; ``extra_columns`` are ignored, and ``byte_columns`` stored
     # as bytes
@@ -70,7 +80,7 @@ class PlyInfo:
 
 @dataclass(frozen=True)
 class PlyScene:
-    """The n Gaussians of a PLY file, row by row; float32, means float64 where the file stores them so.
+    """The n Gaussians of a file, row by row; float32, means float64 where the file stores them so.
 
     A row that was not finite is False in ``valid [n]``, fully transparent and grey, and has the position and scales of
     the finite row before it.
@@ -115,17 +125,47 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    path = Path(path)
+    return _to_scene(Path(path), _ply_rows(Path(path)), opacity)
+
+
+def read_gaussians(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -> PlyScene:
+    """Read a file of Gaussians in the format that the ending of its name says.
+
+    Those are ``.spz`` (versions 1 to 3), ``.splat`` and ``.sog`` (version 2). Everything else is read as by
+    :func:`read_ply`; ``opacity`` is for those.
+
+    Raises:
+        SceneError: If the file cannot be read, is damaged, or holds no finite Gaussian.
+        ValueError: If ``opacity`` is none of the three.
+    """
+    read = READERS.get(Path(path).suffix.lower())
+    return read_ply(path, opacity=opacity) if read is None else _to_scene(Path(path), read(Path(path)), "auto")
+
+
+def _ply_rows(path: Path) -> StoredRows:
     data = open_ply(path)
     compressed = is_compressed(data)
-    stored = unpack(path, data) if compressed else _vertex(path, data).data
-    rows = np.asarray(stored)
+    rows = unpack(path, data) if compressed else _vertex(path, data).data
+    names = tuple(np.asarray(rows).dtype.names or ())
+    num_rest = _num_rest(path, names)
+    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
+    return StoredRows(
+        rows=rows,
+        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
+        format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
+        encoding="logit" if compressed or LOGIT_COMMENT in comments else None,
+        comments=comments,
+        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+    )
+
+
+def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScene:
+    rows = np.asarray(stored.rows)
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
-    num_clipped, num_zero_quats = _convert_all(stored, out)
-    comments = (*data.comments, *(c for e in data.elements for c in e.comments))
-    known = opacity if opacity != "auto" else "logit" if compressed or LOGIT_COMMENT in comments else None
+    num_clipped, num_zero_quats = _convert_all(stored.rows, out)
+    known = opacity if opacity != "auto" else stored.encoding
     encoding = known or _likely_encoding(out["opacities"])
     _activate(out["opacities"], out["valid"], encoding)
     num_bad = _clear_invalid(path, out)
@@ -136,16 +176,16 @@ def read_ply(path: str | os.PathLike[str], *, opacity: OpacityChoice = "auto") -
     extra = tuple(name for name in names if name not in used)
     info = PlyInfo(
         path=str(path),
-        layout=f"compressed, SH degree {sh_degree(num_rest)}" if compressed else layout_name(names, num_rest),
-        format="ascii" if data.text else "binary big-endian" if data.byte_order == ">" else "binary little-endian",
+        layout=stored.layout,
+        format=stored.format,
         count=len(rows),
         file_bytes=path.stat().st_size,
-        bytes_by_attribute=bytes_by_attribute(rows, extra),
+        bytes_by_attribute=stored.sizes or bytes_by_attribute(rows, extra),
         columns=names,
         extra_columns=extra,
-        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+        extra_elements=stored.extra_elements,
         byte_columns=byte_columns,
-        comments=comments,
+        comments=stored.comments,
         sh_degree=sh_degree(num_rest),
         opacity_encoding=encoding,
         opacity_guessed=known is None,

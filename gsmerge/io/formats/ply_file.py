@@ -23,6 +23,8 @@ MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal fl
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
+RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")

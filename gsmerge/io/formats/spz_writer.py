@@ -20,18 +20,20 @@ from gsmerge.types import SH_C0, Gaussians
 
 MAX_DEGREE = 3  # older readers do not know degree 4
 MAGIC, VERSION = 0x5053474E, 3
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, zero
+MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
 LARGEST = 2**23 - 1
 COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 
 
-def spz_bytes(gaussians: Gaussians) -> bytes:
-    """Content of a ``.spz`` file. ValueError if there is NaN or inf."""
+def spz_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
+    """Content of a ``.spz`` file; ``mip`` sets the flag of antialiased Gaussians. ValueError if there is NaN or inf."""
     columns = to_columns(gaussians, MAX_DEGREE)
     degree = round((columns.harmonics.shape[1] + 1) ** 0.5) - 1
     fraction = _fraction_bits(columns.means)
-    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(columns), degree, fraction, 0, 0)
+    header = HEADER.pack(MAGIC, VERSION, len(columns), degree, fraction, MIP_FLAG * mip, 0)
     fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
     parts = [
         fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),  # three little-endian bytes for each coordinate

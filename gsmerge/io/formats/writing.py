@@ -10,17 +10,30 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.formats import compressed, spz_writer
-from gsmerge.io.formats.arrays import Columns, to_bytes, to_columns
-from gsmerge.io.formats.ply_file import BLOCK_BYTES, LOGIT_COMMENT, MAX_LOGIT, MEANS, NORMALS, QUATS, SCALES, SH0
+from gsmerge.io.formats import compressed, glb_writer, sog_writer, splat, spz_writer
+from gsmerge.io.formats.arrays import Columns, to_columns
+from gsmerge.io.formats.ply_file import (
+    BLOCK_BYTES,
+    LOGIT_COMMENT,
+    MAX_LOGIT,
+    MEANS,
+    MIP_COMMENT,
+    NORMALS,
+    QUATS,
+    SCALES,
+    SH0,
+)
 from gsmerge.types import Gaussians
 
-# ``.splat``: 32 bytes per Gaussian and no header, the format of antimatter15/splat that most viewers read. Quaternions
-# wxyz are bytes 128 + 128 q; there is no room for harmonics above degree 0.
-SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
-
 # File endings, the longest first, and the highest degree of the harmonics that there is room for.
-OUTPUT_FORMATS = {".compressed.ply": compressed.MAX_DEGREE, ".ply": 4, ".spz": spz_writer.MAX_DEGREE, ".splat": 0}
+OUTPUT_FORMATS = {
+    ".compressed.ply": compressed.MAX_DEGREE,
+    ".ply": 4,
+    ".spz": spz_writer.MAX_DEGREE,
+    ".sog": sog_writer.MAX_DEGREE,
+    ".splat": splat.MAX_DEGREE,
+    ".glb": glb_writer.MAX_DEGREE,
+}
 
 
 def output_format(path: str | os.PathLike[str]) -> str:
@@ -51,17 +64,19 @@ def write_gaussians(
     overwrite: bool = False,
     comments: Sequence[str] = (),
     ending: str | None = None,
+    normals: bool = True,
 ) -> None:
-    """Write Gaussians as ``.ply``, ``.compressed.ply``, ``.spz`` or ``.splat``, by the ending of the name.
+    """Write Gaussians in one of ``OUTPUT_FORMATS``, by the ending of the name.
 
-    All but ``.ply`` quantise; none of them changes the frame of the Gaussians.
+    All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians.
 
     Args:
         path: The file; complete or not there at all.
         gaussians: Finite values.
         overwrite: Replace an existing file.
-        comments: Lines for the header of the two that have one.
+        comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Format to write instead of the name's.
+        normals: Of a ``.ply``, as of :func:`write_ply`.
 
     Raises:
         UsageError: If the name ends in none of these.
@@ -70,15 +85,20 @@ def write_gaussians(
     """
     ending = output_format(path) if ending is None else ending
     if ending == ".ply":
-        write_ply(path, gaussians, overwrite=overwrite, comments=comments)
+        write_ply(path, gaussians, overwrite=overwrite, comments=comments, normals=normals)
         return
     _check_comments(comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
-        if ending == ".compressed.ply":
-            content = compressed.compressed_bytes(gaussians, comments)
-        else:
-            content = spz_writer.spz_bytes(gaussians) if ending == ".spz" else _splat_bytes(gaussians)
-        temporary.write_bytes(content)
+        temporary.write_bytes(_content(gaussians, ending, comments))
+
+
+def _content(gaussians: Gaussians, ending: str, comments: Sequence[str]) -> bytes:
+    if ending == ".compressed.ply":
+        return compressed.compressed_bytes(gaussians, comments)
+    if ending in (".splat", ".glb"):
+        return splat.splat_bytes(gaussians) if ending == ".splat" else glb_writer.glb_bytes(gaussians)
+    write = spz_writer.spz_bytes if ending == ".spz" else sog_writer.sog_bytes
+    return write(gaussians, mip=MIP_COMMENT in comments)
 
 
 def write_ply(
@@ -88,6 +108,7 @@ def write_ply(
     overwrite: bool = False,
     sh_degree: int | None = None,
     comments: Sequence[str] = (),
+    normals: bool = True,
 ) -> None:
     """Write Gaussians in INRIA's column order, binary little-endian float32.
 
@@ -99,6 +120,8 @@ def write_ply(
         overwrite: Replace an existing file.
         sh_degree: Drop harmonics above this degree; None keeps all.
         comments: Lines for the header, such as :func:`gsmerge.io.kept_comments` of another file.
+        normals: Write three columns of zeros that no renderer uses but a few readers, such as SIBR's, expect: 12 bytes
+            per Gaussian.
 
     Raises:
         SceneError: If the file exists or cannot be written.
@@ -108,12 +131,12 @@ def write_ply(
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
-    header, num_columns = _header(len(gaussians), degree, comments)
+    header, num_columns = _header(len(gaussians), degree, comments, normals=normals)
     block = max(1, BLOCK_BYTES // (4 * num_columns))
     with atomic_output(path, overwrite=overwrite) as temporary, temporary.open("wb") as file:
         file.write(header)
         for start in range(0, len(gaussians), block):
-            rows = _ply_rows(to_columns(gaussians[start : start + block], degree, start))
+            rows = _ply_rows(to_columns(gaussians[start : start + block], degree, start), normals=normals)
             if not np.isfinite(rows).all():
                 raise ValueError(f"expected finite Gaussians, got an opacity outside [0, 1] in the rows from {start}")
             file.write(rows.data)
@@ -124,23 +147,24 @@ def _check_comments(comments: Sequence[str]) -> None:
         raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
 
 
-def _header(count: int, sh_degree: int, comments: Sequence[str] = ()) -> tuple[bytes, int]:
+def _header(count: int, sh_degree: int, comments: Sequence[str] = (), *, normals: bool = True) -> tuple[bytes, int]:
     """The header of a ``.ply`` of that many Gaussians, and its number of columns, all of them float32."""
     num_rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names = [*MEANS, *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
+    start = (*MEANS, *NORMALS) if normals else MEANS
+    names = [*start, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS]
     lines = ["ply", "format binary_little_endian 1.0", f"comment {LOGIT_COMMENT}"]
     lines += [*(f"comment {comment}" for comment in comments), f"element vertex {count}"]
     lines += [*(f"property float {name}" for name in names), "end_header", ""]
     return "\n".join(lines).encode("ascii"), len(names)
 
 
-def _ply_rows(columns: Columns) -> np.ndarray:
+def _ply_rows(columns: Columns, *, normals: bool) -> np.ndarray:
     """``[m,columns]`` float32 values in the order of the header."""
     with np.errstate(all="ignore"):  # opacities 0 and 1 are clipped, impossible ones become NaN
         logits = np.log(columns.opacities) - np.log1p(-columns.opacities)
     parts = [
         columns.means,
-        np.zeros_like(columns.means),  # normals
+        np.zeros((len(columns), 3 * normals)),
         columns.sh0,
         columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
         np.clip(logits, -MAX_LOGIT, MAX_LOGIT)[:, None],
@@ -172,12 +196,3 @@ def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     while file_bytes(count, sh_degree) > max_bytes:  # the header contains the count itself
         count -= 1
     return count
-
-
-def _splat_bytes(gaussians: Gaussians) -> bytes:
-    columns = to_columns(gaussians, OUTPUT_FORMATS[".splat"])
-    rows = np.empty(len(columns), SPLAT_ROW)
-    rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
-    rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
-    rows["quats"] = to_bytes(128 * columns.quats + 128)
-    return rows.tobytes()

@@ -105,13 +105,13 @@ def test_levels_are_part_of_a_result(scene: Path, out: Path) -> None:
     assert run(scene, out, levels)["status"] == DONE
 
 
-@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".splat"])
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat"])
 def test_results_in_other_formats(ending: str, scene: Path, out: Path) -> None:
     said = replace(QUICK, settings=QUICK.settings.with_settings({"levels": 2}), output="{stem}" + ending)
     actual = run(scene, out, said)
     assert [file["path"] for file in actual["files"]] == [f"room{ending}", f"room.level1{ending}"]
     assert sorted(results(out)) == sorted(file["path"] for file in actual["files"])
-    start = {".compressed.ply": b"ply\n", ".spz": b"\x1f\x8b"}.get(ending, b"")
+    start = {".compressed.ply": b"ply\n", ".spz": b"\x1f\x8b", ".sog": b"PK"}.get(ending, b"")
     assert (out / f"room{ending}").read_bytes().startswith(start)
     assert run(scene, out, said)["status"] == SKIPPED
     assert run(scene, out)["files"][0]["bytes"] > 2 * actual["files"][0]["bytes"]

@@ -1,0 +1,53 @@
+"""``.splat``: 32 bytes per Gaussian and no header, the format of antimatter15/splat that most viewers read.
+
+Quaternions wxyz are bytes 128 + 128 q; there is no room for harmonics above degree 0.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import rgb_to_sh0
+from gsmerge.io.bounds import check_file
+from gsmerge.io.formats.arrays import Columns, StoredRows, to_bytes, to_columns, to_rows
+from gsmerge.types import Gaussians
+
+MAX_DEGREE = 0
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+
+
+def splat_bytes(gaussians: Gaussians) -> bytes:
+    """Content of a ``.splat`` file. ValueError if there is NaN or inf."""
+    columns = to_columns(gaussians, MAX_DEGREE)
+    rows = np.empty(len(columns), ROW)
+    rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
+    rows["colors"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
+    rows["quats"] = to_bytes(128 * columns.quats + 128)
+    return rows.tobytes()
+
+
+def read_rows(path: Path) -> StoredRows:
+    """The Gaussians of a ``.splat``. SceneError if its size is no multiple of 32 bytes, or it is empty."""
+    size = check_file(path)
+    if size == 0 or size % ROW.itemsize:
+        problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"
+        raise SceneError(path, problem, "copy or export it again")
+    try:
+        rows = np.fromfile(path, ROW)
+    except OSError as error:
+        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    colors = rows["colors"] / 255
+    with np.errstate(all="ignore"):  # a scale of 0 is a value, what is not finite is set aside later
+        columns = Columns(
+            means=rows["means"],
+            quats=(rows["quats"] - 128.0) / 128,
+            log_scales=np.log(rows["scales"]),
+            opacities=colors[:, 3],
+            sh0=rgb_to_sh0(colors[:, :3]),
+            harmonics=np.zeros((len(rows), 0, 3)),
+        )
+    sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}
+    return to_rows(columns, ".splat", {name: each * len(rows) for name, each in sizes.items()})
