@@ -343,6 +343,8 @@ _TABLE = (
                "do (Mip-Splatting)."),
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
+        switch("no_viewer_cameras", "Do not write the input views beside the result, as NAME.cameras.json for viewers.",
+               rare=True),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),

@@ -136,7 +136,11 @@ def _read_gaussians(given: TensorInput) -> tuple[Gaussians, np.ndarray, list[str
     _check_values(out, valid)
     np.clip(out["opacities"], 0, 1, out=out["opacities"])
     _normalise_few(out["quats"])
-    return Gaussians(**out), valid, [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
+    notes = [f"{num_bad:,} row(s) with NaN or inf, set aside"] if num_bad else []
+    first, last = out["quats"][valid][:, 0], out["quats"][valid][:, 3]
+    if last.min() >= 0 > first.min():  # quaternions of matrices usually have no negative w
+        notes.append("the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]")
+    return Gaussians(**out), valid, notes
 
 
 def _read_base(given: TensorInput) -> np.ndarray:

@@ -166,7 +166,12 @@ def test_wrong_sizes_are_named(scene: PixelScene) -> None:
 
 def test_rotations_may_be_left_unchecked(scene: PixelScene) -> None:
     given = changed(scene, "quats", lambda q: q[:, [1, 2, 3, 0]])
-    assert len(compact_tensors(**given, check_rotations=False, **FAST)) > 0
+    notes = compact_tensors(**given, check_rotations=False, **FAST).report.notes
+    signed = changed(scene, "quats", lambda q: (q * np.where(q[:, :1] < 0, -1, 1))[:, [1, 2, 3, 0]])
+    warned = compact_tensors(**signed, check_rotations=False, **FAST).report.notes
+    assert [any("if w comes last" in note for note in some) for some in (notes, warned)] == [
+        bool((scene.gaussians.quats[:, 0] >= 0).all()), True
+    ]  # fmt: skip
 
 
 def test_centres_at_corners_get_a_note(scene: PixelScene) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from gsmerge.types import Cameras
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
@@ -241,7 +243,8 @@ def viewer_cameras_path(output: Path) -> Path:
     """``out.ply`` -> ``out.cameras.json``: where the cameras for viewers go."""
     name = output.name
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
-    return output.with_name(f"{stem}.cameras.json")
+    ending = ".cameras.json"
+    return output.with_name(os.fsencode(stem)[: _MAX_NAME - len(ending)].decode("utf-8", "ignore") + ending)
 
 
 def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
