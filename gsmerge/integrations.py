@@ -222,7 +222,7 @@ def _axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviations ``[n,3]`` and rotations ``[n,4]`` wxyz of covariances ``[n,3,3]``."""
     finite = np.isfinite(covariances).all((1, 2))
     squares, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
-    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, no mirror
+    axes[:, :, 0] = np.cross(axes[:, :, 1], axes[:, :, 2])  # a rotation, no mirror
     scales = np.sqrt(np.maximum(squares, 0))
     scales[~finite] = np.nan
     return scales.astype(np.float32), rotmat_to_quat(axes).astype(np.float32)

@@ -76,7 +76,7 @@ def read_tensors(given: TensorInput) -> tuple[PixelScene | UnalignedScene, list[
     if given.order not in ORDERS:
         raise ValueError(f"order: expected one of {', '.join(ORDERS)}, got {given.order!r}")
     gaussians, valid, notes = _read_gaussians(given)
-    if given.order == "none" and given.viewmats is None:
+    if given.order == "none" and given.viewmats is None and given.images is None:
         return UnalignedScene(gaussians[valid], NO_CAMERAS, None, ()), notes
     cameras, images = _read_views(given)
     names = tuple(f"view{i}" for i in range(len(cameras))) if given.names is None else tuple(map(str, given.names))
@@ -243,6 +243,8 @@ def _matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: 
 def _view_shape(given: TensorInput, photos: np.ndarray | None) -> tuple[int, int, int]:
     """Views, height and width: as given, or those of the images."""
     if given.shape is not None:
+        if len(given.shape) != 3:
+            raise SceneError("shape", f"expected views, height and width, found {list(given.shape)}")
         views, height, width = (int(side) for side in given.shape)
     elif photos is None:
         raise SceneError("shape", "expected the number of views, their height and width, found neither it nor images")

@@ -160,6 +160,16 @@ def test_wrong_sizes_are_named(scene: PixelScene) -> None:
         compact_tensors(**tensors_of(scene, images=None), **FAST)
     with pytest.raises(SceneError, match=r"^images: expected shape \[3, 35, 48, 3\], found \[3, 36, 48, 3\]"):
         compact_tensors(**tensors_of(scene), shape=(3, 35, 48), **FAST)
+    with pytest.raises(SceneError, match=r"^shape: expected views, height and width, found \[36, 48\]"):
+        compact_tensors(**tensors_of(scene), shape=(36, 48), **FAST)  # type: ignore[arg-type]
+    with pytest.raises(SceneError, match=r"^viewmats: expected one matrix for each view, found none"):
+        compact_tensors(**tensors_of(scene, viewmats=None, Ks=None), order="none", **FAST)
+    with pytest.raises(SceneError, match=r"^names: expected 3 names"):
+        compact_tensors(**tensors_of(scene), names=["a"], **FAST)
+    with pytest.raises(SceneError, match=r"^quats: expected an array or tensor of numbers, found str"):
+        compact_tensors(**tensors_of(scene, quats="wxyz"), **FAST)
+    with pytest.raises(SceneError, match=r"^means: expected finite Gaussians, .* in all 5184 rows"):
+        compact_tensors(**changed(scene, "scales", lambda s: s * np.nan), **FAST)
     with pytest.raises(ValueError, match="order: expected one of"):
         compact_tensors(**tensors_of(scene), order="layers", **FAST)
 
