@@ -55,7 +55,8 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
     """Of what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels.
 
     Args:
-        gaussians: Has ``means``, ``scales``, ``rotations`` wxyz, ``harmonics [1,n,3,k]`` and ``opacities``.
+        gaussians: Has ``means``, ``scales``, ``rotations`` xyzw (its files have w first), ``harmonics [1,n,3,k]`` and
+            ``opacities``.
         poses: ``extrinsic [1,V,4,4]`` camera to world, ``intrinsic [1,V,3,3]`` divided by the image's size.
         images: ``[1,V,3,H,W]`` as the model got them, in [0, 1].
         sh_degree: Harmonics above this degree are left out, as in its files.
@@ -66,7 +67,7 @@ def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_de
     return {
         **_gaussians(gaussians, sh_degree),
         "scales": _one("scales", gaussians.scales, 2),
-        "quats": _one("rotations", gaussians.rotations, 2),
+        "quats": _one("rotations", gaussians.rotations, 2)[:, [3, 0, 1, 2]],
         **_family_views(poses, "extrinsic", "intrinsic", images),
         "order": "none",
     }
