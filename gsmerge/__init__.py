@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gsmerge import integrations as integrations
     from gsmerge.encoded.decode import decode_scene as decode_scene
     from gsmerge.encoded.encode import encode_scene as encode_scene
     from gsmerge.encoded.encoded import Encoded as Encoded
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from gsmerge.encoded.gsm_file import save_encoded as save_encoded
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
+    from gsmerge.in_memory import CompactTensors as CompactTensors
+    from gsmerge.in_memory import compact_tensors as compact_tensors
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_gaussians as read_gaussians
     from gsmerge.io import read_ply as read_ply
@@ -54,6 +57,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "errors": ("GsmergeError", "SceneError"),
+    "in_memory": ("CompactTensors", "compact_tensors"),
     "measure.evaluate": ("EvaluateOptions", "Evaluation", "Views", "evaluate"),
     "measure.inspect": ("inspect",),
     "io": (
@@ -91,6 +95,8 @@ class _Package(ModuleType):
 
 
 def __getattr__(name: str) -> Any:
+    if name == "integrations":
+        return import_module(f"{__name__}.{name}")
     if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)

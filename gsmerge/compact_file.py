@@ -21,6 +21,7 @@ from gsmerge.io import (
     output_format,
     write_gaussians,
 )
+from gsmerge.io.cameras.json_files import write_viewer_cameras
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
@@ -62,9 +63,10 @@ def compact_files(
     seconds_before: Mapping[str, float] | None = None,
     report_path: Path | None = None,
     normals: bool = True,
+    cameras_path: Path | None = None,
 ) -> dict[str, Any]:
-    """Read a scene, compact it and write the result, its further levels of detail beside it, and the report: all of
-    them or none.
+    """Read a scene, compact it and write the result, its further levels of detail beside it, its views for viewers,
+    and the report: all of them or none.
 
     Args:
         files: The scene.
@@ -78,6 +80,7 @@ def compact_files(
         seconds_before: Wall time by name of what the caller did before.
         report_path: A file for the report; None: none is written.
         normals: As of :func:`gsmerge.write_gaussians`.
+        cameras_path: A file for the views, where there are any; None: none is written.
 
     Returns:
         The report, see :func:`gsmerge.report.report_document`.
@@ -102,6 +105,10 @@ def compact_files(
             write_gaussians(
                 at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending, normals=normals
             )
+        if not len(given.scene):
+            cameras_path = None
+        if cameras_path is not None:
+            write_viewer_cameras(add(cameras_path), given.scene.cameras, given.scene.names)
         lost = lost_harmonics(out, result.gaussians.sh_degree)
         document = report_document(
             result.report,
@@ -114,6 +121,7 @@ def compact_files(
             notes=[*given.notes, *([lost] if lost else [])],
             hashed=hashed,
             written_at=at,
+            cameras_path=cameras_path,
         )
         if report_path is not None:
             at[report_path].write_text(to_json(document), encoding="utf-8", errors="replace")

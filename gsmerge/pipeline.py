@@ -7,12 +7,14 @@ GPU, take the place of the arrows alone: preparing, scores and report stay the s
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from gsmerge.baselines import choose_baseline
+from gsmerge.io import load_scene
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import NEAR, photo_psnr, scene_photos
@@ -39,7 +41,7 @@ Psnr = Callable[[Gaussians, PreparedScene], float]
 
 
 def compact(
-    scene: PixelScene | UnalignedScene,
+    scene: PixelScene | UnalignedScene | str | os.PathLike[str],
     options: CompactOptions | None = None,
     *,
     progress: Progress | None = None,
@@ -49,7 +51,8 @@ def compact(
 
     Args:
         scene: One Gaussian per pixel and view, see :func:`gsmerge.read_scene`; or Gaussians that belong to no pixels,
-            which are given to the superpixels by what they add to the views. Tensors give tensors on their device.
+            which are given to the superpixels by what they add to the views. Tensors give tensors on their device. A
+            path is read by :func:`gsmerge.read_scene` with its defaults.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, total) as each stage begins, done and total in stages, and from within
             the longer ones with ("fit: ...", step, steps).
@@ -59,14 +62,20 @@ def compact(
         The Gaussians and a report; further levels of detail if they were asked for.
 
     Raises:
+        SceneError: If a path is given that cannot be read.
         ValueError: If a setting is unknown or out of range, or asks for what the scene does not have.
     """
+    read_notes: tuple[str, ...] = ()
+    if isinstance(scene, str | os.PathLike):
+        load = load_scene(scene)
+        scene, read_notes = load.scene, load.notes
     options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
     options = options.with_chosen_device(scene.num_gaussians)
     log, device = RunLog(progress), scene.gaussians.device
     scene = scene.numpy()
     with use_threads(options.threads):
-        baseline, log.notes[:] = choose_baseline(options, scene)
+        baseline, notes = choose_baseline(options, scene)
+        log.notes[:] = [*read_notes, *notes]
         prepared = prepare(scene, options, log)
         own_build, psnr = choose_builder(prepared)
         make, judge = own_build if baseline is None else baseline.build, partial(score, psnr=psnr)

@@ -97,6 +97,7 @@ def report_document(
     notes: Sequence[str] = (),
     hashed: bool = True,
     written_at: Mapping[Path, Path] | None = None,
+    cameras_path: Path | None = None,
 ) -> dict[str, Any]:
     """The report of one ``compact`` as plain JSON types.
 
@@ -108,6 +109,7 @@ def report_document(
         notes: Of the reader; the report's own follow.
         hashed: Also hash the input, which takes time on large files.
         written_at: Where files are until they are renamed to their names.
+        cameras_path: The file of the views for viewers; None: none was written.
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
@@ -133,6 +135,7 @@ def report_document(
             }
             for path, level in coarser
         ],
+        "viewer_cameras": None if cameras_path is None else os.fspath(cameras_path),
         "ratio": numbers["num_output"] / max(numbers["num_input"], 1),
         "options": to_schema(report.options),
         "seed": numbers["options"]["seed"],
@@ -199,9 +202,10 @@ def curve_lines(points: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def summary_line(document: Mapping[str, Any]) -> str:
-    """The line of the result: counts, ratio, bytes, PSNR, seconds per stage."""
+    """The line of the result: counts, ratio, bytes, PSNR, seconds per stage, the cameras beside it."""
     before, after = document["input"], document["output"]
-    psnr = document["psnr_input_views"]
+    psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
+    cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
     quality = (
         f"; input views {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
         if psnr["before"] is not None and psnr["after"] is not None
@@ -210,7 +214,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"
-        f"{quality}; {seconds_line(document)}"
+        f"{quality}; {seconds_line(document)}{cameras}"
     )
 
 

@@ -20,19 +20,21 @@ if TYPE_CHECKING:
     opt.output(
         "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name.", "SCENE.compact.ply"
     ),
-    f"no_normals overwrite report dry_run {opt.RUN}",
+    f"no_normals overwrite report no_viewer_cameras dry_run {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
     hints = args.hints()
     from gsmerge.compact_file import level_output
+    from gsmerge.io.cameras.json_files import viewer_cameras_path
 
     files = args.files(args.scene)
     out = args.output or default_output(files.ply)
     levels = [level_output(out, level) for level in range(1, args.levels or 1)]
+    cameras = None if args.no_viewer_cameras else viewer_cameras_path(out)
     inputs = (*input_files(files), *checkpoint_files(args.checkpoint))
-    check_outputs((out, *levels, args.report), inputs, overwrite=args.overwrite)
+    check_outputs((out, *levels, args.report, cameras), inputs, overwrite=args.overwrite)
     settings = args.settings()
     check_format(out, settings.budget)
     if args.dry_run:
@@ -60,6 +62,7 @@ def compact(args: opt.Args) -> None:
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
             normals=not args.no_normals,
+            cameras_path=cameras,
         )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)

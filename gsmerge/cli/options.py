@@ -345,6 +345,8 @@ _TABLE = (
                "--budget in bytes counts them.", rare=True),
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
+        switch("no_viewer_cameras", "Do not write the input views beside the result, as NAME.cameras.json for viewers.",
+               rare=True),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),

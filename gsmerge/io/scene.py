@@ -32,7 +32,7 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PixelScene, Unaligned
 
 _MIN_CORRELATION = 0.5  # of a view's base colours with its photo
 _COLOR_SAMPLES = 5000  # pixels per view that it is computed from
-_NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
+NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def align_scene(
     if camera_file is None and files.cameras is None and hints.order == "none":  # views are placed later
         gaussians, notes = usable_rows(ply, hints)
         problem = "expected one Gaussian per pixel, found no cameras that have any"
-        return _unaligned(ply, files, None, UnalignedScene(gaussians, _NO_CAMERAS, None, ()), problem, hints, notes)
+        return _unaligned(ply, files, None, UnalignedScene(gaussians, NO_CAMERAS, None, ()), problem, hints, notes)
     exporter = find_exporter(hints.exporter)
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
     known = camera_file.order if exporter is None else exporter.order
@@ -186,7 +186,7 @@ def _aligned(
         camera_file = select_views(camera_file, layout.views)
     if camera_file.source == ESTIMATED:
         notes.append("no cameras were given: poses and focal length are estimated from the Gaussians' own grid")
-    notes += _layout_notes(recovery, inputs) + filled + rotated + _color_notes(scene)
+    notes += _layout_notes(recovery, inputs) + filled + rotated + color_notes(scene)
     alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
     text = (*ply_notes(ply.info), *notes)
     return SceneLoad(scene, ply.info, files, camera_file, views, exporters, text, alignment, recovery)
@@ -244,7 +244,7 @@ def _layout_notes(recovery: Recovery, inputs: AlignmentInput) -> list[str]:
     return notes + ([f"{used} of {len(inputs.cameras)} views are in the file"] if used < len(inputs.cameras) else [])
 
 
-def _color_notes(scene: PixelScene) -> list[str]:
+def color_notes(scene: PixelScene) -> list[str]:
     """A note if the images do not look like the Gaussians: likely in another order, or of another scene."""
     if scene.images is None:
         return []

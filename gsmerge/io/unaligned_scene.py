@@ -42,7 +42,7 @@ def make_unaligned(
             alignment = check_alignment(ply.gaussians, cameras, ply.valid)
             reason = explain_misalignment(ply.gaussians, cameras, ply.valid, camera_file.convention)
             if reason or looks_like_a_grid(ply.gaussians, ply.valid, cameras, 4 * alignment.limit_px):
-                raise misalignment_error(camera_file, alignment, reason)
+                raise misalignment_error(camera_file.path, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.info.count} rows that are in no known order"
         if _lacks_cameras(inputs):
             raise SceneError(ply.info.path, problem, remedy)
@@ -152,18 +152,18 @@ def count_remedy(count: int, cameras: Cameras) -> str:
     return "give the cameras and images that belong to it"
 
 
-def misalignment_error(camera_file: CameraFile, alignment: Alignment, reason: str | None) -> SceneError:
+def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
     """That the rows would be enough, but do not lie on the rays of their pixels, or as well on those of others."""
     if alignment.ok:
         problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
-        return SceneError(camera_file.path, problem, "name the order of the rows with --order")
+        return SceneError(path, problem, "name the order of the rows with --order")
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
         f"found a median of up to {alignment.worst_px:.1f} px and "
         f"{100 * alignment.share_in_front:.0f} % in front of their camera"
     )
-    unknown = "no other convention fits either: give the cameras that belong to the .ply"
-    return SceneError(camera_file.path, problem, f"{reason}: convert one to the other" if reason else unknown)
+    unknown = "no other convention fits either: give the cameras that belong to the Gaussians"
+    return SceneError(path, problem, f"{reason}: convert one to the other" if reason else unknown)
 
 
 def explain_misalignment(

@@ -199,7 +199,7 @@ def test_no_normals(encoded: Path, tmp_path: Path, run: Run) -> None:
 def test_levels_in_other_formats(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "a.compressed.ply"
     assert run("compact", made_scene, *SMALL, "--fit", "none", "--levels", 2, "-o", out).code == 0
-    assert sorted(listing(tmp_path)) == ["a.compressed.ply", "a.level1.compressed.ply"]
+    assert sorted(listing(tmp_path)) == ["a.cameras.json", "a.compressed.ply", "a.level1.compressed.ply"]
     assert len(gsmerge.read_ply(tmp_path / "a.level1.compressed.ply").gaussians) > 10
 
 

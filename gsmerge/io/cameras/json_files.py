@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +25,12 @@ from gsmerge.io.cameras.camera_file import (
     make_pinhole,
 )
 from gsmerge.io.photos import find_image, image_size
+from gsmerge.types import Cameras
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
@@ -233,3 +237,28 @@ def _numbers(path: Path) -> np.ndarray | None:
     if not np.isfinite(values).all():
         raise SceneError(path, "expected finite numbers, found NaN or inf")
     return values
+
+
+def viewer_cameras_path(output: Path) -> Path:
+    """``out.ply`` -> ``out.cameras.json``: where the cameras for viewers go."""
+    name = output.name
+    stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
+    ending = ".cameras.json"
+    return output.with_name(os.fsencode(stem)[: _MAX_NAME - len(ending)].decode("utf-8", "ignore") + ending)
+
+
+def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    """Write cameras as INRIA's ``cameras.json``, which SuperSplat and other viewers open; :func:`read_inria` reads it.
+
+    It has no principal point: cameras are written as if theirs were in the middle.
+    """
+    rotations, centres = cameras.viewmats[:, :3, :3].transpose(0, 2, 1), cameras.centres
+    entries = [
+        {
+            "id": i, "img_name": name, "width": cameras.width, "height": cameras.height,
+            "position": centres[i].tolist(), "rotation": rotations[i].tolist(),
+            "fy": float(cameras.Ks[i, 1, 1]), "fx": float(cameras.Ks[i, 0, 0]),
+        }
+        for i, name in enumerate(names)
+    ]  # fmt: skip
+    path.write_text(json.dumps(entries) + "\n", encoding="utf-8")

@@ -168,7 +168,7 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
     known = opacity if opacity != "auto" else stored.encoding
     encoding = known or _likely_encoding(out["opacities"])
     _activate(out["opacities"], out["valid"], encoding)
-    num_bad = _clear_invalid(path, out)
+    num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if rows.dtype[name].itemsize == 1)
     if byte_columns == NORMALS:
         spread_low_degree(out["shN"])
@@ -346,7 +346,7 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
         np.reciprocal(opacities, out=opacities)
 
 
-def _clear_invalid(path: Path, out: dict[str, np.ndarray]) -> int:
+def clear_invalid(path: str | Path, out: dict[str, np.ndarray]) -> int:
     """Make the invalid rows transparent, in place; returns their number."""
     valid = out["valid"]
     bad = np.flatnonzero(~valid)

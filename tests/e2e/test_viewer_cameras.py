@@ -1,0 +1,91 @@
+"""``compact`` writes the input views beside its result, so that viewers start at one of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gsmerge
+from gsmerge.io.cameras.json_files import viewer_cameras_path
+
+Run = Callable[..., Any]
+QUICK = ("--superpixels", 40, "--fit", "none", "--no-robust", "--checkpoint", "none")
+
+
+def test_the_views_are_written_and_named(scene_copy: Path, run: Run) -> None:
+    done = run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK)
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1].endswith("; cameras for viewers in small.cameras.json")
+    scene = gsmerge.read_scene(scene_copy)
+    entries = json.loads((scene_copy / "small.cameras.json").read_text())
+    assert [entry["img_name"] for entry in entries] == list(scene.names)
+    assert list(entries[0]) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
+    np.testing.assert_allclose([entry["position"] for entry in entries], scene.cameras.centres, atol=1e-9)
+    back = gsmerge.read_cameras(scene_copy / "small.cameras.json")
+    np.testing.assert_allclose(back.viewmats, scene.cameras.viewmats, atol=1e-9)
+
+
+def test_they_are_in_the_frame_of_the_gaussians(scene_copy: Path, run: Run) -> None:
+    """Where the cameras' file is in another unit."""
+    path = scene_copy / "transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 3
+    path.write_text(json.dumps(content))
+    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK, "-q").code == 0
+    back = gsmerge.read_cameras(scene_copy / "small.cameras.json")
+    np.testing.assert_allclose(back.viewmats, gsmerge.read_scene(scene_copy).cameras.viewmats, atol=1e-9)
+    assert np.abs(back.viewmats[:, :3, 3]).max() < 0.5 * np.abs(gsmerge.read_cameras(path).viewmats[:, :3, 3]).max()
+
+
+def test_none_are_written_unless_there_are_any(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    done = run("compact", scene_copy, "-o", out / "a.ply", "--no-viewer-cameras", *QUICK, "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["viewer_cameras"] is None
+    (out / "scene.ply").write_bytes((scene_copy / "scene.ply").read_bytes())
+    done = run("compact", out / "scene.ply", "-o", out / "b.ply", "--order", "none", *QUICK)
+    assert done.code == 0, done.err
+    assert "cameras for viewers" not in done.out
+    assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply", "scene.ply"]
+
+
+def test_they_are_replaced_on_request_alone(scene_copy: Path, run: Run) -> None:
+    (scene_copy / "small.cameras.json").write_text("mine")
+    done = run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK)
+    assert (done.code, done.out) == (2, "")
+    assert "small.cameras.json: exists already" in done.err
+    assert not (scene_copy / "small.ply").exists()
+    assert (scene_copy / "small.cameras.json").read_text() == "mine"
+    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", "--overwrite", *QUICK).code == 0
+    assert len(json.loads((scene_copy / "small.cameras.json").read_text())) == len(gsmerge.read_scene(scene_copy))
+
+
+def test_a_run_that_fails_leaves_neither(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise gsmerge.SceneError("disk", "is full")
+
+    monkeypatch.setattr("gsmerge.compact_file.report_document", fail)
+    before = sorted(path.name for path in scene_copy.iterdir())
+    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK).code == 3
+    assert sorted(path.name for path in scene_copy.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("output", "expected"),
+    [
+        ("a/small.ply", "a/small.cameras.json"),
+        ("small.compressed.ply", "small.cameras.json"),
+        ("x.compact.spz", "x.compact.cameras.json"),
+        (f"{'a' * 251}.ply", f"{'a' * 242}.cameras.json"),
+    ],
+)
+def test_their_name_is_made_of_the_result_s(output: str, expected: str) -> None:
+    assert viewer_cameras_path(Path(output)) == Path(expected)
