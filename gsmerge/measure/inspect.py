@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -258,7 +259,8 @@ def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
     rows = np.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
     if isinstance(scene, PixelScene):
         rows = rows[scene.stored.reshape(-1)[rows]]
-    shares = _shares_inside(scene.gaussians.means[rows].astype(np.float64), scene.cameras)
+    points = scene.gaussians.means[rows].astype(np.float64)
+    shares = [float(inside.mean()) if len(points) else 0.0 for inside in _inside(points, scene.cameras)]
     pixels: list[float | None] = [None] * len(scene)
     if isinstance(scene, PixelScene):
         visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
@@ -266,13 +268,20 @@ def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
     return tuple(map(Coverage, scene.names, pixels, shares))
 
 
-def _shares_inside(points: np.ndarray, cameras: Cameras) -> list[float]:
+def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
+    """Share of the Gaussians, of many some, whose centres are inside no view's picture; 0 without any."""
+    points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
+    seen = np.zeros(len(points), bool)
+    for inside in _inside(points, cameras):
+        seen |= inside
+    return float(1 - seen.mean()) if len(points) else 0.0
+
+
+def _inside(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
+    """``[n]`` bool of each view: which points its picture shows."""
     size = np.array([cameras.width, cameras.height])
-    shares = []
     for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True):
         image = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
         with np.errstate(all="ignore"):
             xy = image[:, :2] / image[:, 2:]
-        inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < size).all(1)
-        shares.append(float(inside.mean()) if len(points) else 0.0)
-    return shares
+        yield (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < size).all(1)
