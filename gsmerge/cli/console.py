@@ -149,7 +149,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     from gsmerge.runtime.run_log import STAGES
 
     columns = (
-        rich.TextColumn("{task.description:>12}"), rich.BarColumn(28), rich.TimeElapsedColumn(),
+        rich.TextColumn("{task.description:>12}"), rich.BarColumn(16), rich.TimeElapsedColumn(),
         rich.TextColumn("{task.fields[count]}"), rich.TextColumn("{task.fields[detail]}"),
     )  # fmt: skip
     with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
