@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
+    f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
     opt.output("The compact scene: .ply, .compressed.ply, .spz or .splat, by its name.", "SCENE.compact.ply"),
     f"overwrite report dry_run {opt.RUN}",
 )

@@ -33,11 +33,11 @@ from gsmerge.options import CompactOptions
 from gsmerge.report import finite
 from gsmerge.runtime.estimate import estimate_run
 from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.group import default_count
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 MAX_SAMPLES = 200_000  # Gaussians that are measured
-OUTLIER_BOX = 10.0  # times the box of 1 % to 99 %: what lies beyond is an outlier
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
 _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
@@ -54,6 +54,7 @@ class Extents:
     share_outliers: float  # share of the Gaussians outside of the box made ten times as large about its middle
     scale_median: float  # of each Gaussian's largest scale
     scale_max: float  # the largest scale of all
+    share_floaters: float  # share of the Gaussians that are isolated or far beyond the scene, of many estimated
     share_huge: float  # share of the Gaussians whose largest scale is above a tenth of the diagonal
 
 
@@ -233,19 +234,18 @@ def estimate(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
 def extents(gaussians: Gaussians) -> Extents:
     """Measure finite Gaussians; zeros where there are none. Large scenes are sampled, except for the largest scale."""
     if len(gaussians) == 0:
-        return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     step = -(-len(gaussians) // MAX_SAMPLES)
     points = gaussians.means[::step].astype(np.float64)
     largest = gaussians.scales.max(1)
-    low, high = np.percentile(points, (1, 99), axis=0)
+    low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = float(np.linalg.norm(high - low))
-    half = np.maximum((high - low) / 2, 1e-3 * max(diagonal, 1e-30))
-    outside = (np.abs(points - (low + high) / 2) > OUTLIER_BOX * half).any(1)
     return Extents(
         box_low=tuple(map(float, low)),
         box_high=tuple(map(float, high)),
         diagonal=diagonal,
-        share_outliers=float(outside.mean()),
+        share_outliers=float(beyond_scene(points).mean()),
+        share_floaters=floater_share(gaussians),
         scale_median=float(np.median(largest[::step])),
         scale_max=float(largest.max()),
         share_huge=float((largest[::step] > HUGE_SCALE_SHARE * diagonal).mean()),
