@@ -174,7 +174,7 @@ def test_missing_matplotlib_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     from gsmerge.errors import GsmergeError
 
     monkeypatch.setattr("gsmerge.research.charts.draw.find_spec", lambda name: None)
-    with pytest.raises(GsmergeError, match=r'not installed: pip install "gsmerge\[chart\]"'):
+    with pytest.raises(GsmergeError, match=r'not installed: pip install "matplotlib>=3.8,<4"'):
         draw_figures([], tmp_path)
 
 
