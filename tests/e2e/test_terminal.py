@@ -105,7 +105,7 @@ def test_inspect_breaks_no_words(scene_copy: Path, run: Run) -> None:
 
 def test_lines_are_wrapped_below_their_first_value() -> None:
     assert wrap_line("extent     one two three four", 24) == ["extent     one two three", "           four"]
-    assert wrap_line("note: one two three", 12) == ["note: one", "      two", "      three"]
+    assert wrap_line("note: one two three", 14) == ["note: one two", "      three"]
     assert wrap_line("a/path/longer/than/the/line", 10) == ["a/path/longer/than/the/line"]
     assert wrap_line("x" * 300 + " y", None) == ["x" * 300 + " y"]
 
