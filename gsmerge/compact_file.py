@@ -23,6 +23,7 @@ from gsmerge.io import (
 )
 from gsmerge.io.cameras.json_files import write_viewer_cameras
 from gsmerge.io.formats.ply import OpacityChoice
+from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.report import report_document, to_json
@@ -136,11 +137,21 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     """
     loaded = load_files(files, opacity=opacity, hints=hints)
     no_photos = isinstance(loaded.scene, PixelScene) and loaded.scene.images is None
-    notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []))
+    notes = (*loaded.notes, *([NO_PHOTOS] if no_photos else []), *compact_notes(loaded))
     scene_input = SceneInput(loaded.scene, recognised_of(loaded), kept_comments(loaded.ply), notes)
     del loaded  # its arrays are as large as the scene's
     release_memory()
     return scene_input
+
+
+def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:
+    """A note where a scene is a result of gsmerge: a file of its own with far fewer Gaussians than pixels."""
+    scene = loaded.scene
+    pixels = len(scene) * scene.cameras.height * scene.cameras.width
+    if isinstance(scene, PixelScene) or LOGIT_COMMENT not in loaded.ply.comments or scene.num_gaussians > pixels / 2:
+        return ()
+    count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
+    return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)
 
 
 def recognised_of(loaded: SceneLoad) -> dict[str, Any]:

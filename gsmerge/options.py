@@ -10,6 +10,7 @@ from gsmerge.budget import BudgetOptions, new_settings
 from gsmerge.stages.assign import ContributionOptions
 from gsmerge.stages.backing import BackingOptions
 from gsmerge.stages.choose_merge import RobustOptions, photos_choose
+from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.decode import MIXED, DecodeOptions
 from gsmerge.stages.encode import EncodeOptions
 from gsmerge.stages.fit import FitOptions
@@ -49,6 +50,7 @@ class CompactOptions:
         match: Merging across views.
         decode: Gaussians per group.
         fit: Fit to the photos.
+        clean: What is left out of the result.
         budget: What decides the number of Gaussians.
         method: ``"gsmerge"``: the stages above. Any other: a baseline, see :mod:`gsmerge.baselines`, for which
             the number of Gaussians has to be settled beforehand.
@@ -62,8 +64,8 @@ class CompactOptions:
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:
-        ValueError: If the method is unknown, or another than ``"gsmerge"`` is asked to find the number of Gaussians;
-            if a checkpoint is required and none is named.
+        ValueError: If a PSNR is asked for of a crop; if the method is unknown, or another than ``"gsmerge"`` is asked
+            to find the number of Gaussians; if a checkpoint is required and none is named.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -75,6 +77,7 @@ class CompactOptions:
     match: MatchOptions = field(default_factory=MatchOptions)
     decode: DecodeOptions = field(default_factory=DecodeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
+    clean: CleanOptions = field(default_factory=CleanOptions)
     budget: BudgetOptions = field(default_factory=BudgetOptions)
     method: str = "gsmerge"
     checkpoint: str = "auto"
@@ -92,6 +95,9 @@ class CompactOptions:
             raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
+        if self.clean.crop is not None and self.budget.target_psnr is not None:
+            quality = f"quality {self.budget.quality}"
+            raise ValueError(f"crop: expected a budget or superpixels, got {quality}: photos show what it leaves out")
         if self.method == "gsmerge":
             return
         asked = {"budget auto": self.budget.auto, "levels": self.budget.levels > 1}
@@ -150,6 +156,7 @@ class CompactOptions:
         budget = self.budget
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "k mixed": self.decode.k == MIXED}
+        asked |= {"crop": self.clean.crop is not None, "drop_floaters": self.clean.drop_floaters}
         return [name for name, wanted in asked.items() if wanted]
 
     def to_dict(self) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from gsmerge.search import Build, choose_count, level_counts, search_quality
 from gsmerge.stages.assign import assign_members
 from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
+from gsmerge.stages.clean import clean, make_clean
 from gsmerge.stages.decode import MIXED, decode_merged
 from gsmerge.stages.encode import encode, weaken_contradicted
 from gsmerge.stages.fit import fit, fit_photos
@@ -79,6 +80,8 @@ def compact(
         prepared = prepare(scene, options, log)
         own_build, psnr = choose_builder(prepared)
         make, judge = own_build if baseline is None else baseline.build, partial(score, psnr=psnr)
+        if options.clean.asked:
+            prepared, make = clean_up(prepared, make)
         if options.budget.target_psnr is not None:
             result = search_quality(prepared, make, judge, log)
         else:
@@ -124,6 +127,23 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
         )
     log.add_fit(report)
     return gaussians
+
+
+def clean_up(prepared: PreparedScene, make: Build) -> tuple[PreparedScene, Build]:
+    """The prepared scene without hidden Gaussians that are not wanted, and ``make`` with clean-up of what it makes."""
+    options, scene, lost = prepared.options.clean, prepared.scene, 0
+    if prepared.hidden is not None:
+        kept = clean(prepared.hidden, options, prepared.frame.leave)[0]
+        lost = len(prepared.hidden) - len(kept)
+        prepared = replace(prepared, hidden=kept)
+    given = scene.gaussians[scene.valid.reshape(-1)] if isinstance(scene, PixelScene) else scene.gaussians
+
+    def build_clean(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
+        wanted = None if count is None else count + lost
+        leave = prepared.frame.leave
+        return make_clean(lambda asked, own: make(prepared, asked, own), wanted, options, leave, given, log)
+
+    return prepared, build_clean
 
 
 def begin(prepared: PreparedScene, count: int | None, log: RunLog) -> tuple[Gaussians, int, bool, Gaussians | None]:

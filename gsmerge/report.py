@@ -179,13 +179,41 @@ def csv_cell(value: Any) -> Any:
 
 def summary_lines(document: Mapping[str, Any]) -> list[str]:
     """What ``compact`` ends with: a line for the result, one for each further level, and the curve if measured."""
-    levels = [
+    return [summary_line(document), *level_lines(document), *curve_lines(document["choices"].get("curve", []))]
+
+
+def result_table(document: Mapping[str, Any], next_step: str | None = None) -> list[str]:
+    """What ``compact`` ends with in a terminal: the same as :func:`summary_lines` as a table of at most 80 columns.
+
+    ``next_step``: a command to go on with; None for none.
+    """
+    before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
+    ratio = f"{100 * document['ratio']:.2f} %"
+    rows = [
+        ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}", ratio),
+        ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
+    ]
+    if psnr["before"] is not None and psnr["after"] is not None:
+        rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", "of the input views")]
+    longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
+    rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
+    table = [f"  {name:9}  {old:>12}  {new:>12}  {remark}".rstrip() for name, old, new, remark in rows]
+    curve = curve_lines(document["choices"].get("curve", []))
+    cameras = document.get("viewer_cameras")
+    last = [] if cameras is None else [f"  cameras    {cameras}"]
+    last += [] if next_step is None else [f"  next       {next_step}"]
+    return [after["path"], *table, *level_lines(document), *curve, *last]
+
+
+def level_lines(document: Mapping[str, Any]) -> list[str]:
+    """A line for each further level of detail."""
+    return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
         + (f"; input views {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
         + f"; {level['seconds']:.1f} s"
         for level in document["levels"]
     ]
-    return [summary_line(document), *levels, *curve_lines(document["choices"].get("curve", []))]
 
 
 def curve_lines(points: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -36,7 +36,7 @@ def require_ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise UsageError("engine ray: Ray is not installed; pip install 'gsmerge[ray]'") from error
+        raise UsageError("engine ray: Ray is not installed; pip install 'ray>=2.9,<3'") from error
     return ray
 
 

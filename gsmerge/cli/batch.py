@@ -40,7 +40,7 @@ def parse_jobs(text: str) -> int:
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
     opt.HINTS,
-    f"{opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
+    f"{opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT}",
+    f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
     opt.output(
         "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name.", "SCENE.compact.ply"
     ),
@@ -34,7 +36,7 @@ def compact(args: opt.Args) -> None:
     levels = [level_output(out, level) for level in range(1, args.levels or 1)]
     cameras = None if args.no_viewer_cameras else viewer_cameras_path(out)
     inputs = (*input_files(files), *checkpoint_files(args.checkpoint))
-    check_outputs((out, *levels, args.report, cameras), inputs, overwrite=args.overwrite)
+    check_outputs((out, *levels, args.report, cameras), inputs, overwrite=args.overwrite or args.dry_run)
     settings = args.settings()
     check_format(out, settings.budget)
     if args.dry_run:
@@ -44,7 +46,7 @@ def compact(args: opt.Args) -> None:
         return
     _warn_of_memory(files, quiet=args.silent)
     from gsmerge.compact_file import compact_files
-    from gsmerge.report import summary_lines
+    from gsmerge.report import result_table, summary_lines
 
     seconds_before = {"import": perf_counter() - start}
     needs_fit = settings.method == "unmerged-fit" or (settings.method == "gsmerge" and settings.fit.fit == "full")
@@ -66,7 +68,11 @@ def compact(args: opt.Args) -> None:
         )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)
-    print_document(document, summary_lines(document), as_json=args.json, quiet=args.quiet)
+    lines = summary_lines(document)
+    if sys.stdout.isatty():
+        view = shlex.join(["gsmerge", "view", str(args.scene), str(out)])
+        lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if document["unmet"]:
         raise TargetError(document["unmet"])
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -31,19 +34,42 @@ def say(message: str, *, quiet: bool = False) -> None:
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
     """Print a line on stderr for each note about the input or the run, unless ``quiet``."""
     for note in notes:
-        say(f"note: {note}", quiet=quiet)
+        for line in wrap_line(f"note: {one_line(note)}", _columns(sys.stderr)):
+            say(line, quiet=quiet)
+
+
+def _columns(stream: Any) -> int | None:
+    """Width of the terminal that a stream goes to; None where it goes to none."""
+    return shutil.get_terminal_size().columns if stream.isatty() else None
+
+
+def wrap_line(line: str, columns: int | None) -> list[str]:
+    """A line in pieces of at most so many columns, broken between words; further ones begin below its first value.
+
+    Words longer than that, such as paths, stay whole. ``columns`` None: one piece.
+    """
+    if columns is None or len(line) <= columns:
+        return [line]
+    label = re.match(r" *\S+(?: \S+)?  +|note: ", line)
+    indent = " " * len(label[0]) if label and len(label[0]) < columns // 2 else ""
+    return textwrap.wrap(line, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def print_document(
-    document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False
+    document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = False
 ) -> None:
-    """Print the result of a command on stdout: the document as JSON, or lines for people unless ``quiet``."""
+    """Print the result of a command on stdout: the document as JSON, or lines for people unless ``quiet``.
+
+    ``wrap``: break them between words where a terminal is narrower.
+    """
     from gsmerge.report import to_json
 
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        print("\n".join(map(one_line, [lines] if isinstance(lines, str) else lines)))
+        columns = _columns(sys.stdout) if wrap else None
+        for line in [lines] if isinstance(lines, str) else lines:
+            print("\n".join(wrap_line(one_line(line), columns)))
 
 
 @contextmanager
@@ -100,6 +126,7 @@ def _terminal(*, quiet: bool) -> Any:
     from rich.console import Console
 
     console = Console(stderr=True)
+    console.width = max(20, console.width - len("^C") - 1)  # which the terminal prints, and which must not begin a line
     return console if console.is_terminal else None
 
 
@@ -107,10 +134,11 @@ def _terminal(*, quiet: bool) -> Any:
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """A progress bar per stage on stderr, unless quiet or where stderr is no terminal.
 
-    ``FORCE_COLOR`` in the environment makes anything a terminal.
+    A stage is done when the next one begins. ``FORCE_COLOR`` in the environment makes anything a terminal.
 
     Yields:
-        ``(stage, done, total) -> None``.
+        ``(stage, done, total) -> None``; a stage of :data:`gsmerge.runtime.run_log.STAGES` without a detail counts no
+        steps of its own.
     """
     console = _terminal(quiet=quiet)
     if console is None:
@@ -118,18 +146,34 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
         return
     from rich import progress as rich
 
+    from gsmerge.runtime.run_log import STAGES
+
     columns = (
-        rich.TextColumn("{task.description:>12}"), rich.BarColumn(), rich.MofNCompleteColumn(),
-        rich.TimeElapsedColumn(), rich.TextColumn("{task.fields[detail]}"),
+        rich.TextColumn("{task.description:>12}"), rich.BarColumn(16), rich.TimeElapsedColumn(),
+        rich.TextColumn("{task.fields[count]}"), rich.TextColumn("{task.fields[detail]}"),
     )  # fmt: skip
     with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
+        running: list[str] = []
+
+        def finish() -> None:
+            for name in running:
+                bars.update(tasks[name], total=1, completed=1)
+                bars.stop_task(tasks[name])
+            running.clear()
 
         def move(stage: str, done: int, total: int) -> None:
             name, _, detail = stage.partition(": ")
-            if name not in tasks:
-                tasks[name] = bars.add_task(name, total=total, detail="")
-            bars.update(tasks[name], completed=done, total=total, detail=detail)
+            if running != [name]:
+                finish()
+                if name == "done":
+                    return
+                if name in tasks:
+                    bars.remove_task(tasks[name])
+                tasks[name] = bars.add_task(name, total=None, count="", detail="")
+                running.append(name)
+            if detail or name not in STAGES:
+                bars.update(tasks[name], completed=done, total=total, count=f"{done}/{total}", detail=detail)
 
         yield move
 

@@ -30,7 +30,7 @@ def decode(args: opt.Args) -> None:
     """Write a compact scene from an encoded one, as compact --fit none, or from a state, fitted to its photos."""
     start = perf_counter()
     out = args.output or default_output(args.encoded)
-    check_outputs((out,), (args.encoded,), overwrite=args.overwrite)
+    check_outputs((out,), (args.encoded,), overwrite=args.overwrite or args.dry_run)
     check_format(out)
     import numpy as np
 

@@ -21,7 +21,9 @@ def encode(args: opt.Args) -> None:
     """Keep a scene as merged Feature Gaussians, of which gsmerge decode makes what compact --fit none makes."""
     start, hints, files = perf_counter(), args.hints(), args.files(args.scene)
     out = args.output or files.ply.with_suffix(".gsm")
-    check_outputs((out,), (*input_files(files), *checkpoint_files(args.checkpoint)), overwrite=args.overwrite)
+    check_outputs(
+        (out,), (*input_files(files), *checkpoint_files(args.checkpoint)), overwrite=args.overwrite or args.dry_run
+    )
     settings = args.settings(fit="none")
     if args.dry_run:
         from gsmerge.cli.plan import print_plan

@@ -14,7 +14,10 @@ from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import PlyInfo
+    from gsmerge.io import PlyInfo, PlyScene
+    from gsmerge.types import Cameras
+
+OUTSIDE = 0.03  # share of a result's Gaussians beyond all of its own views: what merging and a fit move there
 
 
 def parse_zoom(text: str) -> tuple[float, ...]:
@@ -74,6 +77,8 @@ def evaluate(args: opt.Args) -> None:
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, args.views)
     plys = {name: read_gaussians(path) for name, path in zip(file_names(paths), paths, strict=True)}
     notes = [*load.notes, *adapted, *missing]
+    if len(scene) < len(load.scene):
+        notes += [_more_views(name, ply, scene.cameras) for name, ply in plys.items()]
     say_notes(notes, quiet=args.silent)
     gaussians = {name: ply.gaussians for name, ply in plys.items()}
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
@@ -84,6 +89,19 @@ def evaluate(args: opt.Args) -> None:
     write_texts({path: text for path, text in texts.items() if path is not None}, overwrite=args.overwrite)
     print_document(document, evaluation_lines(document), as_json=args.json, quiet=args.quiet)
     say_notes(evaluation.notes, quiet=args.silent)
+
+
+def _more_views(name: str, ply: PlyScene, cameras: Cameras) -> str:
+    """What is known of a result that is measured as one of some views, but may be made of all."""
+    from gsmerge.measure.inspect import share_outside
+
+    views, outside = len(cameras), share_outside(ply.gaussians[ply.valid], cameras)
+    if outside > OUTSIDE:
+        return (
+            f"{name}: {100 * outside:.0f} % of its Gaussians lie outside of the {views} views of --views: it was made"
+            f" of more views, so these are no scores of {views}"
+        )
+    return f"{name}: measured as a result of {views} views; if it was made of more, it has seen what it is asked here"
 
 
 def _file(info: PlyInfo) -> dict[str, Any]:

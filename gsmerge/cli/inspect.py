@@ -17,4 +17,5 @@ def inspect(args: opt.Args) -> None:
     facts = inspect_scene(
         args.scene, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints)
     ).to_dict()
-    print_document({**document_head(), **facts}, inspection_lines(facts), as_json=args.json, quiet=args.quiet)
+    lines = inspection_lines(facts)
+    print_document({**document_head(), **facts}, lines, as_json=args.json, quiet=args.quiet, wrap=True)

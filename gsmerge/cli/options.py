@@ -239,6 +239,7 @@ READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
 COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
 MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
+CLEAN = "crop drop_floaters"
 FIT = "fit effort device fit_steps photo_scale time_budget"
 NETWORKS = "recipe checkpoint require_checkpoint"
 RUN = "seed threads"
@@ -329,6 +330,13 @@ _TABLE = (
                "size, for sharper results up close; auto: up to 2.", wording="auto", rare=True,
                parser=parse_photo_scale, metavar="NUMBER|auto"),
         option("time_budget", float, "Seconds that the full fit may take.", rare=True, min=0.0),
+    ),
+    panel(
+        OUTPUT,
+        option("crop", str, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the scene's "
+               "world units; a budget is met after it.", metavar="SHAPE"),
+        option("drop_floaters", bool, "Leave out Gaussians that are isolated or far beyond the scene.",
+               "--drop-floaters", rare=True),
     ),
     panel(
         MEASURING,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,9 +24,11 @@ def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Pat
 
     given = read_input(files, opacity=args.opacity, hints=hints)
     _, unused = choose_baseline(settings, given.scene)
+    refused = os.path.lexists(out) and not args.overwrite
+    exists = [f"{out} exists already: --overwrite would replace it"] * refused
     with usage_errors():
-        document = plan_document(files, given.scene, settings, out, [*given.notes, *unused])
-    print_document({**document_head(), **document}, plan_lines(document), as_json=args.json)
+        document = plan_document(files, given.scene, settings, out, [*given.notes, *unused, *exists])
+    print_document({**document_head(), **document}, plan_lines(document), as_json=args.json, wrap=True)
 
 
 def plan_document(

@@ -27,7 +27,7 @@ def preview(args: opt.Args) -> None:
     from gsmerge.views import pick_views
 
     files = args.files(scenes[0])
-    check_outputs((args.output,), (*scenes, *input_files(files)), overwrite=args.overwrite)
+    check_outputs((args.output,), (*scenes, *input_files(files)), overwrite=args.overwrite or args.dry_run)
     suffix = args.output.suffix.lower()
     if suffix not in (".png", ".html"):
         raise UsageError(f"{args.output}: expected a name that ends in .png or .html")

@@ -43,7 +43,7 @@ def render(args: opt.Args) -> None:
     files = args.files(args.scene)
     source = args.frame_of or source_of(files.ply)
     like = files if source is None else find_scene_files(source, cameras=args.cameras or files.cameras)
-    check_folder(args.output, (*input_files(files), *input_files(like)), overwrite=args.overwrite)
+    check_folder(args.output, (*input_files(files), *input_files(like)), overwrite=args.overwrite or args.dry_run)
     check_cameras(like)
     ply = read_gaussians(files.ply, opacity=args.opacity)
     placed = _place(ply, like)

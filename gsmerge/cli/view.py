@@ -32,7 +32,7 @@ def view(args: opt.Args) -> None:
     files, after = args.files(args.before), args.after
     output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
     inputs = (*input_files(files), *after, args.targets, args.target_images)
-    check_outputs((output,), inputs, overwrite=args.overwrite)
+    check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
     load = args.load(files)

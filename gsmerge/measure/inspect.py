@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -32,11 +33,11 @@ from gsmerge.options import CompactOptions
 from gsmerge.report import finite
 from gsmerge.runtime.estimate import estimate_run
 from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.group import default_count
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 MAX_SAMPLES = 200_000  # Gaussians that are measured
-OUTLIER_BOX = 10.0  # times the box of 1 % to 99 %: what lies beyond is an outlier
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 _TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
 _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
@@ -53,6 +54,7 @@ class Extents:
     share_outliers: float  # share of the Gaussians outside of the box made ten times as large about its middle
     scale_median: float  # of each Gaussian's largest scale
     scale_max: float  # the largest scale of all
+    share_floaters: float  # share of the Gaussians that are isolated or far beyond the scene, of many estimated
     share_huge: float  # share of the Gaussians whose largest scale is above a tenth of the diagonal
 
 
@@ -232,19 +234,18 @@ def estimate(scene: PixelScene | UnalignedScene) -> dict[str, Any]:
 def extents(gaussians: Gaussians) -> Extents:
     """Measure finite Gaussians; zeros where there are none. Large scenes are sampled, except for the largest scale."""
     if len(gaussians) == 0:
-        return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return Extents((0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     step = -(-len(gaussians) // MAX_SAMPLES)
     points = gaussians.means[::step].astype(np.float64)
     largest = gaussians.scales.max(1)
-    low, high = np.percentile(points, (1, 99), axis=0)
+    low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = float(np.linalg.norm(high - low))
-    half = np.maximum((high - low) / 2, 1e-3 * max(diagonal, 1e-30))
-    outside = (np.abs(points - (low + high) / 2) > OUTLIER_BOX * half).any(1)
     return Extents(
         box_low=tuple(map(float, low)),
         box_high=tuple(map(float, high)),
         diagonal=diagonal,
-        share_outliers=float(outside.mean()),
+        share_outliers=float(beyond_scene(points).mean()),
+        share_floaters=floater_share(gaussians),
         scale_median=float(np.median(largest[::step])),
         scale_max=float(largest.max()),
         share_huge=float((largest[::step] > HUGE_SCALE_SHARE * diagonal).mean()),
@@ -258,7 +259,8 @@ def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
     rows = np.arange(0, len(scene.gaussians), -(-len(scene.gaussians) // MAX_SAMPLES))
     if isinstance(scene, PixelScene):
         rows = rows[scene.stored.reshape(-1)[rows]]
-    shares = _shares_inside(scene.gaussians.means[rows].astype(np.float64), scene.cameras)
+    points = scene.gaussians.means[rows].astype(np.float64)
+    shares = [float(inside.mean()) if len(points) else 0.0 for inside in _inside(points, scene.cameras)]
     pixels: list[float | None] = [None] * len(scene)
     if isinstance(scene, PixelScene):
         visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
@@ -266,13 +268,20 @@ def coverage(scene: PixelScene | UnalignedScene) -> tuple[Coverage, ...]:
     return tuple(map(Coverage, scene.names, pixels, shares))
 
 
-def _shares_inside(points: np.ndarray, cameras: Cameras) -> list[float]:
+def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
+    """Share of the Gaussians, of many some, whose centres are inside no view's picture; 0 without any."""
+    points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
+    seen = np.zeros(len(points), bool)
+    for inside in _inside(points, cameras):
+        seen |= inside
+    return float(1 - seen.mean()) if len(points) else 0.0
+
+
+def _inside(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
+    """``[n]`` bool of each view: which points its picture shows."""
     size = np.array([cameras.width, cameras.height])
-    shares = []
     for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True):
         image = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
         with np.errstate(all="ignore"):
             xy = image[:, :2] / image[:, 2:]
-        inside = (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < size).all(1)
-        shares.append(float(inside.mean()) if len(points) else 0.0)
-    return shares
+        yield (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < size).all(1)

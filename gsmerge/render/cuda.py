@@ -35,7 +35,7 @@ from gsmerge.types import Cameras, Gaussians
 # importing gsplat takes one to three seconds, in which two processors do a scene of this size from end to end.
 MIN_PIXELS = 400_000
 EVERY_BATCH = 1 << 24  # past the last batch of 256 Gaussians of any tile
-INSTALL = 'pip install "gsmerge[cuda]"'
+INSTALL = 'pip install "gsplat>=1.5,<2"'  # as the extra cuda asks for; works beside a wheel and in a checkout
 
 
 def cuda_problem() -> str | None:

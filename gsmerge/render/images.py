@@ -88,7 +88,7 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install "gsmerge[cuda]"``), and
+    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install ".[cuda]"``), and
     the results are on their device; all others on the CPU. How the two differ: :mod:`gsmerge.render.cuda`.
 
     Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians and the view

@@ -85,5 +85,5 @@ def test_without_ray_one_line_says_what_to_install(rooms: Path, tmp_path: Path) 
     command = [sys.executable, "-c", code, "batch", str(rooms), "--output", str(tmp_path / "out"), "--engine", "ray"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr == "gsmerge: error: engine ray: Ray is not installed; pip install 'gsmerge[ray]'\n"
+    assert done.stderr == "gsmerge: error: engine ray: Ray is not installed; pip install 'ray>=2.9,<3'\n"
     assert not (tmp_path / "out").exists()

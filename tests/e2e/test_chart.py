@@ -272,5 +272,5 @@ def test_missing_matplotlib_is_told_before_anything_is_run(
     outcome = again(run, copied, "--rerun")
     assert (outcome.code, merges) == (1, [])
     assert outcome.err == (
-        'gsmerge: error: charts need matplotlib, which is not installed: pip install "gsmerge[chart]"\n'
+        'gsmerge: error: charts need matplotlib, which is not installed: pip install "matplotlib>=3.8,<4"\n'
     )

@@ -264,7 +264,7 @@ def test_devices_must_agree() -> None:
 
 def test_without_gsplat_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(GsmergeError, match=r'gsplat.*; pip install "gsmerge\[cuda\]"$'):
+    with pytest.raises(GsmergeError, match=r'gsplat.*; pip install "gsplat>=1.5,<2"$'):
         by_adapter(random_gaussians(3), cameras_of())
 
 
@@ -281,7 +281,7 @@ def test_device_is_resolved(monkeypatch: pytest.MonkeyPatch, fake_gsplat: Calls)
     monkeypatch.delitem(sys.modules, "gsplat")
     monkeypatch.setattr(adapter, "find_spec", lambda name: None)
     assert usable_device("auto") == chosen_device("auto", 10**9) == "cpu"
-    with pytest.raises(ValueError, match=r'got "cuda", but gsplat is not installed; pip install "gsmerge\[cuda\]"$'):
+    with pytest.raises(ValueError, match=r'got "cuda", but gsplat is not installed; pip install "gsplat>=1.5,<2"$'):
         usable_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert FitOptions(device="auto").device == "cpu"

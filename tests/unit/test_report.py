@@ -58,6 +58,21 @@ def test_summary_line(files: tuple[Path, Path]) -> None:
     )
 
 
+def test_result_table(files: tuple[Path, Path]) -> None:
+    table = report.result_table(make_document(files), "gsmerge view scene small.ply")
+    assert table[0] == str(files[1])
+    assert [line.split() for line in table[1:]] == [
+        ["Gaussians", "1,000", "25", "2.50", "%"],
+        ["file", "2.5", "MB", "700", "B"],
+        ["PSNR", "20.00", "dB", "24.50", "dB", "of", "the", "input", "views"],
+        ["time", "1.9", "s", "most", "in", "segment", "1.0,", "encode", "0.5"],
+        ["next", "gsmerge", "view", "scene", "small.ply"],
+    ]
+    assert max(map(len, table[1:])) <= 80
+    short = report.result_table(make_document(files, psnr_before=None, psnr_after=None))
+    assert [line.split()[0] for line in short[1:]] == ["Gaussians", "file", "time"]
+
+
 def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
     assert "dB" not in report.summary_line(make_document(files, psnr_before=None, psnr_after=None))
 

@@ -52,6 +52,7 @@ class Curves:
     y_scale: str = "linear"  # the same
     percent: bool = False  # whether x is a share, shown in per cent
     front: bool = False  # whether the Pareto front is marked
+    all_of: str | None = None  # the figure that shows the main lines of this one; None: it is no such figure's
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class BreakEven:
     input_ms: float  # milliseconds per view of the input
     # name, seconds of the merge, milliseconds per view afterwards, frames to break even (None: never)
     rows: tuple[tuple[str, float, float, float | None], ...]
+    all_of: str | None = None  # as of curves
 
 
 Figure = Curves | Bars | BreakEven
@@ -86,7 +88,45 @@ def make_figures(records: Sequence[RunRecord], proxies: Sequence[Proxy] = ()) ->
     part = series.choose_part(done)
     figures: list[Figure | None] = [_against(done, part, "seconds"), _against(done, part, "ratio"), _stages(done)]
     figures += [_proxy(proxies), _counts(done), _over_views(done, part), _break_even(done)]
-    return [figure for figure in figures if figure is not None]
+    return [one for figure in figures if figure is not None for one in main_and_all(figure)]
+
+
+def main_and_all(figure: Figure) -> list[Figure]:
+    """A figure of quality or of break-even with one line for each method, and the whole one; itself if it has no more.
+
+    The main line of a method has the best mean in the first panel; a single point is one only where there is no line.
+    """
+    names: dict[str, str] = {}
+    if isinstance(figure, Curves) and figure.name.startswith("quality"):
+        first = figure.panels[0]
+        sign = 1 if first.higher else -1
+        for line in sorted(first.lines, key=lambda one: (len(one.points) > 1, sign * _mean_quality(one))):
+            names[_method(line.name)] = line.name
+        lines = {line.name for panel in figure.panels for line in panel.lines}
+    elif isinstance(figure, BreakEven):
+        for name, *_ in reversed(figure.rows):  # those with the fewest settings come first
+            names[_method(name)] = name
+        lines = {name for name, *_ in figure.rows}
+    else:
+        return [figure]
+    kept = set(names.values())
+    if lines == kept:
+        return [figure]
+    caption = f"{figure.caption} One line for each method; the page has all."
+    whole = replace(figure, name=f"{figure.name}-all", all_of=figure.name)
+    if isinstance(figure, BreakEven):
+        return [replace(figure, caption=caption, rows=tuple(row for row in figure.rows if row[0] in kept)), whole]
+    panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in kept)) for panel in figure.panels]
+    return [replace(figure, caption=caption, panels=tuple(panel for panel in panels if panel.lines)), whole]
+
+
+def _method(name: str) -> str:
+    """The method of a line, whose name goes on with settings."""
+    return name.split(", ")[0]
+
+
+def _mean_quality(line: Line) -> float:
+    return float(np.mean([point.y.mean for point in line.points]))
 
 
 def _cost(name: str) -> Getter:

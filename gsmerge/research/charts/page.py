@@ -10,7 +10,7 @@ from pathlib import Path
 from gsmerge.report import human_bytes
 from gsmerge.research.charts import series
 from gsmerge.research.charts.experiment import OURS
-from gsmerge.research.charts.figures import DIGITS, Curves, Figure, VerdictTable
+from gsmerge.research.charts.figures import DIGITS, BreakEven, Curves, Figure, VerdictTable
 from gsmerge.research.charts.markup import Cell, Row, details, inline_svg, table, text
 from gsmerge.research.charts.pictures import error_section, find_pictures, slider_section
 from gsmerge.research.charts.record import RunRecord
@@ -40,10 +40,12 @@ def make_page(
     scenes = list(dict.fromkeys(record.scene for record in records))
     failed = [record for record in records if record.error is not None]
     pictures = find_pictures(done, folder)
+    wholes = {figure.all_of: figure for figure in figures if isinstance(figure, Curves | BreakEven) and figure.all_of}
+    shown = [figure for figure in figures if figure not in wholes.values()]
     sections = [
         ("results", "Results", _results(done)),
         ("verdicts", "At equal cost", _verdicts(verdicts)),
-        *((figure.name, figure.title, _figure(figure, drawings[figure.name], done, command)) for figure in figures),
+        *((figure.name, figure.title, _figure(figure, wholes, drawings, done, command)) for figure in shown),
         ("compare", "Side by side", slider_section(pictures)),
         ("errors", "Error maps", error_section(pictures)),
         ("failures", "Failed runs", _failures(failed)),
@@ -149,11 +151,21 @@ def _verdicts(tables: Sequence[VerdictTable]) -> str:
     return f'<p class="muted">{text(how)}</p>{"".join(parts)}'
 
 
-def _figure(figure: Figure, drawing: str, records: Sequence[RunRecord], command: str) -> str:
-    commands = details("commands", _commands(records, command))
-    points = _points(figure) if isinstance(figure, Curves) else ""
-    svg = inline_svg(drawing, figure.name, f"{figure.title}. {figure.caption}")
-    return f"<figure>{svg}<figcaption>{text(figure.caption)}</figcaption></figure>{points}{commands}"
+def _figure(
+    figure: Figure, wholes: Mapping[str, Figure], drawings: Mapping[str, str], records: Sequence[RunRecord],
+    command: str,
+) -> str:  # fmt: skip
+    """A figure, all its lines behind a toggle where it shows the main ones, its numbers, and the commands."""
+    whole = wholes.get(figure.name)
+    rest = "" if whole is None else details("all lines", _drawing(whole, drawings))
+    numbers = whole or figure
+    points = _points(numbers) if isinstance(numbers, Curves) else ""
+    return f"{_drawing(figure, drawings)}{rest}{points}{details('commands', _commands(records, command))}"
+
+
+def _drawing(figure: Figure, drawings: Mapping[str, str]) -> str:
+    svg = inline_svg(drawings[figure.name], figure.name, f"{figure.title}. {figure.caption}")
+    return f"<figure>{svg}<figcaption>{text(figure.caption)}</figcaption></figure>"
 
 
 def _commands(records: Sequence[RunRecord], command: str) -> str:

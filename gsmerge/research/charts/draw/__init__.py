@@ -12,7 +12,7 @@ from gsmerge.errors import GsmergeError
 if TYPE_CHECKING:
     from gsmerge.research.charts.figures import Figure
 
-INSTALL_HINT = 'pip install "gsmerge[chart]"'
+INSTALL_HINT = 'pip install "matplotlib>=3.8,<4"'  # as the extra chart asks for
 
 
 def require_matplotlib() -> None:

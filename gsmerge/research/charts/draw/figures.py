@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import matplotlib
@@ -34,7 +34,7 @@ OUR_COLORS = ("#0072B2", "#56B4E9", "#003F66", "#7FA8C9", "#2E5C8A", "#9FC5E8")
 OUR_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), "-", (0, (4, 1.5)))
 BASELINE_COLORS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00", "#7B4173", "#8C6D31")
 BASELINE_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # the next for every round through the colours
-OUR_MARKERS, BASELINE_MARKERS = "oosDvP", "^vD<>XP"
+OUR_MARKERS, BASELINE_MARKERS = "osDvPX*", "^vD<>XP"  # as many as leave no divisor in common with the colours
 _TICKS = {"color": MUTED, "labelcolor": INK, "labelsize": 7, "major.size": 2.5, "major.width": 0.6}
 RC: dict[Any, Any] = {
     "axes.edgecolor": MUTED,
@@ -83,7 +83,8 @@ def line_styles(names: Sequence[tuple[str, bool]]) -> dict[str, LineStyle]:
         elif is_ours:
             i = ours % len(OUR_COLORS)
             width, order = 1.6 if ours == 0 else 1.2, 6 - min(ours, 2)
-            styles[name] = LineStyle(OUR_COLORS[i], OUR_DASHES[i], OUR_MARKERS[i], width, order)
+            marker = OUR_MARKERS[ours % len(OUR_MARKERS)]
+            styles[name] = LineStyle(OUR_COLORS[i], OUR_DASHES[i], marker, width, order)
             ours += 1
         else:
             dash = BASELINE_DASHES[baselines // len(BASELINE_COLORS) % len(BASELINE_DASHES)]
@@ -94,8 +95,9 @@ def line_styles(names: Sequence[tuple[str, bool]]) -> dict[str, LineStyle]:
 
 
 def common_styles(several: Sequence[figures.Figure]) -> Styles:
-    """The styles of the first figure's lines, for all figures that have no others."""
-    return line_styles(next((_names(figure) for figure in several if isinstance(figure, figures.Curves)), []))
+    """The styles of the lines of the curves with the most, for all figures that have no others."""
+    curves = [_names(figure) for figure in several if isinstance(figure, figures.Curves)]
+    return line_styles(max(curves, key=len, default=[]))
 
 
 def _names(figure: figures.Figure) -> list[tuple[str, bool]]:
@@ -277,9 +279,10 @@ def _draw_break_even(figure: figures.BreakEven, styles: Styles) -> MplFigure:
         axes.plot(frames, total, color=style.color, linestyle=style.dash, linewidth=style.width, zorder=style.order)
         if at is not None:
             spot = at * figure.input_ms / 1000
-            axes.plot([at], [spot], "o", color=style.color, markersize=5, markeredgecolor="white", zorder=8)
+            edge: dict[str, Any] = {"markersize": 5.5, "markeredgecolor": "white", "markeredgewidth": 0.5}
+            axes.plot([at], [spot], style.marker, color=style.color, zorder=8, **edge)
         when = "" if name == INPUT else ": never" if at is None else f": {math.ceil(at):,} frames"
-        key.append((name + when, LineStyle(style.color, style.dash, "", style.width, style.order)))
+        key.append((name + when, style if at is not None else replace(style, marker="")))
     _log_axis(axes, "x", first, last)
     _log_axis(axes, "y", float(np.min(totals)) / 1.3, float(np.max(totals)) * 1.3)
     axes.set(xlabel="Frames rendered", ylabel="Seconds, merge included")

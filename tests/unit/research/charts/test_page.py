@@ -67,7 +67,7 @@ def page_of(records: list[RunRecord], folder: Path, most_figures: int = 1) -> st
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return page_of(make_grid(), tmp_path_factory.mktemp("results"), most_figures=9)
+    return page_of(make_grid(), tmp_path_factory.mktemp("results"), most_figures=20)
 
 
 def test_the_page_is_well_formed(page: str) -> None:
@@ -75,6 +75,14 @@ def test_the_page_is_well_formed(page: str) -> None:
     assert actual.open == []
     assert len(actual.ids) == len(set(actual.ids))
     assert page.startswith("<!DOCTYPE html>\n<html lang=")
+
+
+def test_all_lines_are_behind_a_toggle(page: str) -> None:
+    for name in ("quality-seconds", "quality-ratio"):
+        assert page.count(f'<section id="{name}">') == 1
+        assert f'<section id="{name}-all">' not in page
+    assert page.count("<details><summary>all lines</summary><figure><svg") == 4  # also over views, and break-even
+    assert page.count("</section>") == page.count("<section ")
 
 
 def test_the_page_fetches_nothing(page: str) -> None:
@@ -174,7 +182,7 @@ def test_missing_matplotlib_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     from gsmerge.errors import GsmergeError
 
     monkeypatch.setattr("gsmerge.research.charts.draw.find_spec", lambda name: None)
-    with pytest.raises(GsmergeError, match=r'not installed: pip install "gsmerge\[chart\]"'):
+    with pytest.raises(GsmergeError, match=r'not installed: pip install "matplotlib>=3.8,<4"'):
         draw_figures([], tmp_path)
 
 

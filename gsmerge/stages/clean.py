@@ -1,0 +1,204 @@
+"""fitted Gaussians -> those that are wanted: cropped to a box or a sphere, without floaters.
+
+A budget is met after clean-up: more Gaussians are made than are asked for, and the faintest of what is too many are
+left out (:func:`make_clean`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import UsageError
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.types import Gaussians
+
+BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
+OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
+NEIGHBORS = 8  # nearest Gaussians, of which a floater touches none
+TOUCH = 3.0  # Gaussians touch within so many of their largest scales together
+APART = 3.0  # times the median distance of nearest Gaussians: a floater's own is larger
+MAX_SAMPLES = 200_000  # Gaussians that a share is estimated from
+MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count; more than it by so much at first
+CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
+SIZES = {"sphere": 4, "box": 6}  # numbers of a crop
+
+Make = Callable[[int | None, RunLog], Gaussians]
+ToWorld = Callable[[Gaussians], Gaussians]
+
+
+@dataclass(frozen=True)
+class CleanOptions:
+    """What is left out of the result.
+
+    Args:
+        crop: Keep the Gaussians whose centre is inside: ``"sphere:x,y,z,radius"`` or ``"box:x0,y0,z0,x1,y1,z1"``, in
+            the scene's world units; None: all.
+        drop_floaters: Leave out Gaussians that are isolated or far beyond the scene, see :func:`floaters`.
+
+    Raises:
+        ValueError: If the crop is none, or holds nothing.
+    """
+
+    crop: str | None = None
+    drop_floaters: bool = False
+
+    def __post_init__(self) -> None:
+        if self.crop is not None:
+            parse_crop(self.crop)
+
+    @property
+    def asked(self) -> bool:
+        """Whether anything is to be left out."""
+        return self.crop is not None or self.drop_floaters
+
+
+def parse_crop(text: str) -> tuple[str, np.ndarray]:
+    """The shape of a crop and its numbers, float64.
+
+    Raises:
+        ValueError: If it is none, or holds nothing.
+
+    Example:
+        >>> parse_crop("sphere:0,0,2,1.5")
+        ('sphere', array([0. , 0. , 2. , 1.5]))
+    """
+    match = re.fullmatch(r"\s*(sphere|box)\s*:(.*)", text)
+    try:
+        numbers = np.array([float(part) for part in match[2].split(",")] if match else [])
+    except ValueError:
+        numbers = np.array([])
+    if match is None or len(numbers) != SIZES[match[1]] or not np.isfinite(numbers).all():
+        raise ValueError(f"crop: expected {CROP}, got {text!r}")
+    empty = numbers[3] <= 0 if match[1] == "sphere" else (numbers[3:] <= numbers[:3]).any()
+    if empty:
+        expected = "a radius above 0" if match[1] == "sphere" else "x0 < x1, y0 < y1 and z0 < z1"
+        raise ValueError(f"crop: expected {expected}, got {text!r}")
+    return match[1], numbers
+
+
+def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
+    """``[n]`` bool: which world-frame centres ``[n,3]`` a crop keeps; its border belongs to it."""
+    shape, numbers = parse_crop(crop)
+    if shape == "sphere":
+        return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
+    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:])).all(1))
+
+
+def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
+    """``[n]`` bool: which centres ``[n,3]`` lie outside ten times the box of 1 % to 99 % of them, or of ``samples``."""
+    low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
+    half = np.maximum((high - low) / 2, 1e-3 * max(float(np.linalg.norm(high - low)), 1e-30))
+    return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
+
+
+def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
+    """``[n]`` bool: which finite Gaussians are isolated, or far beyond the scene.
+
+    Isolated: none of the eight nearest is within three times the largest scales of both, and the nearest is more than
+    three times as far as the median Gaussian's. Far beyond: :func:`beyond_scene`.
+
+    Args:
+        gaussians: n of them, in any unit.
+        rows: ``[m]`` of them to ask about; None: all.
+    """
+    rows = np.arange(len(gaussians)) if rows is None else rows
+    means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
+    if len(means) <= NEIGHBORS:
+        return np.zeros(len(rows), bool)
+    from scipy.spatial import cKDTree  # loads slowly, and is seldom needed
+
+    tree = cKDTree(means, balanced_tree=False, compact_nodes=False)
+    distances, ids = tree.query(means[rows], k=NEIGHBORS + 1, workers=-1)
+    distances, ids = distances[:, 1:], ids[:, 1:]  # the first is the Gaussian itself
+    touched = (distances <= TOUCH * (sizes[rows][:, None] + sizes[ids])).any(1)
+    apart = distances[:, 0] > APART * np.median(distances[:, 0])
+    return np.asarray(~touched & apart) | beyond_scene(means[rows], means)
+
+
+def floater_share(gaussians: Gaussians) -> float:
+    """Share of finite Gaussians that are :func:`floaters`, of many estimated from some; 0 without any."""
+    rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // MAX_SAMPLES)))
+    return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
+
+
+def clean(gaussians: Gaussians, options: CleanOptions, to_world: ToWorld) -> tuple[Gaussians, dict[str, int]]:
+    """The Gaussians that are wanted, and how many are left out by reason: ``cropped``, ``floaters``.
+
+    Args:
+        gaussians: In the canonical frame.
+        options: What is left out.
+        to_world: From that frame to the world's, which a crop is in.
+    """
+    counts = {}
+    if options.crop is not None:
+        inside = inside_crop(to_world(gaussians).means, options.crop)
+        gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
+    if options.drop_floaters:
+        loose = floaters(gaussians)
+        gaussians, counts["floaters"] = gaussians[~loose], int(loose.sum())
+    return gaussians, counts
+
+
+def make_clean(
+    make: Make, count: int | None, options: CleanOptions, to_world: ToWorld, given: Gaussians, log: RunLog
+) -> Gaussians:
+    """Gaussians after clean-up: exactly ``count`` of them, unless the whole scene does not hold so many.
+
+    Args:
+        make: Makes that many Gaussians before clean-up.
+        count: Gaussians in the result; None: as many as are left.
+        options: What is left out.
+        to_world: From the canonical frame, which all Gaussians are in, to the world's.
+        given: The scene's own Gaussians, which say how many a crop is likely to leave.
+        log: Takes seconds, counts and notes.
+
+    Raises:
+        UsageError: If the crop holds none of the scene.
+    """
+    most, asked = len(given), count
+    share = 1.0 if options.crop is None else float(inside_crop(to_world(given).means, options.crop).mean())
+    if share == 0:
+        remedy = "gsmerge inspect says where the scene is"
+        raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
+    if count is not None:
+        asked = min(most, math.ceil(SURPLUS * count / share))
+    found: tuple[Gaussians, dict[str, int], RunLog] | None = None
+    for _ in range(MAX_BUILDS):
+        own = RunLog(log.progress)
+        gaussians, counts = clean(make(asked, own), options, to_world)
+        for name, value in own.seconds.items():
+            log.seconds[name] = log.seconds.get(name, 0.0) + value
+        if found is None or count is None or len(found[0]) < len(gaussians):
+            found = gaussians, counts, own
+        if count is None or asked is None or len(gaussians) >= count or asked == most:
+            break
+        asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
+    assert found is not None
+    gaussians, counts, own = found
+    if count is not None and len(gaussians) > count:
+        gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
+    log.choices |= own.choices | {"clean": counts}
+    log.notes += [*own.notes, *_clean_notes(counts, len(gaussians), count)]
+    return gaussians
+
+
+def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
+    """The ``count`` Gaussians with the largest opacity times area of the two largest axes, in their order."""
+    area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
+    return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]
+
+
+def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> list[str]:
+    words = {"cropped": "outside of the crop", "floaters": "floater(s)", "surplus": "more than the budget"}
+    parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
+    scores = ["PSNR of the input views counts what the crop leaves out as errors"] * ("cropped" in counts)
+    short = []
+    if count is not None and left < count:
+        short = [f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up"]
+    return [f"left out by clean-up: {parts}", *scores, *short]

@@ -1,0 +1,108 @@
+"""What the wheel and the source archive hold, and what their metadata say."""
+
+from __future__ import annotations
+
+import email
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from email.message import Message
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomllib
+
+import gsmerge
+from gsmerge.render.cuda import INSTALL
+from gsmerge.research.charts.draw import INSTALL_HINT
+
+pytest.importorskip("setuptools", minversion="77")
+BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"
+SOURCES = ("gsmerge", "pyproject.toml", "README.md", "LICENSE")
+
+
+@pytest.fixture(scope="module")
+def built(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel and the source archive of a copy of the sources."""
+    folder = tmp_path_factory.mktemp("distribution")
+    for name in SOURCES:
+        if (root / name).is_dir():
+            ignored = shutil.ignore_patterns("__pycache__", "*.nb?")
+            shutil.copytree(root / name, folder / "source" / name, ignore=ignored)
+        else:
+            shutil.copy(root / name, folder / "source" / name)
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD, "../dist"], cwd=folder / "source", capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def project(root: Path) -> dict[str, Any]:
+    content: dict[str, Any] = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    return content
+
+
+def packed(source: Path) -> set[str]:
+    """Every file of the package."""
+    return {str(path.relative_to(source)) for path in (source / "gsmerge").rglob("*") if path.is_file()}
+
+
+def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
+    (wheel,) = (built / "dist").glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert packed(built / "source") - names == set()
+    for name in (
+        "view/vendor/spark-three.js.gz",
+        "view/templates/view.html",
+        "networks/shipped.safetensors",
+        "py.typed",
+    ):
+        assert f"gsmerge/{name}" in names
+    licences = {Path(name).name for name in names if ".dist-info/licenses/" in name}
+    assert {"LICENSE", "LICENSE.three", "LICENSE.spark", "LICENSE.fflate"} <= licences
+    assert [
+        name for name in names if not name.startswith(("gsmerge/", f"gsmerge-{gsmerge.__version__}.dist-info/"))
+    ] == []
+
+
+def test_the_source_archive_can_be_built_again(built: Path) -> None:
+    (archive,) = (built / "dist").glob("*.tar.gz")
+    with tarfile.open(archive) as file:
+        names = {name.split("/", 1)[1] for name in file.getnames() if "/" in name}
+    assert packed(built / "source") - names == set()
+    assert {"pyproject.toml", "README.md", "LICENSE"} <= names
+
+
+def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
+    (wheel,) = (built / "dist").glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        metadata: Message = email.message_from_bytes(
+            file.read(next(name for name in file.namelist() if name.endswith(".dist-info/METADATA")))
+        )
+    assert metadata["Version"] == gsmerge.__version__
+    assert "version" not in project  # which stands in gsmerge/__init__.py alone
+    assert "Typing :: Typed" in metadata.get_all("Classifier", [])
+    assert not re.search(r"file://|/work/|/root/|/tmp/|/home/", metadata.as_string())
+
+
+def test_messages_install_what_the_extras_ask_for(root: Path, project: dict[str, Any]) -> None:
+    extras = project["optional-dependencies"]
+    assert [f'pip install "{extras[name][0]}"' for name in ("cuda", "chart")] == [INSTALL, INSTALL_HINT]
+    assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "batch" / "ray_engine.py").read_text()
+    pages = (*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "gsmerge").rglob("*.py"))
+    assert [str(page) for page in pages if re.search(r"""pip install ["']gsmerge""", page.read_text())] == []
+
+
+def test_the_image_has_the_pinned_versions(root: Path) -> None:
+    steps = (root / "Dockerfile").read_text()
+    assert steps.count("\nFROM python:3.11-slim") == 1
+    assert "pip install --no-cache-dir -c constraints.txt ." in steps
+    assert re.search(r"^torch==\S+$", (root / "constraints.txt").read_text(), re.MULTILINE)
+    copied = {word for line in re.findall(r"^COPY (.+) \S+$", steps, re.MULTILINE) for word in line.split()}
+    assert copied >= set(SOURCES)

@@ -1,0 +1,135 @@
+"""What a person sees in a terminal of 80 columns: commands run in a pseudo-terminal, their bytes become a screen."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import struct
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsmerge.cli.console import wrap_line
+
+from .conftest import Run
+
+pty = pytest.importorskip("pty")
+COLUMNS, ROWS = 80, 50
+
+
+def screen(data: bytes) -> list[str]:
+    """The lines of a terminal after these bytes: cursor up, erase line, wrapping at the last column."""
+    lines, row, column = [""], 0, 0
+    text = data.decode("utf-8")
+    for match in re.finditer(r"\x1b\[([\d;?]*)([A-Za-z])|(.)", text, re.DOTALL):
+        number, control, letter = match.groups()
+        if control == "A":
+            row = max(0, row - int(number or 1))
+        elif control == "K":
+            lines[row] = ""
+        elif letter == "\r":
+            column = 0
+        elif letter == "\n":
+            row += 1
+        elif letter:
+            row, column = (row + 1, 0) if column == COLUMNS else (row, column)
+            lines += [""] * (row + 1 - len(lines))
+            lines[row] = lines[row][:column].ljust(column) + letter + lines[row][column + 1 :]
+            column += 1
+        lines += [""] * (row + 1 - len(lines))
+    return [line.rstrip() for line in lines if line.strip()]
+
+
+def in_terminal(*arguments: object, interrupt_at: bytes | None = None) -> tuple[int, bytes]:
+    """Exit code and bytes of a command in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
+    import fcntl
+    import termios
+
+    pid, terminal = pty.fork()
+    if pid == 0:
+        words = [sys.executable, "-m", "gsmerge", *map(str, arguments)]
+        os.execve(sys.executable, words, {**os.environ, "TERM": "xterm", "COLUMNS": str(COLUMNS)})
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
+    output = b""
+    while select.select([terminal], [], [], 300)[0]:
+        try:
+            block = os.read(terminal, 1 << 16)
+        except OSError:  # the end, on Linux
+            break
+        if not block:
+            break
+        output += block
+        if interrupt_at is not None and interrupt_at in output:
+            os.write(terminal, b"\x03")
+            interrupt_at = None
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    os.close(terminal)
+    return code, output
+
+
+def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
+    out = tmp_path / "small.ply"
+    code, output = in_terminal("compact", scene_copy, "-o", out, "--superpixels", 200, "--fit-steps", 20)
+    lines = [line for line in screen(output) if not line.startswith("compiling")]
+    assert code == 0
+    first = next(i for i, line in enumerate(lines) if line.startswith("  Gaussians"))
+    assert "".join(lines[:first]) == str(out)
+    assert [line.split()[0] for line in lines[first : first + 5]] == ["Gaussians", "file", "PSNR", "time", "next"]
+    assert "next       gsmerge view" in lines[first + 4]
+    text = re.sub(r"\x1b\[[^A-Za-z]*[A-Za-z]", "", output.decode())
+    bars = dict(re.findall(r"(prepare|match|fit) (━+) \d:\d\d:\d\d", text))
+    assert bars == dict.fromkeys(("prepare", "match", "fit"), "━" * 16)  # done once the next stage begins
+    assert "/17" not in output.decode()
+
+
+def test_ctrl_c_leaves_no_bar(scene_copy: Path, tmp_path: Path) -> None:
+    words = ("compact", scene_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--fit-steps", 100_000)
+    code, output = in_terminal(*words, interrupt_at=b"held out")
+    assert code == 130
+    lines = [line for line in screen(output) if not line.startswith("compiling")]
+    assert lines == ["gsmerge: error: interrupted"]
+    assert list(tmp_path.glob("small*")) == []
+
+
+def test_inspect_breaks_no_words(scene_copy: Path, run: Run) -> None:
+    code, output = in_terminal("inspect", scene_copy)
+    assert code == 0
+    lines = output.decode().replace("\r", "").splitlines()
+    whole = run("inspect", scene_copy).out.splitlines()
+    assert any(len(line) > COLUMNS for line in whole)
+    assert [len(line) for line in lines if len(line) > COLUMNS and " " in line[11:]] == []
+    assert " ".join(" ".join(lines).split()) == " ".join(" ".join(whole).split())
+
+
+def test_lines_are_wrapped_below_their_first_value() -> None:
+    assert wrap_line("extent     one two three four", 24) == ["extent     one two three", "           four"]
+    assert wrap_line("note: one two three", 14) == ["note: one two", "      three"]
+    assert wrap_line("a/path/longer/than/the/line", 10) == ["a/path/longer/than/the/line"]
+    assert wrap_line("x" * 300 + " y", None) == ["x" * 300 + " y"]
+
+
+def test_a_dry_run_replaces_nothing_and_refuses_nothing(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "small.ply"
+    out.write_text("mine")
+    said = run("compact", scene_copy, "-o", out, "--dry-run")
+    assert said.code == 0
+    assert f"note         {out} exists already: --overwrite would replace it" in said.out
+    assert "exists" not in run("compact", scene_copy, "-o", out, "--dry-run", "--overwrite").out
+    assert out.read_text() == "mine"
+
+
+def test_a_compact_scene_is_known_again(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    out, again = tmp_path / "small.ply", tmp_path / "smaller.ply"
+    words = ("--fit", "none", "--superpixels", 200)
+    first = run("compact", scene_copy, "-o", out, *words)
+    assert "compact already" not in first.err
+    views = ("--cameras", scene_copy / "transforms.json", "--images", scene_copy / "images")
+    second = run("compact", out, "-o", again, *words, *views)
+    assert second.code == 0
+    assert second.err.count("note: the scene is compact already (") == 1
+    scored = run("evaluate", scene_copy, out, "--views", 2, "--lpips", "none")
+    assert "small.ply: " in scored.err
+    assert "made of more" in scored.err
+    assert "made of more" not in run("evaluate", scene_copy, out, "--lpips", "none").err

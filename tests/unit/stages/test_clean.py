@@ -1,0 +1,132 @@
+"""What is left out of a result: crops, floaters, and a budget that is met after them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import CompactOptions, Gaussians, PixelScene, compact
+from gsmerge.errors import UsageError
+from gsmerge.stages.clean import CleanOptions, clean, faintest_dropped, floater_share, floaters, inside_crop, parse_crop
+
+QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60}
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01)
+
+
+def sphere_in(scene: PixelScene, share: float) -> str:
+    """A sphere about the scene's middle that holds that share of its Gaussians."""
+    means = scene.gaussians.means.astype(float)
+    middle = np.median(means, axis=0)
+    radius = np.quantile(np.linalg.norm(means - middle, axis=1), share)
+    return "sphere:" + ",".join(map(str, (*middle, radius)))
+
+
+def wall(n: int = 40) -> Gaussians:
+    """n x n Gaussians that touch, at a distance of 1, on a plane that is not along an axis."""
+    y, x = np.divmod(np.arange(n * n), n)
+    means = np.stack([x, y, (x + y) / 4], 1).astype(np.float32)
+    count = len(means)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+    return Gaussians(
+        means, quats, np.full((count, 3), 0.5, np.float32), np.full(count, 0.5, np.float32),
+        np.zeros((count, 1, 3), np.float32), np.zeros((count, 0, 3), np.float32),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("sphere:0,0,0", "expected sphere:x,y,z,radius or box"),
+        ("ball:0,0,0,1", "expected sphere:x,y,z,radius or box"),
+        ("sphere:0,0,nan,1", "expected sphere:x,y,z,radius or box"),
+        ("box:a,0,0,1,1,1", "expected sphere:x,y,z,radius or box"),
+        ("sphere:0,0,0,0", "expected a radius above 0"),
+        ("box:0,0,0,1,1,0", "expected x0 < x1, y0 < y1 and z0 < z1"),
+    ],
+)
+def test_a_crop_that_is_none(text: str, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        CleanOptions(crop=text)
+
+
+def test_crops_keep_what_is_inside() -> None:
+    means = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [-1, -1, -1]], float)
+    assert inside_crop(means, "sphere: 0, 0, 0, 1").tolist() == [True, True, False, False]
+    assert inside_crop(means, "box:0,0,-.5,1,2,1").tolist() == [True, True, True, False]
+    assert parse_crop("sphere:1,2,3,4")[1].tolist() == [1, 2, 3, 4]
+
+
+def test_floaters_are_alone_or_far_away() -> None:
+    given = wall()
+    assert not floaters(given).any()
+    means = given.means.copy()
+    means[5] += (0, 0, 9)  # alone in front of the wall
+    means[6:16, 0] += 1000  # together, but far beyond
+    moved = replace(given, means=means)
+    assert np.flatnonzero(floaters(moved)).tolist() == list(range(5, 16))
+    assert floater_share(moved) == pytest.approx(11 / 1600)
+    large = replace(moved, scales=np.full((1600, 3), 4, np.float32))  # which touch across the gap
+    assert np.flatnonzero(floaters(large)).tolist() == list(range(6, 16))
+    assert not floaters(given[:8]).any()
+    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop_floaters=True), lambda g: g)
+    assert (len(left), counts) == (1589, {"cropped": 10, "floaters": 1})
+
+
+def test_the_faintest_go_first() -> None:
+    given = wall(3)
+    opacities = np.array([5, 1, 8, 2, 7, 3, 9, 4, 6], np.float32) / 10
+    assert faintest_dropped(replace(given, opacities=opacities), 4).opacities.tolist() == pytest.approx(
+        [0.8, 0.7, 0.9, 0.6]
+    )
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_a_budget_is_met_after_the_crop(scene: PixelScene, share: float) -> None:
+    crop = sphere_in(scene, share)
+    result = compact(scene, **QUICK, crop=crop, drop_floaters=True, budget=150)
+    assert len(result.gaussians) == 150
+    assert inside_crop(result.gaussians.means, crop).all()
+    assert result.report.choices["clean"]["cropped"] > 0
+    assert result.report.num_output == 150
+    assert sum(note.startswith("left out by clean-up: ") for note in result.report.notes) == 1
+
+
+def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: PixelScene) -> None:
+    crop = sphere_in(scene, 0.5)
+    whole, part = compact(scene, **QUICK), compact(scene, **QUICK, crop=crop)
+    inside = inside_crop(whole.gaussians.means, crop)
+    np.testing.assert_array_equal(part.gaussians.means, whole.gaussians.means[inside])
+    assert part.report.choices["clean"] == {"cropped": int((~inside).sum())}
+    assert "clean" not in whole.report.choices
+
+
+def test_levels_and_baselines_are_cropped(scene: PixelScene) -> None:
+    crop = sphere_in(scene, 0.5)
+    result = compact(scene, **QUICK, crop=crop, budget=160, levels=2)
+    assert [len(one.gaussians) for one in (result, *result.coarser)] == [160, 40]
+    assert inside_crop(result.coarser[0].gaussians.means, crop).all()
+    opaque = compact(scene, method="opacity", crop=crop, budget=100)
+    assert len(opaque.gaussians) == 100
+    assert inside_crop(opaque.gaussians.means, crop).all()
+    assert not any("does not use" in note for note in opaque.report.notes)
+
+
+def test_what_cannot_be(scene: PixelScene) -> None:
+    with pytest.raises(UsageError, match="expected Gaussians of the scene in sphere:0,0,1e9,1, found none"):
+        compact(scene, **QUICK, crop="sphere:0,0,1e9,1")
+    with pytest.raises(ValueError, match="crop: expected a budget or superpixels, got quality 30dB"):
+        CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "quality": "30dB"})
+    few = sphere_in(scene, 0.002)
+    result = compact(scene, **QUICK, crop=few, budget=5000)
+    assert 0 < len(result.gaussians) < 5000
+    assert any("budget: 5,000 Gaussians were asked for" in note for note in result.report.notes)
+    assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop_floaters": True}).whole_only == [
+        "crop", "drop_floaters",
+    ]  # fmt: skip
