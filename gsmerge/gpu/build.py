@@ -181,7 +181,7 @@ class DeviceScene:
         with self.stage(log, "decode"):
             if on_device_decode.covers(options.decode):
                 wanted = cut.count if cut.exact and not options.fit.grows else None
-                gaussians = on_device_decode.decode(merged, self.members, options.decode, wanted)
+                gaussians = on_device_decode.decode(merged, self.members, options.decode, wanted, exact=True)
                 if cut.exact and len(gaussians) > cut.count:  # K each would be more than the fit may grow to
                     gaussians = on_device_decode.decode(merged, self.members, options.decode, cut.count)
             else:
