@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 Scene = TypeVar("Scene", PixelScene, UnalignedScene)
 
-# On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.12 to 0.9 with drawings; noise stays
-# below 0.06, photos of other views mostly below 0.3.
+# On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.13 to 0.8 with drawings; noise mostly
+# stays below 0.06, photos of other views below 0.3.
 SIDE = 48  # pixels of the longer side
 SAMPLES = 1 << 17  # Gaussians that are drawn
 MIN_PIXELS = 64  # of a small picture
