@@ -36,7 +36,6 @@ from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import PreparedScene, prepare
 from gsmerge.stages.segment import scene_saliency
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
-from gsmerge.views import scored_views
 
 Psnr = Callable[[Gaussians, PreparedScene], float]
 
@@ -120,7 +119,7 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
     if scene.images is None or not options.fit.needs_photos:
         return gaussians
     with log.stage("fit"):
-        photos = fit_photos(scene, options.fit, log)
+        photos = fit_photos(scene, options.fit, log, prepared.photo_views)
         log.choices["begun_with"] = len(gaussians)
         gaussians, report = fit(
             gaussians, photos, options.fit, count, options.seed, log.fit_progress, analytic, exact=exact
@@ -257,5 +256,5 @@ def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
     In a quarter of every photo, or in the whole where a quality was asked for.
     """
     photos, exact = scene_photos(prepared.given), prepared.options.budget.target_psnr is not None
-    views, near = scored_views(len(photos)), NEAR * prepared.frame.unit
+    views, near = prepared.scored_views(), NEAR * prepared.frame.unit
     return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)

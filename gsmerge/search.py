@@ -57,7 +57,7 @@ def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | No
     drop = options.budget.max_drop
     if drop is None and not options.budget.auto:
         return limits.count
-    if prepared.given.images is None:
+    if prepared.given.images is None or prepared.scene.images is None:
         return knee_count(prepared)
     with log.stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
@@ -93,7 +93,7 @@ def search_quality(prepared: PreparedScene, build: Build, score: Score, log: Run
             f"quality: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
             f" with {len(result.gaussians)} Gaussians"
         )
-    choices = result.report.choices | {"search": asdict(search)}
+    choices = log.choices | result.report.choices | {"search": asdict(search)}
     notes = [*log.notes, *result.report.notes]
     return replace(result, report=replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet))
 
@@ -110,7 +110,7 @@ def measure_curve(
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, rates=options.fit.rates)
     limits = replace(prepared.limits, share=1.0)  # so short a fit does not grow
     quick = replace(prepared, options=replace(options, fit=short), limits=limits, checkpoint=None)
-    photos = scene_photos(prepared.scene)
+    photos = scene_photos(prepared.scene)[prepared.photo_views]
     weights = training_weights(photos, HOLDOUT, options.seed)
     points: list[CurvePoint] = []
     for count in counts:

@@ -40,8 +40,10 @@ def unmerged_fit(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
 def _fit_input(prepared: PreparedScene, options: FitOptions, log: RunLog) -> Gaussians:
     """All Gaussians, fitted to the photos."""
     gaussians = own_gaussians(prepared.scene)
+    if prepared.scene.images is None:
+        return gaussians
     with log.stage("fit"):
-        photos = fit_photos(prepared.scene, options, log)
+        photos = fit_photos(prepared.scene, options, log, prepared.photo_views)
         gaussians, report = fit(gaussians, photos, options, len(gaussians), prepared.options.seed, log.fit_progress)
     log.add_fit(report)
     return gaussians

@@ -47,7 +47,6 @@ from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.stages.segment import scene_saliency
 from gsmerge.types import Gaussians, PixelScene, Segmentation
-from gsmerge.views import scored_views
 
 Begin = Callable[[PreparedScene, int | None, RunLog], tuple[Gaussians, int, bool, Gaussians | None]]
 
@@ -107,6 +106,15 @@ class DeviceScene:
         return upload_pair(self.prepared.scene, self.device)
 
     @cached_property
+    def fit_photos(self) -> tuple[DevicePhotos, DevicePhotos]:
+        """Those of them that a fit may use."""
+        views = self.prepared.photo_views
+        if len(views) == len(self.prepared.scene):
+            return self.photos
+        full, half = (upload_photos(photos.host[views], self.device) for photos in self.photos)
+        return full, half
+
+    @cached_property
     def pictures(self) -> Tensor:
         """``[v,h,w,3]`` what superpixels are cut from."""
         if self.prepared.scene.images is not None:
@@ -145,7 +153,7 @@ class DeviceScene:
             log.choices["on_cpu"] = reasons
             start, other_start = gaussians.numpy(), None if other is None else other.numpy()
             with log.stage("fit"):
-                photos = fit_photos(scene, options.fit, log)
+                photos = fit_photos(scene, options.fit, log, prepared.photo_views)
                 gaussians, report = fit_on_cpu(
                     start, photos, options.fit, count, options.seed, log.fit_progress, other_start, exact=exact
                 )
@@ -153,7 +161,7 @@ class DeviceScene:
             log.notes += [] if problem is None else [problem]
             with self.stage(log, "fit"):
                 settings = options.fit, count, options.seed, log.fit_progress, other
-                gaussians, report = fit_with(ON_DEVICE, gaussians, self.photos, *settings, exact=exact)
+                gaussians, report = fit_with(ON_DEVICE, gaussians, self.fit_photos, *settings, exact=exact)
                 gaussians = gaussians.numpy()
         log.add_fit(report)
         return gaussians
@@ -174,7 +182,7 @@ class DeviceScene:
         with self.stage(log, "decode"):
             if on_device_decode.covers(options.decode):
                 wanted = cut.count if cut.exact and not options.fit.grows else None
-                gaussians = on_device_decode.decode(merged, self.members, options.decode, wanted)
+                gaussians = on_device_decode.decode(merged, self.members, options.decode, wanted, exact=True)
                 if cut.exact and len(gaussians) > cut.count:  # K each would be more than the fit may grow to
                     gaussians = on_device_decode.decode(merged, self.members, options.decode, cut.count)
             else:
@@ -237,7 +245,7 @@ class DeviceScene:
             assert given.images is not None
             photos = upload_photos(photos_of(given.images, cameras), self.device)
         quarter = prepared.options.budget.target_psnr is None
-        return photo_psnr(gaussians, photos, scored_views(len(photos)), near=NEAR, quarter=quarter)
+        return photo_psnr(gaussians, photos, prepared.scored_views(), near=NEAR, quarter=quarter)
 
 
 def _match(features: Features, prepared: PreparedScene, reasons: dict[str, str]) -> tuple[Tensor, int]:

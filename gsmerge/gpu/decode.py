@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +12,7 @@ from gsmerge.gpu.match import take
 from gsmerge.gpu.pool import pool_members
 from gsmerge.gpu.runs import owners_of
 from gsmerge.gpu.scene import DeviceMembers, Features
-from gsmerge.stages.decode import MAX_CHILDREN, MIXED, DecodeOptions, hull_gains
+from gsmerge.stages.decode import MAX_CHILDREN, MIXED, DecodeOptions, deal_visible, hull_gains
 from gsmerge.types import Gaussians
 
 
@@ -20,13 +21,23 @@ def covers(options: DecodeOptions) -> bool:
     return options.k != MIXED
 
 
-def decode(features: Features, members: DeviceMembers, options: DecodeOptions, count: int | None) -> Gaussians:
+def decode(
+    features: Features, members: DeviceMembers, options: DecodeOptions, count: int | None, *, exact: bool = False
+) -> Gaussians:
     """``count`` Gaussians, spent where they lower distortion most, or None: K of each Feature Gaussian.
 
-    Those below the least opacity are left out. See :func:`gsmerge.stages.decode.decode`; the rule is ``"depth"``.
+    Those below the least opacity are left out; with ``exact`` others take their place. See
+    :func:`gsmerge.stages.decode.decode`; the rule is ``"depth"``.
     """
     if count is None:
         children = torch.full((len(features),), options.max_k, device=features.means.device)
+    elif exact:
+        order = deal_order(features, members).cpu().numpy()
+
+        def make(counts: np.ndarray) -> Gaussians:
+            return divide(features, members, torch.from_numpy(counts).to(features.means.device))
+
+        return deal_visible(order, len(features), count, options.min_opacity, make)
     else:
         children = split_counts(features, members, max(0, count - len(features)), MAX_CHILDREN)
     gaussians = divide(features, members, children)
@@ -56,15 +67,22 @@ def split_counts(features: Features, members: DeviceMembers, extra: int, max_chi
     See :func:`gsmerge.stages.decode.split_counts`.
     """
     ones = torch.ones(len(features), dtype=torch.int64, device=features.means.device)
-    front = torch.nonzero(~features.backing)[:, 0]
-    if extra <= 0 or len(front) == 0:
+    if extra <= 0:
         return ones
+    dealt = deal_order(features, members, max_children)[:extra]
+    return ones.index_add_(0, dealt, ones.new_ones(len(dealt)))
+
+
+def deal_order(features: Features, members: DeviceMembers, max_children: int = MAX_CHILDREN) -> Tensor:
+    """``[d]`` the Feature Gaussian that each further Gaussian goes to; see :func:`gsmerge.stages.decode.deal_order`."""
+    front = torch.nonzero(~features.backing)[:, 0]
+    if len(front) == 0:
+        return front
     counts = torch.full((len(front),), max_children, device=front.device)
     errors = _halve(features, members, front, counts)[1].errors
     gains = torch.from_numpy(hull_gains(errors.cpu().numpy())).to(front.device)
     order = torch.sort(-gains.reshape(-1), stable=True).indices
-    dealt = order[: min(extra, int(torch.isfinite(gains).sum()))] // gains.shape[1]
-    return ones.index_add_(0, front[dealt], ones.new_ones(len(dealt)))
+    return front[order[: int(torch.isfinite(gains).sum())] // gains.shape[1]]
 
 
 def _halve(features: Features, members: DeviceMembers, groups: Tensor, counts: Tensor) -> tuple[Features, Division]:

@@ -8,10 +8,10 @@ import re
 import struct
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
-from typing import BinaryIO
+from typing import BinaryIO, overload
 
 import cv2
 import numpy as np
@@ -31,8 +31,28 @@ _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 ImageSource = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-Photos = Sequence[np.ndarray] | np.ndarray  # c of [h,w,3], uint8 sRGB
 Size = tuple[int, int]  # width, height, pixels
+_AT_ONCE = 128 << 20  # bytes of decoded photos; more are decoded one by one, when they are used
+
+
+@dataclass(frozen=True)
+class PhotoReader:
+    """c photos of one size ``(width, height)`` that are decoded each time they are asked for, and not kept."""
+
+    count: int
+    size: Size
+    read: Callable[[int], np.ndarray]  # number -> [h,w,3] uint8 sRGB; several threads may call it
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, photo: int) -> np.ndarray:
+        if not 0 <= photo < self.count:
+            raise IndexError(photo)
+        return self.read(photo)
+
+
+Photos = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB
 
 
 def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
@@ -50,15 +70,32 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     return as_floats(decode_images(match_images(source, names)))
 
 
-def decode_images(paths: Sequence[Path]) -> list[np.ndarray]:
-    """The images of these files, ``[h,w,3]`` uint8 each. SceneError if one cannot be read, or two differ in size."""
+def decode_images(paths: Sequence[Path]) -> Photos:
+    """The images of these files, ``[h,w,3]`` uint8 each; many large ones are decoded when they are used.
+
+    SceneError if two differ in size, or one cannot be read: of many large ones, when it is used.
+    """
     sizes = [image_size(path) for path in paths]
     for path, (w, h) in zip(paths, sizes, strict=True):
         if (w, h) != sizes[0]:
             w0, h0 = sizes[0]
             raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
 
+    if sum(3 * width * height for width, height in sizes) > _AT_ONCE:
+        return PhotoReader(len(paths), sizes[0], lambda photo: decode_image(paths[photo], sizes[0]))
     return parallel_map(lambda path: decode_image(path, sizes[0]), paths)
+
+
+def change_photos(photos: Photos, size: Size, change: Callable[[int, np.ndarray], np.ndarray]) -> Photos:
+    """``change(number, photo)`` of every photo, ``size`` in the end; of those that are decoded when used, then."""
+    if isinstance(photos, PhotoReader):
+        return PhotoReader(len(photos), size, lambda photo: change(photo, photos[photo]))
+    return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
+
+
+def keep_photos(photos: Photos) -> Photos:
+    """The photos in memory, for what uses them more than once."""
+    return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
 def decode_image(path: Path, size: Size) -> np.ndarray:
@@ -71,14 +108,25 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
 
 def as_floats(images: Photos) -> np.ndarray:
     """``[c,h,w,3]`` float32 in [0, 1] from c uint8 images of one size."""
-    out = np.empty((len(images), *images[0].shape), np.float32)
+    width, height = photo_size(images)
+    out = np.empty((len(images), height, width, 3), np.float32)
     parallel_map(lambda i: np.multiply(images[i], np.float32(1 / 255), out=out[i]), range(len(images)))
     return out
 
 
+@overload
+def photo_size(photos: Photos) -> Size: ...
+
+
+@overload
+def photo_size(photos: Photos | None) -> Size | None: ...
+
+
 def photo_size(photos: Photos | None) -> Size | None:
     """(width, height) of the photos; None without any."""
-    return None if photos is None else (photos[0].shape[1], photos[0].shape[0])
+    if photos is None or isinstance(photos, PhotoReader):
+        return None if photos is None else photos.size
+    return photos[0].shape[1], photos[0].shape[0]
 
 
 def same_shape(one: Size, other: Size) -> bool:
@@ -267,17 +315,17 @@ class PhotoTransform:
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
         return replace(cameras, Ks=np.array(matrix) @ cameras.Ks, width=self.width, height=self.height)
 
-    def photos(self, images: Photos) -> list[np.ndarray]:
+    def photos(self, images: Photos) -> Photos:
         """The results for c uint8 photos ``[h,w,3]``."""
 
-        def one(image: np.ndarray) -> np.ndarray:
+        def one(_: int, image: np.ndarray) -> np.ndarray:
             height, width = image.shape[:2]
             size = round(width * self.scale_x), round(height * self.scale_y)
             shrinks = size[0] * size[1] < width * height
             whole = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
             return np.ascontiguousarray(whole[self.top : self.top + self.height, self.left : self.left + self.width])
 
-        return parallel_map(one, list(images))
+        return change_photos(images, (self.width, self.height), one)
 
 
 def resize_to(size: Size, to: Size) -> PhotoTransform:

@@ -25,6 +25,7 @@ from gsmerge.io.photos import (
     decode_images,
     find_image,
     image_size,
+    keep_photos,
     list_images,
     match_images,
     photo_size,
@@ -157,7 +158,7 @@ def limit_photo_size(
     if not unaligned and (_FLOAT_PIXEL * pixels <= _MAX_BYTES or 2 * rows > pixels):
         return photos, []
     transform, notes = _limit(size, max_side)
-    return photos if transform is None else transform.photos(photos), notes
+    return photos if transform is None else keep_photos(transform.photos(photos)), notes
 
 
 def limit_view_size(
@@ -167,7 +168,8 @@ def limit_view_size(
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
         cameras = transform.cameras(cameras)
-        images = None if images is None else np.stack(transform.photos(images))
+        smaller = None if images is None else transform.photos(images)
+        images = None if smaller is None else np.stack([smaller[view] for view in range(len(smaller))])
     return cameras, images, notes
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-TOKENS = 16384  # tokens of one table: a few megabytes of activations, which stay in a processor's cache
+TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a processor's cache
 
 
 def split_tables(sizes: np.ndarray, max_width: int) -> Iterator[tuple[np.ndarray, int]]:

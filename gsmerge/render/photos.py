@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -38,6 +38,13 @@ class Photos:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def __getitem__(self, views: Sequence[int]) -> Photos:
+        """The photos of some views; of all, in order, without a copy."""
+        ids = list(views)
+        if ids == list(range(len(self))):
+            return self
+        return replace(self, images=self.images[ids], viewmats=self.viewmats[ids], Ks=self.Ks[ids])
 
     @property
     def height(self) -> int:

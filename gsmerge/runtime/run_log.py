@@ -11,7 +11,8 @@ from typing import Any
 from gsmerge.runtime.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
-RELEASED = ("encode", "robust", "fit")  # stages that leave much behind that was freed in other threads
+# stages that leave much behind that was freed in other threads
+RELEASED = ("encode", "robust", "match", "refine", "close", "choose", "fit")
 STAGES = (
     "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "close",
     "cover", "decode", "choose", "join", "fit", "score", "input",

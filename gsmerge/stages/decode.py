@@ -12,7 +12,7 @@ from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, Rule, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.merge import MergedViews
-from gsmerge.types import FeatureGaussians, Gaussians
+from gsmerge.types import FeatureGaussians, Gaussians, as_array
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -179,7 +179,7 @@ def deal_visible(
         extra += missing
     if len(gaussians) <= total:
         return gaussians
-    most_opaque = np.argsort(-gaussians.opacities, kind="stable")[:total]  # the last few may be faint
+    most_opaque = np.argsort(-as_array(gaussians.opacities), kind="stable")[:total]  # the last few may be faint
     return gaussians[np.sort(most_opaque)]
 
 

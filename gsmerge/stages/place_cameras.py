@@ -75,7 +75,7 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = _sampled(gaussians)
+    sample = sampled(gaussians)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.linalg.norm(half)))
@@ -88,9 +88,9 @@ def _lens(size: int) -> np.ndarray:
     return np.array([[size / FIELD, 0, size / 2], [0, size / FIELD, size / 2], [0, 0, 1]])
 
 
-def _sampled(gaussians: Gaussians) -> Gaussians:
-    """Every so many-th Gaussian, larger so that they cover what all did."""
-    step = -(-len(gaussians) // SAMPLES)
+def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
+    """Every so many-th Gaussian, at most ``count``, larger so that they cover what all did."""
+    step = max(1, -(-len(gaussians) // count))
     few = gaussians[::step]
     return Gaussians(few.means, few.quats, few.scales * step**0.5, few.opacities, few.sh0, few.shN)
 

@@ -21,6 +21,7 @@ from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.assign import ContributionOptions, split_unseen
+from gsmerge.stages.check_photos import leave_out_photos
 from gsmerge.stages.group import CountLimits, count_limits, with_tree
 from gsmerge.stages.place_cameras import add_pictures, add_views
 from gsmerge.stages.region_tree import RegionTree
@@ -142,6 +143,7 @@ class PreparedScene:
         checkpoint: Networks that correct the analytic stages; None: those alone.
         tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
         hidden: Gaussians in place of those that no view sees, canonical; None without any.
+        photo_views: Views whose photos a fit may use, see :mod:`gsmerge.stages.check_photos`.
     """
 
     given: PixelScene | UnalignedScene
@@ -155,6 +157,14 @@ class PreparedScene:
     checkpoint: Checkpoint | None
     tree: RegionTree | None
     hidden: Gaussians | None
+    photo_views: tuple[int, ...]
+
+    def scored_views(self) -> list[int]:
+        """The given views that the photos are scored in: those whose photos show the scene."""
+        views = scored_views(len(self.given))
+        if len(self.given) != len(self.scene):  # repeated ones were left out, and numbers differ
+            return views
+        return [view for view in views if view in self.photo_views] or views
 
     def candidates(self, members: Members) -> list[NetworkContext | None]:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
@@ -195,10 +205,12 @@ def prepare(
         canonical: PixelScene | UnalignedScene
         members, hidden = None, None
         if isinstance(own, PixelScene):
-            canonical, frame = canonicalise(own, frame)
-            members = scene_members(canonical)
+            aligned_scene, frame = canonicalise(own, frame)
+            canonical, options, shown = leave_out_photos(aligned_scene, options, log)
+            members = scene_members(aligned_scene)
         else:
             unaligned, frame = canonicalise(add_views(own, log), frame)
+            unaligned, options, shown = leave_out_photos(unaligned, options, log)
             unaligned, options, hidden = split_unseen(unaligned, options, log)
             canonical = add_pictures(unaligned, log)
         photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
@@ -208,7 +220,7 @@ def prepare(
         log.notes += [*notes, *([f"the input views are scored on {scored} of {len(scene)}"] * (scored < len(scene)))]
         limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
     prepared = PreparedScene(
-        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden
+        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown
     )
     if settings.method != "gsmerge" or not (options.needs_tree or limits.count is not None):
         return prepared

@@ -10,8 +10,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import COEFFICIENTS, CameraFile, Lens, sizes_of, to_cameras
-from gsmerge.io.photos import Photos, Size, photo_size, same_shape
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.io.photos import Photos, Size, change_photos, photo_size, same_shape
 
 _MIN_SHARE = (
     0.25  # of an undistorted photo's pixels that lie within the photo: at half of the image's diagonal r, a lens
@@ -49,21 +48,21 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
     return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
 
 
-def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> list[np.ndarray]:
+def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> Photos:
     """The photos that pinholes with the same intrinsics would have taken; where one shows nothing, its border is
     repeated.
 
     ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).
     """
 
-    def one(item: tuple[np.ndarray, np.ndarray, Lens | None]) -> np.ndarray:
-        photo, K, lens = item
+    def one(view: int, photo: np.ndarray) -> np.ndarray:
+        lens = lenses[view]
         if lens is None:
             return photo
-        maps = _rectify_maps(K, lens, (photo.shape[1], photo.shape[0]))
+        maps = _rectify_maps(Ks[view], lens, (photo.shape[1], photo.shape[0]))
         return cv2.remap(photo, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    return parallel_map(one, list(zip(photos, Ks, lenses, strict=True)))
+    return change_photos(photos, photo_size(photos), one)
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,7 @@ from gsmerge.io.formats.ply_file import (
     color_columns,
     layout_name,
     open_ply,
-    release_block,
+    open_rows,
     sh_degree,
     spread_low_degree,
 )
@@ -164,7 +164,8 @@ def _to_scene(path: Path, stored: StoredRows, opacity: OpacityChoice) -> PlyScen
     names = tuple(rows.dtype.names or ())
     num_rest = _num_rest(path, names)
     out = _allocate(rows, num_rest // 3)
-    num_clipped, num_zero_quats = _convert_all(stored.rows, out)
+    with open_rows(path, stored.rows) as read:
+        num_clipped, num_zero_quats = _convert_all(rows, read, out)
     known = opacity if opacity != "auto" else stored.encoding
     encoding = known or _likely_encoding(out["opacities"])
     _activate(out["opacities"], out["valid"], encoding)
@@ -235,16 +236,13 @@ def _allocate(rows: np.ndarray, num_higher: int) -> dict[str, np.ndarray]:
     return out | {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
 
 
-def _convert_all(stored: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
+def _convert_all(rows: np.ndarray, read: Callable[[slice], np.ndarray], out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill the arrays block by block, in parallel; how many rows were clipped, and had no rotation."""
-    rows = np.asarray(stored)
     size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
 
     def convert(start: int) -> tuple[int, int]:
         block = slice(start, min(start + size, len(rows)))
-        counts = _convert(rows[block], {name: column[block] for name, column in out.items()})
-        release_block(stored, block)
-        return counts
+        return _convert(read(block), {name: column[block] for name, column in out.items()})
 
     counts = parallel_map(convert, range(0, len(rows), size))
     return sum(clipped for clipped, _ in counts), sum(zero for _, zero in counts)

@@ -5,10 +5,12 @@ Log scales, logits and channel-major harmonics exist only in what reads and writ
 
 from __future__ import annotations
 
-import mmap
 import re
+import threading
 import warnings
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
 from typing import IO, Any
@@ -45,7 +47,8 @@ _SIZES = {
 
 
 def open_ply(path: Path) -> PlyData:
-    """A PLY file, mapped into memory where it is binary. SceneError if it is no PLY file, is truncated or damaged, or
+    """A PLY file, whose vertices are mapped into memory where they are binary and not packed: :func:`open_rows` reads
+    them. SceneError if it is no PLY file, is truncated or damaged, or
     its header asks for more than it holds.
     """
     size = check_file(path)
@@ -58,7 +61,12 @@ def open_ply(path: Path) -> PlyData:
         end, text = _check_header(path, start, size)
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
-            return PlyData.read(file, mmap="r")
+            data = PlyData.read(file, mmap="r")
+        for element in data.elements:
+            if isinstance(element.data, np.memmap) and (element.name != "vertex" or "chunk" in data):
+                with open_rows(path, element.data) as read:  # small, or packed
+                    element.data = read(slice(None))
+        return data
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
     except PlyElementParseError as error:
@@ -98,15 +106,30 @@ class _BinaryRows(BufferedReader):
         return bytes(byte if byte < 128 else ord("?") for byte in data)
 
 
-def release_block(rows: np.ndarray, block: slice) -> None:
-    """Drop a block of rows of a mapped file from the process's memory; used again, it is read again."""
-    mapped = getattr(rows, "_mmap", None)
-    if not isinstance(rows, np.memmap) or mapped is None or not hasattr(mmap, "MADV_DONTNEED"):
+@contextmanager
+def open_rows(path: Path, rows: np.ndarray) -> Iterator[Callable[[slice], np.ndarray]]:
+    """A function that gives blocks of a PLY file's rows; those of a mapped file are read, also by several threads.
+
+    Mapped pages of a file that shrinks would end the process; reading it is a SceneError.
+    """
+    if not isinstance(rows, np.memmap):
+        yield rows.__getitem__
         return
-    before = rows.offset % mmap.ALLOCATIONGRANULARITY
-    start, end = (before + row * rows.dtype.itemsize for row in (block.start, block.stop))
-    start -= start % mmap.PAGESIZE
-    mapped.madvise(mmap.MADV_DONTNEED, start, end - start)
+    lock = threading.Lock()
+    with path.open("rb") as file:
+
+        def read(block: slice) -> np.ndarray:
+            start, stop, _ = block.indices(len(rows))
+            out = np.empty(stop - start, rows.dtype)
+            with lock:
+                file.seek(rows.offset + start * rows.dtype.itemsize)
+                num_bytes = file.readinto(out.view(np.uint8).data)
+            if num_bytes < out.nbytes:
+                whole = start + num_bytes // rows.dtype.itemsize
+                raise _truncated(path, f"{len(rows)} rows", whole, "it became shorter while it was read")
+            return out
+
+        yield read
 
 
 def header_counts(path: Path) -> tuple[int, int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -16,18 +18,22 @@ MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
 ALIKE = 0.01  # of the scale: the rounding of sizes
 
 
-def fit_photos(scene: PixelScene | UnalignedScene, options: FitOptions, log: RunLog) -> tuple[Photos, ...]:
+def fit_photos(
+    scene: PixelScene | UnalignedScene, options: FitOptions, log: RunLog, views: Sequence[int] | None = None
+) -> tuple[Photos, ...]:
     """The photos at full and at half size, and at the scale of the options where they look at larger ones.
 
-    The log's choices get ``photo_scale`` where it is not 1, its notes what differs from what was asked for.
+    Those of ``views``, None: of all. The log's choices get ``photo_scale`` where it is not 1, its notes what differs
+    from what was asked for.
     """
-    photos = scene_photos(scene), scene_photos(scene, 2)
+    views = range(len(scene)) if views is None else views
+    photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
     scale, problem = photo_scale(scene, options)
     if problem is not None:
         log.notes.append(problem)
     if scale == 1:
         return photos
-    large = large_photos(scene, scale)
+    large = large_photos(scene, scale)[views]
     size = f"{large.width} x {large.height}"
     log.choices["photo_scale"] = round(scale, 4)
     log.notes.append(

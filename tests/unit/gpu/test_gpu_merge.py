@@ -22,7 +22,7 @@ from gsmerge.moments import Members, feature_to_gaussians, scene_members
 from gsmerge.moments import principal_axes as axes_of
 from gsmerge.networks.neighbors import nearest_of_other_views
 from gsmerge.stages import encode as encode_stage
-from gsmerge.stages.decode import DecodeOptions, decode, split_counts
+from gsmerge.stages.decode import DecodeOptions, deal_order, deal_visible, decode, split_counts
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.stages.match import MatchOptions, match
 from gsmerge.stages.merge import merge
@@ -187,6 +187,21 @@ def test_more_gaussians_go_where_the_stage_spends_them(merged: FeatureGaussians,
         np.testing.assert_array_equal(gpu_decode.split_counts(*device, extra), split_counts(merged, members, extra))
     count = len(merged) + 40
     assert len(gpu_decode.decode(*device, DecodeOptions(min_opacity=0), count)) == count
+
+
+@pytest.mark.parametrize("extra", [1, 40])
+def test_faint_gaussians_make_way_for_others(merged: FeatureGaussians, members: Members, extra: int) -> None:
+    """An exact number is met, as the stage meets it; a tenth is below the least opacity at first."""
+    device, count = (upload(merged), upload_members(members, CPU)), len(merged) + extra
+    faint = float(np.quantile(feature_to_gaussians(merged).opacities, 0.1))
+    few = gpu_decode.decode(*device, DecodeOptions(min_opacity=faint), count)
+    exact = gpu_decode.decode(*device, DecodeOptions(min_opacity=faint), count, exact=True)
+    assert len(few) < len(exact) == count
+    order = deal_order(merged, members)
+    np.testing.assert_array_equal(gpu_decode.deal_order(*device), order)
+    every = DecodeOptions(min_opacity=0)
+    expected = deal_visible(order, len(merged), count, faint, lambda counts: decode(merged, members, every, counts))
+    np.testing.assert_allclose(exact.opacities, expected.opacities, rtol=1e-4, atol=1e-6)
 
 
 def test_members_that_are_alike_are_not_divided(merged: FeatureGaussians, members: Members) -> None:

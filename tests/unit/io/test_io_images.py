@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 
 import cv2
@@ -8,8 +9,9 @@ import pytest
 from tiny_scene import Tiny, write_images
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_images
+from gsmerge.io import photos, read_images
 from gsmerge.io.photos import match_images, natural_key
+from gsmerge.runtime.threads import use_threads
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -109,3 +111,43 @@ def test_grey_and_transparent_images_become_rgb(tmp_path: Path) -> None:
 def test_numbers_sort_as_numbers() -> None:
     names = ["view 10", "view 2", "a/1", "3", "view 2b"]
     assert sorted(names, key=natural_key) == ["3", "a/1", "view 2", "view 2b", "view 10"]
+
+
+def test_many_large_photos_are_decoded_one_by_one(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those in memory, in every way that photos are used; few at a time."""
+    write_images(tmp_path, tiny)
+    kept = photos.decode_images(photos.match_images(tmp_path, tiny.names))
+    monkeypatch.setattr(photos, "_AT_ONCE", 0)
+    held, most = [0], [0]
+
+    def decode(path: Path, size: tuple[int, int]) -> np.ndarray:
+        image = decode_image(path, size)
+        held[0] += 1
+        most[0] = max(most[0], held[0])
+        weakref.finalize(image, lambda: held.__setitem__(0, held[0] - 1))
+        return image
+
+    decode_image = photos.decode_image
+    monkeypatch.setattr(photos, "decode_image", decode)
+    read = photos.decode_images(photos.match_images(tmp_path, tiny.names))
+    assert isinstance(read, photos.PhotoReader)
+    with use_threads(1):
+        np.testing.assert_array_equal(photos.as_floats(read), photos.as_floats(kept))
+        assert photos.photo_size(read) == photos.photo_size(kept)
+        smaller = photos.resize_to(photos.photo_size(read), (4, 3))
+        expected = smaller.photos(kept)
+        for actual in (smaller.photos(read), photos.keep_photos(smaller.photos(read))):
+            assert photos.photo_size(actual) == (4, 3)
+            np.testing.assert_array_equal(photos.as_floats(actual), photos.as_floats(expected))
+    assert most[0] <= 2
+    with pytest.raises(IndexError):
+        read[len(tiny.names)]
+
+
+def test_a_damaged_photo_among_many_large_ones(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(photos, "_AT_ONCE", 0)
+    write_images(tmp_path, tiny)
+    path = photos.match_images(tmp_path, tiny.names)[-1]
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(SceneError, match="cannot be decoded"):
+        read_images(tmp_path, tiny.names)

@@ -1,14 +1,16 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_ply, write_ply
-from gsmerge.io.formats.ply_file import header_counts, open_ply, release_block
+from gsmerge.io import read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.ply_file import header_counts, open_ply, open_rows
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Gaussians
 
@@ -277,26 +279,45 @@ def test_harmonics_with_a_gap_are_refused(tmp_path: Path) -> None:
         read_ply(save(tmp_path / "a.ply", columns(names=names)))
 
 
-def test_rows_that_were_let_go_are_still_there(tmp_path: Path) -> None:
-    """Only the process's pages are dropped; other rows of the same page are read again, and so are these."""
-    rows = columns(20_000)
-    stored = open_ply(save(tmp_path / "a.ply", rows))["vertex"].data
+@pytest.mark.parametrize("packed", [False, True], ids=["plain", "packed"])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
+def test_a_file_that_shrinks_while_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, packed: bool
+) -> None:
+    """One line, not the signal that reading mapped pages beyond the end would be."""
+    path = tmp_path / ("a.compressed.ply" if packed else "a.ply")
+    if packed:
+        write_gaussians(path, read_ply(save(tmp_path / "b.ply", columns(20_000))).gaussians)
+    else:
+        save(path, columns(20_000))
+    size, parse = path.stat().st_size, PlyData.read
+
+    def parse_then_cut(*arguments: Any, **settings: Any) -> PlyData:
+        data = parse(*arguments, **settings)
+        os.truncate(path, round(share * size))
+        return data
+
+    monkeypatch.setattr(PlyData, "read", parse_then_cut)
+    with pytest.raises(SceneError, match="it became shorter while it was read"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("block", [slice(0, 7), slice(7, 12_345), slice(12_345, 20_000), slice(None)], ids=str)
+def test_rows_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
+    rows, path = columns(20_000), tmp_path / "a.ply"
+    stored = open_ply(save(path, rows))["vertex"].data
     assert isinstance(stored, np.memmap)
-    for block in (slice(0, 7), slice(7, 12_345), slice(12_345, 20_000)):
-        release_block(stored, block)
-    assert np.array_equal(np.asarray(stored), rows)
-    release_block(rows, slice(0, 5))  # of no file: nothing to do
-    assert (rows["x"] != 0).any()
+    for some in (stored, rows):  # of no file: as they are
+        with open_rows(path, some) as read:
+            np.testing.assert_array_equal(read(block), rows[block])
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux")
 def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
-    stored = open_ply(save(tmp_path / "large.ply", columns(100_000)))["vertex"].data
-    assert float(np.asarray(stored)["x"].sum()) != 0
-    before = resident(stored.filename)
-    for first in range(0, len(stored), 9000):
-        release_block(stored, slice(first, min(first + 9000, len(stored))))
-    assert before > 0.9 * stored.nbytes
+    path = save(tmp_path / "large.ply", columns(100_000))
+    stored = open_ply(path)["vertex"].data
+    with open_rows(path, stored) as read:
+        assert float(read(slice(None))["x"].sum()) != 0
     assert resident(stored.filename) < 0.1 * stored.nbytes
 
 

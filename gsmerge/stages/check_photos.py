@@ -1,0 +1,152 @@
+"""scene -> the same without the photos that do not show it: black, of another scene, or of another view.
+
+A photo is compared with what the Gaussians show from its camera by the correlation of the gradients of small pictures,
+which no exposure changes, and with what they show from the other cameras: a photo that fits another one much better was
+mistaken for it. Of Gaussians that belong to pixels the colours of a view's own are compared, because those show the
+view whatever their depths are; the others are drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.render import render
+from gsmerge.render.photos import photo_errors, photos_of
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.place_cameras import sampled
+from gsmerge.types import PixelScene, UnalignedScene
+
+if TYPE_CHECKING:
+    from gsmerge.options import CompactOptions
+
+Scene = TypeVar("Scene", PixelScene, UnalignedScene)
+
+# On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.13 to 0.8 with drawings; noise mostly
+# stays below 0.06, photos of other views below 0.3.
+SIDE = 48  # pixels of the longer side
+SAMPLES = 1 << 17  # Gaussians that are drawn
+MIN_PIXELS = 64  # of a small picture
+FLAT = 1 / 255  # root mean square of a view's gradients, sRGB: below it a view shows nothing to go by
+LEAST, LEAST_DRAWN = 0.25, 0.06  # correlation of a photo that shows the scene
+SHARE = 0.25  # the same, as a share of the median of all photos
+GAIN = 0.4  # of the inverse hyperbolic tangent of the correlation: more with another view, and the photo is of that one
+CLOSEST = 0.995  # correlation above which photos are equally good
+NAMED = 4  # views that the note names
+
+
+def leave_out_photos(
+    scene: Scene, options: CompactOptions, log: RunLog
+) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
+    """The scene without the photos that do not show it, whose place the Gaussians' own colours take.
+
+    Where they are most, there are no photos and no fit. The log gets a note and the choice ``photos_left_out``.
+
+    Args:
+        scene: Canonical.
+        options: Of all stages.
+        log: Takes the note.
+
+    Returns:
+        The scene, the options, and the views whose photos a fit may use.
+    """
+    views = tuple(range(len(scene)))
+    odd = [] if scene.images is None else odd_photos(scene)
+    if not odd or scene.images is None:
+        return scene, options, views
+    names = [scene.names[view] for view in odd]
+    log.choices["photos_left_out"] = names
+    more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
+    which = ", ".join(names[:NAMED]) + more
+    problem = f"{len(odd)} of {len(views)} photos do not show what the Gaussians show"
+    if 2 * len(odd) > len(views):
+        log.notes.append(f"{problem}, so none is used and nothing is fitted: {which}; check their names and order")
+        return (
+            replace(scene, images=None, large_photos=None),
+            replace(options, fit=replace(options.fit, fit="none")),
+            views,
+        )
+    log.notes.append(f"{problem} and are not used: {which}")
+    images = scene.images.copy()
+    images[odd] = _own_pictures(scene, odd)
+    return replace(scene, images=images), options, tuple(view for view in views if view not in odd)
+
+
+def odd_photos(scene: PixelScene | UnalignedScene) -> list[int]:
+    """The views of a canonical scene whose photos do not show it, as far as the Gaussians can tell."""
+    assert scene.images is not None
+    least = LEAST if isinstance(scene, PixelScene) else LEAST_DRAWN
+    level = max(scene.cameras.width, scene.cameras.height) / SIDE
+    if min(scene.images.shape[1:3]) < 2 or scene.pixels_per_view / max(level, 1) ** 2 < MIN_PIXELS:
+        return []
+    scores, judged = gradient_correlations(scene, max(level, 1.0))
+    own, others = np.diag(scores).copy(), np.arctanh(scores.clip(-CLOSEST, CLOSEST))
+    fits = np.diag(others).copy()
+    np.fill_diagonal(others, -np.inf)
+    others[~judged] = -np.inf
+    gains = np.maximum(others.max(0), others.max(1)) - fits
+    if judged.any():
+        least = max(least, SHARE * float(np.median(own[judged])))
+    return np.flatnonzero(judged & ((own < least) | (gains > GAIN))).tolist()
+
+
+def gradient_correlations(scene: PixelScene | UnalignedScene, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """``[v,v]`` float64: how much alike view i, as the Gaussians show it, and photo j are, -1 to 1.
+
+    Args:
+        scene: With photos.
+        level: The pictures' sides are divided by it.
+
+    Returns:
+        The correlations, and a mask ``[v]`` of the views that show enough to go by.
+    """
+    assert scene.images is not None
+    photos = photos_of(scene.images, scene.cameras, level)
+    if isinstance(scene, PixelScene):
+        shape, size = scene.valid.shape, (photos.width, photos.height)
+        colors = scene.gaussians.sh0.reshape(*shape, 3)
+        weights = np.where(scene.valid, scene.gaussians.opacities.reshape(shape), 0).astype(np.float32)
+
+        def shrink(view: int) -> tuple[np.ndarray, np.ndarray]:
+            color, weight = (np.ascontiguousarray(some[view], np.float32) for some in (colors, weights))
+            small = cv2.resize(sh0_to_rgb(color), size, interpolation=cv2.INTER_AREA)
+            return small, cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+
+        shown = parallel_map(shrink, range(len(scene)))
+    else:
+        few = sampled(scene.gaussians, SAMPLES)
+        shown = photo_errors(few, photos, lambda _, image, left: (image.clip(0, 1), 1 - left))
+    a = np.stack([_gradients(image) for image, _ in shown])
+    b = np.stack([_gradients(image) for image in photos.images])
+    w = np.stack([_gradient_weights(weight) for _, weight in shown])
+    weighted, squares = w * a, (w * a * a).sum(1)
+    sizes = squares[:, None] * (w @ (b * b).T)
+    scores = np.divide(weighted @ b.T, np.sqrt(sizes), out=np.zeros_like(sizes), where=sizes > 0)
+    return scores, squares > FLAT**2 * w.sum(1).clip(1e-9)
+
+
+def _gradients(image: np.ndarray) -> np.ndarray:
+    """``[2·(h-1)·(w-1)]`` float64 differences of an image's grey to the right and down."""
+    grey = image.mean(-1, dtype=np.float64)
+    return np.concatenate([np.diff(grey, axis=1)[:-1].ravel(), np.diff(grey, axis=0)[:, :-1].ravel()])
+
+
+def _gradient_weights(weight: np.ndarray) -> np.ndarray:
+    """The weights of :func:`_gradients` from those of pixels ``[h,w]``."""
+    both = (weight[:-1, :-1] * weight[:-1, 1:] * weight[1:, :-1]).astype(np.float64).ravel()
+    return np.concatenate([both, both])
+
+
+def _own_pictures(scene: PixelScene | UnalignedScene, views: list[int]) -> np.ndarray:
+    """``[n,h,w,3]`` some views of a scene in the colours of its Gaussians."""
+    if isinstance(scene, UnalignedScene):
+        return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
+    size = scene.pixels_per_view
+    colors = [scene.gaussians.sh0[view * size : (view + 1) * size, 0] for view in views]
+    shape = (len(views), scene.cameras.height, scene.cameras.width, 3)
+    return sh0_to_rgb(np.stack(colors)).clip(0, 1).reshape(shape)

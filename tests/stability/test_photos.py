@@ -1,0 +1,190 @@
+"""Photos that do not show the scene: black, noise, of another scene, of another view (method reference, case 56)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import CompactResult, Gaussians, PixelScene, UnalignedScene, compact
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.check_photos import odd_photos
+from gsmerge.stages.fit import FitOptions, fit_photos
+
+Photos = np.ndarray
+VIEWS = 6
+FIT = {"superpixels": 100, "fit_steps": 40, "checkpoint": "none"}
+
+
+def swapped(photos: Photos) -> Photos:
+    return photos[[0, 4, 2, 3, 1, 5]]
+
+
+def one_black(photos: Photos) -> Photos:
+    return np.where(np.arange(VIEWS)[:, None, None, None] == 3, np.float32(0), photos)
+
+
+def all_black(photos: Photos) -> Photos:
+    return np.zeros_like(photos)
+
+
+def all_noise(photos: Photos) -> Photos:
+    return np.random.default_rng(0).random(photos.shape, np.float32)
+
+
+def moved_on(photos: Photos) -> Photos:
+    return np.roll(photos, 3, 0)
+
+
+def another_scene(photos: Photos) -> Photos:
+    other = scenes.make_scene(scenes.wall(9), scenes.arc(VIEWS, 96, 72)).images
+    assert other is not None
+    return other
+
+
+SPOILT = [
+    (swapped, [1, 4]),
+    (one_black, [3]),
+    (all_black, list(range(VIEWS))),
+    (all_noise, list(range(VIEWS))),
+    (moved_on, list(range(VIEWS))),
+    (another_scene, list(range(VIEWS))),
+]
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, 96, 72), noise=0.005)
+
+
+@pytest.fixture(scope="module")
+def unspoilt(room: PixelScene) -> CompactResult:
+    return compact(room, **FIT)
+
+
+def with_photos(room: PixelScene, change: Callable[[Photos], Photos], *, aligned: bool = True) -> Any:
+    assert room.images is not None
+    scene = replace(room, images=change(room.images))
+    return scene if aligned else UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+
+
+def novel_psnr(gaussians: Gaussians) -> float:
+    """PSNR (dB) between the views."""
+    camera = scenes.arc(1, 96, 72, start=-0.2)
+    truth = scenes.trace(scenes.room(), camera)[2].reshape(72, 96, 3)
+    image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
+    return float(-10 * np.log10(((image - truth) ** 2).mean()))
+
+
+@pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
+@pytest.mark.parametrize(("change", "odd"), SPOILT, ids=lambda case: getattr(case, "__name__", None))
+def test_they_are_found(room: PixelScene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool) -> None:
+    assert odd_photos(with_photos(room, change, aligned=aligned)) == odd
+
+
+def darker(photos: Photos) -> Photos:
+    return photos * np.linspace(0.05, 1, VIEWS, dtype=np.float32)[:, None, None, None]
+
+
+def overexposed(photos: Photos) -> Photos:
+    return (photos * np.linspace(1, 2, VIEWS, dtype=np.float32)[:, None, None, None]).clip(0, 1)
+
+
+def tinted(photos: Photos) -> Photos:
+    gains = np.random.default_rng(0).uniform(0.3, 1, (VIEWS, 1, 1, 3)).astype(np.float32)
+    return gains * np.sqrt(photos)
+
+
+def shifted(photos: Photos) -> Photos:
+    """By a pixel, as where the cameras are not exact."""
+    return np.roll(photos, 1, 2)
+
+
+@pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
+@pytest.mark.parametrize("change", [lambda photos: photos, darker, overexposed, tinted, shifted])
+def test_right_ones_stay(room: PixelScene, change: Callable[[Photos], Photos], aligned: bool) -> None:
+    assert odd_photos(with_photos(room, change, aligned=aligned)) == []
+
+
+@pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
+def test_gaussians_that_show_nothing_cannot_tell(room: PixelScene, aligned: bool) -> None:
+    flat = replace(room, gaussians=replace(room.gaussians, sh0=np.zeros_like(room.gaussians.sh0)))
+    if aligned:  # drawn, edges and gaps show
+        assert odd_photos(with_photos(flat, all_noise, aligned=aligned)) == []
+    tiny = scenes.make_scene(scenes.room(), scenes.arc(2, 6, 4))
+    assert odd_photos(with_photos(tiny, np.zeros_like, aligned=aligned)) == []
+
+
+def test_a_view_given_twice_is_no_swap(room: PixelScene) -> None:
+    assert odd_photos(scenes.take_views(room, [0, 1, 1, 2, 3])) == []
+
+
+@pytest.mark.parametrize("change", [swapped, one_black])
+def test_the_fit_does_without_some(
+    room: PixelScene, unspoilt: CompactResult, change: Callable[[Photos], Photos]
+) -> None:
+    """Nearly as good as with all photos, and as the input; the note and the report name them."""
+    odd = dict(SPOILT)[change]
+    result = compact(with_photos(room, change), **FIT)
+    names = [room.names[view] for view in odd]
+    note = f"{len(odd)} of {VIEWS} photos do not show what the Gaussians show and are not used: {', '.join(names)}"
+    assert note in result.report.notes
+    assert result.report.choices["photos_left_out"] == names
+    assert result.report.choices["fit"]["accepted"]
+    assert novel_psnr(result.gaussians) > novel_psnr(unspoilt.gaussians) - 1
+    assert result.report.psnr_after == pytest.approx(unspoilt.report.psnr_after, abs=1)
+
+
+@pytest.mark.parametrize("change", [all_black, all_noise, moved_on, another_scene])
+@pytest.mark.parametrize("settings", [{}, {"budget": 500}, {"budget": "auto"}, {"fit": "color"}], ids=str)
+def test_no_fit_where_most_are_wrong(
+    room: PixelScene, change: Callable[[Photos], Photos], settings: dict[str, Any]
+) -> None:
+    """As where there are no photos."""
+    wanted = {**FIT, **settings}
+    result, without = (compact(one, **wanted) for one in (with_photos(room, change), replace(room, images=None)))
+    note = f"{VIEWS} of {VIEWS} photos do not show what the Gaussians show, so none is used and nothing is fitted"
+    assert any(one.startswith(note) for one in result.report.notes)
+    assert "fit" not in result.report.choices
+    if settings.get("budget") == 500:
+        assert len(result.gaussians) == 500
+    else:
+        assert scenes.identical(result.gaussians, without.gaussians)
+
+
+def test_unaligned_gaussians_without_a_fit(room: PixelScene) -> None:
+    result = compact(with_photos(room, all_black, aligned=False), **FIT)
+    assert "fit" not in result.report.choices
+    assert novel_psnr(result.gaussians) > 20
+
+
+def test_an_unaligned_scene_does_without_one(room: PixelScene) -> None:
+    right, wrong = (
+        compact(with_photos(room, change, aligned=False), **FIT) for change in (lambda photos: photos, one_black)
+    )
+    assert wrong.report.choices["photos_left_out"] == [room.names[3]]
+    assert novel_psnr(wrong.gaussians) > novel_psnr(right.gaussians) - 1
+
+
+def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
+    assert unspoilt.report.notes == []
+    assert "photos_left_out" not in unspoilt.report.choices
+
+
+def test_the_views_of_a_fit(room: PixelScene) -> None:
+    full, half = fit_photos(room, FitOptions(), RunLog(), (0, 2, 5))
+    assert room.images is not None
+    np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
+    assert len(half) == 3
+    np.testing.assert_array_equal(half.viewmats, room.cameras.viewmats[[0, 2, 5]])
+
+
+def test_the_quality_asked_for_is_that_of_the_others(room: PixelScene) -> None:
+    """A black photo would keep any result from it."""
+    result = compact(with_photos(room, one_black), quality="22dB", **FIT)
+    assert result.report.unmet is None
+    assert result.report.choices["photos_left_out"] == [room.names[3]]
