@@ -23,12 +23,13 @@ from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.run_log import STAGES, Progress, RunLog
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import Build, choose_count, level_counts, search_quality
+from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.stages.assign import assign_members
 from gsmerge.stages.backing import encode_backing
 from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
 from gsmerge.stages.clean import clean, make_clean
 from gsmerge.stages.decode import MIXED, decode_merged
-from gsmerge.stages.encode import encode, weaken_contradicted
+from gsmerge.stages.encode import encode
 from gsmerge.stages.fit import fit, fit_photos
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
@@ -189,7 +190,7 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
                 photos, aligned = scene_photos(scene, 2), isinstance(scene, PixelScene)
                 robust = choose_merge(features, coarse, photos, options.robust, leave_out=aligned)
                 features = robust.features
-        elif networks is None and options.encode.agreement and options.fit.grows:
+        elif networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
             features = weaken_contradicted(features, members, scene.cameras)
         with log.stage("match"):
             matches = match(features, options.match, networks)

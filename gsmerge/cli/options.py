@@ -225,7 +225,7 @@ def parse_photo_scale(text: str) -> float | str:
 
 
 def parse_superpixels(text: str) -> int | str:
-    """``--superpixels``: a number, or a share."""
+    """``--superpixels``: a number, a share, or auto."""
     return int(text) if text.isdigit() else text
 
 
@@ -274,8 +274,9 @@ _TABLE = (
         option("k_high", float, "Percentile of saliency above which a mixed k is 4.", wording="85.0", rare=True),
         option("k_rule", ("saliency", "distortion"), "What a mixed k goes by: the corner response of the photos, or "
                "as many Gaussians where they lower distortion most.", wording="saliency", rare=True),
-        option("superpixels", str, "Superpixels per view: a number such as 3000, or a share of its pixels.",
-               wording="4.4%", parser=parse_superpixels, metavar="NUMBER|SHARE"),
+        option("superpixels", str, "Superpixels per view: a number such as 3000, a share of its pixels, or auto: 1.5 "
+               "to 8 %, the more the better the depths of the views agree.", wording="4.4%", parser=parse_superpixels,
+               metavar="NUMBER|SHARE|auto"),
         option("budget", str, "Gaussians in the result: a number, a share such as 2% of the input, or a size such as "
                "5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the scene "
                "needs.", metavar="40000|2%|5MB|DEVICE|auto"),

@@ -36,8 +36,8 @@ from gsmerge.gpu.score import photo_psnr
 from gsmerge.render.cuda import start_cuda
 from gsmerge.render.photos import NEAR, photos_of
 from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.agreement import agreement_factors
 from gsmerge.stages.decode import decode_merged
-from gsmerge.stages.encode import agreement_factors
 from gsmerge.stages.fit import fit as fit_on_cpu
 from gsmerge.stages.fit.photos import fit_photos, photo_scale
 from gsmerge.stages.fit.stage import fit_with
@@ -211,7 +211,7 @@ class DeviceScene:
         numbers = torch.where(valid, cut.labels + first[:, None, None], -1).reshape(-1)
         rows = group_rows(numbers, sum(cut.counts))
         features = encode(self.members, rows, torch.searchsorted(first, rows.groups, right=True) - 1)
-        if not (prepared.options.encode.agreement and prepared.options.fit.grows):
+        if not (prepared.options.encode.agreement and prepared.limits.share < 1):  # no long fit follows
             return features
         assert prepared.members is not None
         means, sh0, views = (tensor.cpu().numpy() for tensor in (features.means, features.sh0, features.views))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,15 +10,10 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, FeatureGaussians, Groups, PixelScene, UnalignedScene, to_float32
+from gsmerge.types import FeatureGaussians, Groups, PixelScene, UnalignedScene, to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
-
-
-# Factors on the optical depth of groups that other views see through: those at whose place no other view has its
-# surface, and those of which fewer views have it there than see through it
-ALONE, DISPUTED = 0.15, 0.39
 
 
 @dataclass(frozen=True)
@@ -70,29 +65,6 @@ def encode(
     from gsmerge.networks.apply import encode_features
 
     return encode_features(features, networks)
-
-
-def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
-    """Less optical depth for groups that other views see through.
-
-    Args:
-        features: Of single views.
-        members: The scene's Gaussians, one per pixel.
-        cameras: Its views.
-    """
-    factors = agreement_factors(features.means, features.sh0, features.views, members, cameras)
-    return replace(features, gains=features.gains * factors)
-
-
-def agreement_factors(
-    means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
-) -> np.ndarray:
-    """``[g]`` float32, at most 1: factors of :func:`weaken_contradicted`; arguments as of ``cross_view_stats``."""
-    from gsmerge.networks.cross_view_stats import cross_view_stats
-
-    _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
-    disputed = np.where(same > 0, DISPUTED, ALONE)
-    return np.where(behind > same, disputed, 1).astype(np.float32)
 
 
 def member_rows(

@@ -20,6 +20,7 @@ from gsmerge.moments import Members, scene_members
 from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.stages.agreement import choose_superpixels
 from gsmerge.stages.assign import ContributionOptions, split_unseen
 from gsmerge.stages.check_photos import leave_out_photos
 from gsmerge.stages.group import CountLimits, count_limits, with_tree
@@ -218,6 +219,7 @@ def prepare(
         checkpoint, notes = find_networks(name, options)
         scored = len(scored_views(len(scene))) if scene.images is not None else len(scene)
         log.notes += [*notes, *([f"the input views are scored on {scored} of {len(scene)}"] * (scored < len(scene)))]
+        options = choose_superpixels(canonical, members, options, log)
         limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
     prepared = PreparedScene(
         scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown

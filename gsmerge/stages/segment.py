@@ -38,6 +38,7 @@ RANGE_SLACK = 1e-3  # colours may leave [0, 1] by this much, as resampled pictur
 MAX_FACTOR = 4  # most times more or fewer superpixels than bass-adaptive starts with
 
 SHARE = "4.4%"  # superpixels per pixel by default
+AUTO_SHARE = "auto"
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class SegmentOptions:
     """How to cut views into superpixels.
 
     Args:
-        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%". A share is where
-            ``bass-adaptive`` starts from.
+        superpixels: Superpixels of each view: a number, or a share of its pixels as "4.4%"; ``"auto"``: 1.5 to 8 %,
+            the more the better the depths of the views agree. A share is where ``bass-adaptive`` starts from.
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
         effort: Of ``rdseg`` only: ``draft`` or ``fast`` (the same), ``default`` or ``best``.
         compactness: Of ``rdseg`` and ``slic``'s clean-up: weight of squared pixels against squared colours in
@@ -64,7 +65,7 @@ class SegmentOptions:
     def __post_init__(self) -> None:
         if self.per_view is not None and self.per_view < 1:
             raise ValueError(f"superpixels: expected at least 1, got {self.superpixels}")
-        if self.per_view is None:
+        if self.per_view is None and self.superpixels != AUTO_SHARE:
             try:
                 parse_share(str(self.superpixels))
             except ValueError as error:
@@ -79,8 +80,10 @@ class SegmentOptions:
 
     @property
     def share(self) -> float:
-        """Superpixels per pixel; the default where a number of them is asked for."""
-        return parse_share(SHARE if self.per_view is not None else str(self.superpixels))
+        """Superpixels per pixel; the default where a number is asked for, or where the scene has yet to choose."""
+        return parse_share(
+            SHARE if self.per_view is not None or self.superpixels == AUTO_SHARE else str(self.superpixels)
+        )
 
     @property
     def adapts(self) -> bool:

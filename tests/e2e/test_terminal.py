@@ -76,8 +76,9 @@ def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
     assert code == 0
     first = next(i for i, line in enumerate(lines) if line.startswith("  Gaussians"))
     assert "".join(lines[:first]) == str(out)
-    assert [line.split()[0] for line in lines[first : first + 5]] == ["Gaussians", "file", "PSNR", "time", "next"]
-    assert "next       gsmerge view" in lines[first + 4]
+    words = [line.split()[0] for line in lines[first:] if line.startswith("  ") and line.split()[0].isalpha()]
+    assert words[:6] == ["Gaussians", "file", "PSNR", "time", "cameras", "next"]
+    assert any("next       gsmerge view" in line for line in lines)
     text = re.sub(r"\x1b\[[^A-Za-z]*[A-Za-z]", "", output.decode())
     bars = dict(re.findall(r"(prepare|match|fit) (━+) \d:\d\d:\d\d", text))
     assert bars == dict.fromkeys(("prepare", "match", "fit"), "━" * 16)  # done once the next stage begins

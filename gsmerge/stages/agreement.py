@@ -1,0 +1,88 @@
+"""What the depths of other views say of a view's: how faint its groups begin, and how many superpixels are worth it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gsmerge.moments import Members
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.segment import AUTO_SHARE, SHARE
+from gsmerge.types import Cameras, FeatureGaussians, PixelScene, UnalignedScene
+
+if TYPE_CHECKING:
+    from gsmerge.options import CompactOptions
+
+# Factors on the optical depth of groups that other views see through: those at whose place no other view has its
+# surface, and those of which fewer views have it there than see through it
+ALONE, DISPUTED = 0.15, 0.39
+SAMPLES = 65536  # pixels whose depths are compared
+# Superpixels per pixel: most, where all depths agree, falling to the fewest as those that other views see through come
+# near this part of all. More of them repeat what is wrong, and are learned by heart (nine training captures).
+MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
+
+
+def choose_superpixels(
+    scene: PixelScene | UnalignedScene, members: Members | None, options: CompactOptions, log: RunLog
+) -> CompactOptions:
+    """The options with a share of superpixels where they leave it to the scene.
+
+    Args:
+        scene: The canonical scene.
+        members: Its Gaussians, one per pixel; None for an unaligned scene, which gets the usual share.
+        options: Of all stages.
+        log: Takes the choice and a note that says why.
+    """
+    if options.segment.superpixels != AUTO_SHARE:
+        return options
+    if members is None or not isinstance(scene, PixelScene) or len(scene) < 2:
+        text, why = SHARE, "depths of several views cannot be compared"
+    else:
+        wrong = contradicted_share(scene, members)
+        share = min(MOST, max(FEWEST, MOST * (1 - wrong / WRONG)))
+        text, why = f"{100 * share:.2g}%", f"other views see through {100 * wrong:.0f} % of the pixels"
+        log.choices["superpixels"] = {"share": share, "contradicted": wrong}
+    log.notes.append(f"superpixels: {text} of the pixels, because {why}")
+    return replace(options, segment=replace(options.segment, superpixels=text))
+
+
+def contradicted_share(scene: PixelScene, members: Members) -> float:
+    """Share of the valid pixels, of some tens of thousands, that more views see through than have a surface there."""
+    rows = np.flatnonzero(scene.valid)
+    rows = rows[:: max(1, len(rows) // SAMPLES)]
+    views = rows // scene.pixels_per_view
+    factors = agreement_factors(members.means[rows], scene.gaussians.sh0[rows], views, members, scene.cameras)
+    return float((factors < 1).mean()) if len(rows) else 0.0
+
+
+def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
+    """Less optical depth for groups that other views see through.
+
+    Args:
+        features: Of single views.
+        members: The scene's Gaussians, one per pixel.
+        cameras: Its views.
+    """
+    factors = agreement_factors(features.means, features.sh0, features.views, members, cameras)
+    return replace(features, gains=features.gains * factors)
+
+
+def agreement_factors(
+    means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
+) -> np.ndarray:
+    """``[g]`` float32, at most 1: how much of the optical depth of each point stays.
+
+    Args:
+        means: ``[g,3]`` points, world.
+        sh0: ``[g,1,3]`` base colours.
+        views: ``[g]`` int64 view that each belongs to.
+        members: The scene's Gaussians, one per pixel; for an unaligned scene all factors are 1.
+        cameras: All views.
+    """
+    from gsmerge.networks.cross_view_stats import cross_view_stats
+
+    _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
+    disputed = np.where(same > 0, DISPUTED, ALONE)
+    return np.where(behind > same, disputed, 1).astype(np.float32)

@@ -1,0 +1,87 @@
+"""What the depths of other views say: fainter groups, and a share of superpixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+import gsmerge
+from gsmerge import PixelScene
+from gsmerge.moments import scene_members
+from gsmerge.options import CompactOptions
+from gsmerge.runtime.run_log import RunLog
+from gsmerge.stages.agreement import choose_superpixels, contradicted_share, weaken_contradicted
+from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.types import Groups
+
+AUTO = CompactOptions().with_settings({"superpixels": "auto"})
+
+
+@pytest.fixture(scope="module")
+def wall() -> PixelScene:
+    return scenes.make_scene(scenes.wall(), scenes.arc(4, 48, 36))
+
+
+def with_nearer_half(scene: PixelScene, views: list[int]) -> PixelScene:
+    """The right half of some views stands at six tenths of its depth."""
+    means = scene.gaussians.means.reshape(4, 36, 48, 3).copy()
+    for view in views:
+        eye = scene.cameras.centres[view]
+        means[view, :, 24:] = eye + 0.6 * (means[view, :, 24:] - eye)
+    return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))
+
+
+def test_what_other_views_see_through_begins_fainter(wall: PixelScene) -> None:
+    """One view's right half stands nearer than the wall that all others see; the wall itself stays as it is."""
+    wrong = with_nearer_half(wall, [1])
+    labels = np.arange(48 * 36, dtype=np.int32).reshape(36, 48) // 6
+    groups = Groups(np.broadcast_to(labels, (4, 36, 48)).copy(), (288,) * 4)
+    features = encode(wrong, scene_members(wrong), groups, EncodeOptions())
+    thin = weaken_contradicted(features, scene_members(wrong), wrong.cameras)
+    moved = (features.views == 1) & (np.arange(len(features)) % 8 >= 4)
+    factors = thin.gains / features.gains
+    assert set(np.unique(factors.round(2))) <= {np.float32(0.15), np.float32(0.39), np.float32(1)}
+    assert (factors[moved] < 1).mean() > 0.9
+    assert (factors[~moved] == 1).mean() > 0.95
+    np.testing.assert_array_equal(thin.means, features.means)
+
+
+def test_share_that_other_views_see_through(wall: PixelScene) -> None:
+    one, two = (contradicted_share(some, scene_members(some)) for some in (wall, with_nearer_half(wall, [1])))
+    assert one < 0.02
+    assert two == pytest.approx(1 / 8, abs=0.03)
+    nothing = replace(wall, valid=np.zeros_like(wall.valid))
+    assert contradicted_share(nothing, scene_members(nothing)) == 0
+
+
+def test_views_that_agree_get_more_superpixels(wall: PixelScene) -> None:
+    shares = []
+    for scene in (wall, with_nearer_half(wall, [1]), with_nearer_half(wall, [0, 2])):
+        log = RunLog(None)
+        options = choose_superpixels(scene, scene_members(scene), AUTO, log)
+        shares.append(options.segment.share)
+        assert log.choices["superpixels"]["share"] == pytest.approx(options.segment.share, rel=0.05)
+        assert len(log.notes) == 1
+        assert "see through" in log.notes[0]
+    assert 0.08 >= shares[0] > shares[1] > shares[2] >= 0.015
+
+
+def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: PixelScene) -> None:
+    alone = scenes.take_views(wall, [0])
+    for scene, members in ((alone, scene_members(alone)), (wall, None)):
+        log = RunLog(None)
+        assert choose_superpixels(scene, members, AUTO, log).segment == CompactOptions().segment
+        assert "cannot be compared" in log.notes[0]
+        assert "superpixels" not in log.choices
+
+
+def test_a_run_says_what_it_chose(wall: PixelScene) -> None:
+    auto, usual = (scenes.compacted(wall, superpixels=share, effort="draft") for share in ("auto", "4.4%"))
+    assert len(auto.gaussians) > 1.4 * len(usual.gaussians)
+    assert auto.report.options["superpixels"] == "auto"
+    assert any(note.startswith("superpixels: ") for note in auto.report.notes)
+    with pytest.raises(ValueError, match="superpixels"):
+        gsmerge.compact(wall, superpixels="some")
