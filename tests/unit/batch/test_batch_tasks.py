@@ -197,7 +197,7 @@ def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.Monke
 KILLS = {
     "while it reads": ("gsmerge.batch.task.scene_key", True),
     "while it writes": ("gsmerge.compact_file.write_gaussians", False),
-    "before the result is renamed": ("pathlib.Path.replace", True),
+    "before the result is renamed": ("gsmerge.io.atomic._flush", True),
     "before the record": ("gsmerge.batch.task.append_line", True),
     "before the lock is gone": ("gsmerge.batch.locks.Lock.finish", True),
 }
