@@ -106,8 +106,7 @@ def compact_files(
             write_gaussians(
                 at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending, normals=normals
             )
-        if not len(given.scene):
-            cameras_path = None
+        cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
             write_viewer_cameras(add(cameras_path), given.scene.cameras, given.scene.names)
         lost = lost_harmonics(out, result.gaussians.sh_degree)

@@ -58,7 +58,7 @@ class CompactTensors:
         return like(sh0_to_rgb(as_array(self.sh0)[:, 0]), self.sh0)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False, cameras: bool = True) -> None:
-        """Write them as ``.ply``, ``.compressed.ply``, ``.spz`` or ``.splat``, by the ending of the name.
+        """Write them in the format that the ending of the name says, see :func:`gsmerge.write_gaussians`.
 
         Args:
             path: The file; its folder must exist.
@@ -66,7 +66,7 @@ class CompactTensors:
             cameras: Write the views beside it, as ``NAME.cameras.json``, for viewers.
 
         Raises:
-            UsageError: If the name ends in none of these.
+            UsageError: If the name has no known ending.
             SceneError: If a file exists or cannot be written.
         """
         out = Path(path)

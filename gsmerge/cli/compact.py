@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 @opt.command(
     opt.SCENE,
     f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
-    opt.output(
-        "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name.", "SCENE.compact.ply"
-    ),
+    opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
     f"no_normals overwrite report no_viewer_cameras dry_run {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
@@ -63,8 +61,7 @@ def compact(args: opt.Args) -> None:
         document = compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
-            normals=not args.no_normals,
-            cameras_path=cameras,
+            normals=not args.no_normals, cameras_path=cameras,
         )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)

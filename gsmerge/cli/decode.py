@@ -22,8 +22,7 @@ from gsmerge.errors import SceneError
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
     "effort device fit_steps time_budget",
-    opt.output("The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name.",
-               "ENCODED.compact.ply"),
+    opt.output(opt.COMPACT_SCENE, "ENCODED.compact.ply"),
     f"no_normals overwrite dry_run {opt.RUN}",
 )  # fmt: skip
 def decode(args: opt.Args) -> None:

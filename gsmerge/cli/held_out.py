@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsmerge.cli.options import usage_errors
+from gsmerge.cli.options import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io import SceneLoad
+    from gsmerge.io import PlyScene, SceneFiles, SceneLoad
     from gsmerge.measure.evaluate import Views
-    from gsmerge.types import PixelScene, UnalignedScene
+    from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
@@ -27,6 +28,45 @@ def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
     if not all(map(lpips_available, nets)):
         raise UsageError(f"--lpips: its weights are not installed: {INSTALL}; or pass --lpips none")
     return nets, []
+
+
+@dataclass(frozen=True)
+class BeforeAfter:
+    """A scene and its compact versions, as commands compare them.
+
+    Args:
+        load: The scene as it was read.
+        scene: The same with views: placed ones where it has none.
+        held_out: Views that were no input.
+        plys: The compact versions by name.
+        notes: What was adapted, one sentence each.
+    """
+
+    load: SceneLoad
+    scene: PixelScene | UnalignedScene
+    held_out: Views | None
+    plys: dict[str, PlyScene]
+    notes: list[str]
+
+    @property
+    def gaussians(self) -> dict[str, Gaussians]:
+        """Those of the compact versions."""
+        return {name: ply.gaussians for name, ply in self.plys.items()}
+
+
+def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
+    """What the arguments BEFORE, whose files are given, and AFTER name, and the views of ``--targets``."""
+    from gsmerge.io import read_gaussians
+    from gsmerge.runtime.run_log import RunLog
+    from gsmerge.stages.place_cameras import add_views
+    from gsmerge.types import UnalignedScene
+
+    load, log = args.load(files), RunLog()
+    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
+    if isinstance(scene, UnalignedScene):
+        scene = add_views(scene, log)
+    plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
+    return BeforeAfter(load, scene, held_out, plys, [*load.notes, *adapted, *log.notes])
 
 
 def require_views(load: SceneLoad) -> None:

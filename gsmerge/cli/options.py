@@ -230,10 +230,11 @@ def parse_superpixels(text: str) -> int | str:
 
 
 BEFORE = argument("before", Path, "BEFORE", "The scene: a .ply or its folder.")
-AFTER = argument("after", list[Path], "AFTER...", "Compact .ply files of that scene.")
+AFTER = argument("after", list[Path], "AFTER...", "Compact files of that scene: .ply, .spz, .sog or .splat.")
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
 
-# Names of options that commands share
+# What commands share: a text, and names of options
+COMPACT_SCENE = "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat or .glb, by its name."
 HINTS = "opacity exporter quats order scene_scale max_side"
 READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"

@@ -10,14 +10,13 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes
-from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks
+from gsmerge.cli.held_out import BeforeAfter, lpips_networks, read_before_after
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.io import PlyInfo
     from gsmerge.measure.comparison import Storage
-    from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 SUFFIXES = (".md", ".html", ".json")
 
@@ -51,13 +50,9 @@ def parse_sizes(text: str) -> tuple[int, ...]:
 )  # fmt: skip
 def report(args: opt.Args) -> None:
     """Compare a scene with its compact versions: bytes, render time, overdraw, quality, break-even frames."""
-    from gsmerge.io import read_gaussians
     from gsmerge.measure.comparison import compare
     from gsmerge.measure.comparison_page import comparison_document, comparison_markdown
     from gsmerge.measure.evaluate import INPUT, EvaluateOptions
-    from gsmerge.runtime.run_log import RunLog
-    from gsmerge.stages.place_cameras import add_views
-    from gsmerge.types import UnalignedScene
 
     files, after, outputs = args.files(args.before), args.after, args.output or []
     for path in outputs:
@@ -67,24 +62,18 @@ def report(args: opt.Args) -> None:
     check_outputs(outputs, inputs, overwrite=args.overwrite)
     seconds = _merge_seconds(after, args.merge_seconds, args.compact_report)
     nets, missing = lpips_networks(args.lpips)
-    load = args.load(files)
-    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
-    log = RunLog()
-    if isinstance(scene, UnalignedScene):
-        scene = add_views(scene, log)
-    plys = {name: read_gaussians(path) for name, path in zip(file_names(after), after, strict=True)}
-    notes = [*load.notes, *adapted, *log.notes, *missing]
+    given = read_before_after(args, files)
+    notes = [*given.notes, *missing]
     say_notes(notes, quiet=args.silent)
-    storage = {INPUT: _storage(load.ply), **{name: _storage(ply.info) for name, ply in plys.items()}}
-    gaussians = {name: ply.gaussians for name, ply in plys.items()}
+    storage = {INPUT: _storage(given.load.ply), **{name: _storage(ply.info) for name, ply in given.plys.items()}}
     with announce_compilation(quiet=args.silent):
         comparison = compare(
-            scene, gaussians, storage, held_out, EvaluateOptions(nets, threads=args.threads),
-            long_sides=args.sizes, merge_seconds=dict(zip(plys, seconds, strict=False)),
+            given.scene, given.gaussians, storage, given.held_out, EvaluateOptions(nets, threads=args.threads),
+            long_sides=args.sizes, merge_seconds=dict(zip(given.plys, seconds, strict=False)),
         )  # fmt: skip
     document = comparison_document(comparison, notes)
     for path in outputs:
-        _write(path, document, scene, gaussians, overwrite=args.overwrite)
+        _write(path, document, given, overwrite=args.overwrite)
     lines = comparison_markdown(document).rstrip().split("\n")
     print_document(document, lines, as_json=args.json, quiet=args.quiet or bool(outputs))
     say_notes(comparison.quality.notes, quiet=args.silent or not outputs)
@@ -118,23 +107,17 @@ def _storage(info: PlyInfo) -> Storage:
     return Storage(info.path, info.count, info.file_bytes, info.bytes_by_attribute)
 
 
-def _write(
-    path: Path,
-    document: Mapping[str, Any],
-    scene: PixelScene | UnalignedScene,
-    gaussians: Mapping[str, Gaussians],
-    *,
-    overwrite: bool,
-) -> None:
+def _write(path: Path, document: Mapping[str, Any], given: BeforeAfter, *, overwrite: bool) -> None:
     from gsmerge.measure.comparison_page import comparison_markdown
     from gsmerge.measure.evaluate import near_plane
     from gsmerge.measure.preview import view_pictures
     from gsmerge.report import to_json
 
     if path.suffix == ".html":
-        parts = [("before", scene.file_gaussians), *gaussians.items()]
         from gsmerge.view.report_page import report_page
 
+        scene = given.scene
+        parts = [("before", scene.file_gaussians), *given.gaussians.items()]
         pictures = view_pictures(parts, scene.cameras, scene.images, max_views=2, near=near_plane(scene))
         text = report_page(document, pictures)
     else:

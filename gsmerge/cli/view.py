@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say, say_notes, stage_progress
-from gsmerge.cli.held_out import file_names, held_out_views
+from gsmerge.cli.held_out import read_before_after
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
@@ -23,11 +23,7 @@ from gsmerge.errors import UsageError
 )
 def view(args: opt.Args) -> None:
     """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
-    from gsmerge.io import read_gaussians
     from gsmerge.report import document_head
-    from gsmerge.runtime.run_log import RunLog
-    from gsmerge.stages.place_cameras import add_views
-    from gsmerge.types import UnalignedScene
 
     files, after = args.files(args.before), args.after
     output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
@@ -35,31 +31,26 @@ def view(args: opt.Args) -> None:
     check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
-    load = args.load(files)
-    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
-    log = RunLog()
-    if isinstance(scene, UnalignedScene):
-        scene = add_views(scene, log)
-    plys = {name: read_gaussians(path) for name, path in zip(file_names(after), after, strict=True)}
-    notes = [*load.notes, *adapted, *log.notes]
-    say_notes(notes, quiet=args.silent)
-    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": notes}
+    given = read_before_after(args, files)
+    say_notes(given.notes, quiet=args.silent)
+    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": given.notes}
     if args.dry_run:
         print_document(document, f"would write {output}", as_json=args.json)
         return
     from gsmerge.view.data import collect
     from gsmerge.view.page import headline, view_page
 
-    sizes = [load.ply.file_bytes, *(ply.info.file_bytes for ply in plys.values())]
-    gaussians = {name: ply.gaussians for name, ply in plys.items()}
+    sizes = [given.load.ply.file_bytes, *(ply.info.file_bytes for ply in given.plys.values())]
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
-        data = collect(title, scene, gaussians, sizes, held_out, threads=args.threads, progress=progress)
+        data = collect(
+            title, given.scene, given.gaussians, sizes, given.held_out, threads=args.threads, progress=progress
+        )
     page = view_page(data)
     write_texts({output: page}, overwrite=args.overwrite)
     say_notes(data.notes, quiet=args.silent)
     said = headline(*data.sides[:2])
-    document |= {"bytes": len(page), "headline": said, "notes": [*notes, *data.notes]}
+    document |= {"bytes": len(page), "headline": said, "notes": [*given.notes, *data.notes]}
     print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)

@@ -180,8 +180,8 @@ class GsmFile:
             least = 0.0 if column in NOT_NEGATIVE else -most
             low, high = array.min(initial=0), array.max(initial=0)
             if not (least <= low and high <= most):  # NaN, too
-                found = high if least <= low else low
-                raise self.error(f"{key}: expected finite numbers from {least:g} to {most:g}, found {found:g}")
+                beyond = high if least <= low else low
+                raise self.error(f"{key}: expected finite numbers from {least:g} to {most:g}, found {beyond:g}")
         return array
 
     def features(self) -> FeatureGaussians:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import project
 from gsmerge.io import (
     Alignment,
     PlyScene,
@@ -279,9 +280,6 @@ def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
 
 def _inside(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
     """``[n]`` bool of each view: which points its picture shows."""
-    size = np.array([cameras.width, cameras.height])
-    for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True):
-        image = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
-        with np.errstate(all="ignore"):
-            xy = image[:, :2] / image[:, 2:]
-        yield (image[:, 2] > 0) & (xy >= 0).all(1) & (xy < size).all(1)
+    for view in range(len(cameras)):
+        (pixels,), (depths,) = project(points, cameras[[view]])
+        yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge.moments import Members
+from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.segment import AUTO_SHARE, SHARE
 from gsmerge.types import Cameras, FeatureGaussians, PixelScene, UnalignedScene
@@ -74,15 +75,8 @@ def agreement_factors(
 ) -> np.ndarray:
     """``[g]`` float32, at most 1: how much of the optical depth of each point stays.
 
-    Args:
-        means: ``[g,3]`` points, world.
-        sh0: ``[g,1,3]`` base colours.
-        views: ``[g]`` int64 view that each belongs to.
-        members: The scene's Gaussians, one per pixel; for an unaligned scene all factors are 1.
-        cameras: All views.
+    Arguments as of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`; of an unaligned scene everything stays.
     """
-    from gsmerge.networks.cross_view_stats import cross_view_stats
-
     _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
     disputed = np.where(same > 0, DISPUTED, ALONE)
     return np.where(behind > same, disputed, 1).astype(np.float32)

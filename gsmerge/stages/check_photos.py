@@ -16,11 +16,12 @@ import numpy as np
 
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.render import render
-from gsmerge.render.photos import photo_errors, photos_of
+from gsmerge.render.photos import photo_errors, photos_of, scene_pictures
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.place_cameras import sampled
 from gsmerge.types import PixelScene, UnalignedScene
+from gsmerge.views import subset
 
 if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
@@ -146,7 +147,4 @@ def _own_pictures(scene: PixelScene | UnalignedScene, views: list[int]) -> np.nd
     """``[n,h,w,3]`` some views of a scene in the colours of its Gaussians."""
     if isinstance(scene, UnalignedScene):
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
-    size = scene.pixels_per_view
-    colors = [scene.gaussians.sh0[view * size : (view + 1) * size, 0] for view in views]
-    shape = (len(views), scene.cameras.height, scene.cameras.width, 3)
-    return sh0_to_rgb(np.stack(colors)).clip(0, 1).reshape(shape)
+    return scene_pictures(replace(subset(scene, views), images=None))

@@ -168,19 +168,19 @@ def make_clean(
         raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
     if count is not None:
         asked = min(most, math.ceil(SURPLUS * count / share))
-    found: tuple[Gaussians, dict[str, int], RunLog] | None = None
+    best: tuple[Gaussians, dict[str, int], RunLog] | None = None
     for _ in range(MAX_BUILDS):
         own = RunLog(log.progress)
         gaussians, counts = clean(make(asked, own), options, to_world)
         for name, value in own.seconds.items():
             log.seconds[name] = log.seconds.get(name, 0.0) + value
-        if found is None or count is None or len(found[0]) < len(gaussians):
-            found = gaussians, counts, own
+        if best is None or count is None or len(best[0]) < len(gaussians):
+            best = gaussians, counts, own
         if count is None or asked is None or len(gaussians) >= count or asked == most:
             break
         asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
-    assert found is not None
-    gaussians, counts, own = found
+    assert best is not None
+    gaussians, counts, own = best
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
     log.choices |= own.choices | {"clean": counts}

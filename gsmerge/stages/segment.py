@@ -81,9 +81,8 @@ class SegmentOptions:
     @property
     def share(self) -> float:
         """Superpixels per pixel; the default where a number is asked for, or where the scene has yet to choose."""
-        return parse_share(
-            SHARE if self.per_view is not None or self.superpixels == AUTO_SHARE else str(self.superpixels)
-        )
+        given = self.per_view is None and self.superpixels != AUTO_SHARE
+        return parse_share(str(self.superpixels) if given else SHARE)
 
     @property
     def adapts(self) -> bool:

@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 import cv2
 import numpy as np
 
+from gsmerge.geometry import project
 from gsmerge.io.formats import spz_writer
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
 from gsmerge.measure.preview import Picture, to_picture
@@ -147,13 +148,10 @@ def encode_still(picture: Picture) -> bytes:
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
     """Median depth of the points ``[n,3]`` that one camera has in its picture; 1 where there is none."""
-    points = means[:: max(1, len(means) // DEPTH_SAMPLE)].astype(np.float64)
-    x, y, z = (points @ camera.viewmats[0, :3, :3].T + camera.viewmats[0, :3, 3]).T
-    fx, fy, cx, cy = camera.Ks[0][[0, 1, 0, 1], [0, 1, 2, 2]]
-    with np.errstate(all="ignore"):
-        u, v = fx * x / z + cx, fy * y / z + cy
-    inside = (z > 0) & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-    return float(np.median(z[inside])) if inside.any() else 1.0
+    points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
+    (pixels,), (depths,) = project(points, camera)
+    inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
+    return float(np.median(depths[inside])) if inside.any() else 1.0
 
 
 def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:

@@ -49,9 +49,9 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _check_version(path: Path, meta: Any) -> None:
-    found = meta.get("version", 1) if isinstance(meta, dict) else "none"
-    if found != VERSION:
-        raise SceneError(path, f"expected .sog version {VERSION}, found {found}", "export it with a newer program")
+    version = meta.get("version", 1) if isinstance(meta, dict) else "none"
+    if version != VERSION:
+        raise SceneError(path, f"expected .sog version {VERSION}, found {version}", "export it with a newer program")
 
 
 @dataclass(frozen=True)

@@ -295,6 +295,6 @@ def affordable_steps(seconds: float, plan: Plan) -> int:
     """
     budget, coarse = plan.options.time_budget, plan.half_part
     assert budget is not None
-    pixels = [p.height * p.width for p in (plan.photos[0], plan.photos[-1] if len(plan.photos) > 2 else plan.photos[0])]
-    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + pixels[1] / pixels[0]) / 2)
+    pixels = [photos.height * photos.width for photos in plan.photos]
+    mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + max(pixels) / pixels[0]) / 2)
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))
