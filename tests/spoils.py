@@ -70,3 +70,22 @@ def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
 
 def cut(share: float) -> Spoil:
     return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+# What every file holds, in numbers that nothing real has; all finite but the last
+WILD_NUMBERS: dict[str, Spoil] = {
+    "intrinsics of zeros": with_array("cameras.Ks", np.zeros_like),
+    "intrinsics of 1e6": with_array("cameras.Ks", lambda a: a * [[1e9], [1e9], [1]]),
+    "views of zeros": with_array("cameras.viewmats", np.zeros_like),
+    "views of 3e38": with_array("cameras.viewmats", filled(3e38)),
+    "views of 1e300": with_array("cameras.viewmats", filled(1e300)),
+    "means of 3e38": with_array("features.means", filled(3e38)),
+    "negative spreads": with_array("features.spreads", filled(-1.0)),
+    "spreads of 1e12": with_array("features.spreads", filled(1e12)),
+    "negative weights": with_array("features.weights", filled(-1.0)),
+    "an origin of 1e20": with_array("frame.origin", filled(1e20)),
+    "a unit of 1e30": with_header(unit=1e30),
+    "views of 65536 x 65536": with_header(width=65536, height=65536),
+    "views of more pixels than bytes": with_header(width=8000, height=8000),
+    "infinity in features.means": with_array("features.means", filled(float("inf"))),
+}

@@ -12,7 +12,7 @@ import pytest
 import scenes
 from learned import noisy, written
 from safetensors.numpy import load_file, save_file
-from spoils import Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
+from spoils import WILD_NUMBERS, Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
 
 from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
 from gsmerge.encoded.gsm_file import ENCODED
@@ -90,20 +90,7 @@ DAMAGED: dict[str, Spoil] = {
         f"NaN in {name}": with_array(name, filled(float("nan")))
         for name in ("features.covars", "division.means", "cameras.Ks", "frame.origin", "heads.group")
     },
-    "intrinsics of zeros": with_array("cameras.Ks", np.zeros_like),
-    "intrinsics of 1e6": with_array("cameras.Ks", lambda a: a * [[1e9], [1e9], [1]]),
-    "views of zeros": with_array("cameras.viewmats", np.zeros_like),
-    "views of 3e38": with_array("cameras.viewmats", filled(3e38)),
-    "views of 1e300": with_array("cameras.viewmats", filled(1e300)),
-    "means of 3e38": with_array("features.means", filled(3e38)),
-    "negative spreads": with_array("features.spreads", filled(-1.0)),
-    "spreads of 1e12": with_array("features.spreads", filled(1e12)),
-    "negative weights": with_array("features.weights", filled(-1.0)),
-    "an origin of 1e20": with_array("frame.origin", filled(1e20)),
-    "a unit of 1e30": with_header(unit=1e30),
-    "views of 65536 x 65536": with_header(width=65536, height=65536),
-    "views of more pixels than bytes": with_header(width=8000, height=8000),
-    "infinity in features.means": with_array("features.means", filled(float("inf"))),
+    **WILD_NUMBERS,
 }
 
 

@@ -13,7 +13,7 @@ import pytest
 from arriving import fed, parts_of, room, same_state, state_of
 from loose import far_behind, shuffled
 from safetensors.numpy import load_file, save_file
-from spoils import Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
+from spoils import WILD_NUMBERS, Spoil, cut, filled, header, with_array, with_header, with_settings, with_text, without
 
 from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
 from gsmerge.encoded.gsm_file import STATE
@@ -98,20 +98,7 @@ DAMAGED: dict[str, Spoil] = {
     },
     **{f"{name} of another shape": with_array(name, lambda a: a[None]) for name in ARRAYS},
     **{f"NaN in {name}": with_array(name, filled(float("nan"))) for name in FLOATS},
-    "intrinsics of zeros": with_array("cameras.Ks", np.zeros_like),
-    "intrinsics of 1e6": with_array("cameras.Ks", lambda a: a * [[1e9], [1e9], [1]]),
-    "views of zeros": with_array("cameras.viewmats", np.zeros_like),
-    "views of 3e38": with_array("cameras.viewmats", filled(3e38)),
-    "views of 1e300": with_array("cameras.viewmats", filled(1e300)),
-    "means of 3e38": with_array("features.means", filled(3e38)),
-    "negative spreads": with_array("features.spreads", filled(-1.0)),
-    "spreads of 1e12": with_array("features.spreads", filled(1e12)),
-    "negative weights": with_array("features.weights", filled(-1.0)),
-    "an origin of 1e20": with_array("frame.origin", filled(1e20)),
-    "a unit of 1e30": with_header(unit=1e30),
-    "views of 65536 x 65536": with_header(width=65536, height=65536),
-    "views of more pixels than bytes": with_header(width=8000, height=8000),
-    "infinity in features.means": with_array("features.means", filled(float("inf"))),
+    **WILD_NUMBERS,
 }
 
 

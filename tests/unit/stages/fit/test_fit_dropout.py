@@ -20,16 +20,6 @@ QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
-@pytest.fixture(scope="module")
-def truth() -> Gaussians:
-    return scenes.self_made(0)[1]
-
-
-@pytest.fixture(scope="module")
-def photos() -> tuple[Photos, Photos]:
-    return scenes.pair_of(scenes.self_made(0)[0])
-
-
 def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> None:
     many = Photos(*(np.concatenate([a, a]) for a in (photos[0].images, photos[0].viewmats, photos[0].Ks)), eps2d=0.3)
     pair = many, replace(photos[1], images=np.concatenate([photos[1].images] * 2))

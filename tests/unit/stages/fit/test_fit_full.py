@@ -34,21 +34,6 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
 @pytest.fixture(scope="module")
-def scene() -> PixelScene:
-    return scenes.self_made(0)[0]
-
-
-@pytest.fixture(scope="module")
-def truth() -> Gaussians:
-    return scenes.self_made(0)[1]
-
-
-@pytest.fixture(scope="module")
-def photos(scene: PixelScene) -> Pair:
-    return scenes.pair_of(scene)
-
-
-@pytest.fixture(scope="module")
 def noise(photos: Pair) -> Pair:
     return scenes.noise_for(photos)
 

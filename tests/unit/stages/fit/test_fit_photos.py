@@ -43,16 +43,6 @@ def with_large(scene: PixelScene, scale: float, read: list[int] | None = None) -
     return replace(scene, large_photos=large)
 
 
-@pytest.fixture(scope="module")
-def scene() -> PixelScene:
-    return scenes.self_made(0)[0]
-
-
-@pytest.fixture(scope="module")
-def truth() -> Gaussians:
-    return scenes.self_made(0)[1]
-
-
 # which size
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, PixelScene
+from gsmerge import Gaussians
 from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions, FitReport, fit, stage
 from gsmerge.stages.fit.full import fit_full
@@ -19,21 +19,6 @@ from gsmerge.types import SH_C0
 Pair = tuple[Photos, Photos]
 QUICK = FitOptions(fit_steps=30, holdout=0.2)
 LONG = FitOptions(fit_steps=160, holdout=0.2)
-
-
-@pytest.fixture(scope="module")
-def scene() -> PixelScene:
-    return scenes.self_made(0)[0]
-
-
-@pytest.fixture(scope="module")
-def truth() -> Gaussians:
-    return scenes.self_made(0)[1]
-
-
-@pytest.fixture(scope="module")
-def photos(scene: PixelScene) -> Pair:
-    return scenes.pair_of(scene)
 
 
 @pytest.fixture(scope="module")
