@@ -226,6 +226,7 @@ def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr
     if prepared.given.images is not None:
         with log.stage("score"):
             after = (psnr or input_psnr)(gaussians, prepared)
+        log.choices["scored_views"] = len(prepared.scored_views())
     settings = prepared.settings.to_dict() | {"fit_steps": prepared.options.fit.steps}
     counts = prepared.given.num_gaussians, len(gaussians)
     return CompactResult(
@@ -252,7 +253,7 @@ def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog, psn
 
 
 def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
-    """Mean PSNR (dB) of the input photos, of many some, rendered from world-frame Gaussians.
+    """Mean PSNR (dB) of some input photos, see :meth:`PreparedScene.scored_views`, rendered from world-frame Gaussians.
 
     In a quarter of every photo, or in the whole where a quality was asked for.
     """

@@ -194,7 +194,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
     ]
     if psnr["before"] is not None and psnr["after"] is not None:
-        rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", "of the input views")]
+        views = f"in {document['choices']['scored_views']} of the input views"
+        rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.runtime.estimate import MAX_SCORED_VIEWS
+from gsmerge.runtime.estimate import MAX_SCORED_VIEWS, REPORT_VIEWS
 from gsmerge.types import PixelScene, UnalignedScene
 
 
@@ -31,6 +31,11 @@ def scored_views(num_views: int) -> list[int]:
     Rendering the unmerged input costs as many views as Gaussians, so with all of many views it would be most of a run.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
+
+
+def report_views(num_views: int) -> list[int]:
+    """The views that input and result are scored on where nothing but the report needs the numbers."""
+    return pick_views(num_views, REPORT_VIEWS)
 
 
 def pick_views(num_views: int, most: int) -> list[int]:

@@ -8,6 +8,7 @@ power of two: scaling there and back changes no bit.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
@@ -27,7 +28,7 @@ from gsmerge.stages.group import CountLimits, count_limits, with_tree
 from gsmerge.stages.place_cameras import add_pictures, add_views
 from gsmerge.stages.region_tree import RegionTree
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
-from gsmerge.views import distinct_views, scored_views, subset
+from gsmerge.views import distinct_views, report_views, scored_views, subset
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -161,11 +162,15 @@ class PreparedScene:
     photo_views: tuple[int, ...]
 
     def scored_views(self) -> list[int]:
-        """The given views that the photos are scored in: those whose photos show the scene."""
-        views = scored_views(len(self.given))
-        if len(self.given) != len(self.scene):  # repeated ones were left out, and numbers differ
-            return views
-        return [view for view in views if view in self.photo_views] or views
+        """The given views that input and result are scored on: some of those whose photos show the scene.
+
+        More of them where a quality was asked for, which depends on the scores.
+        """
+        candidates: Sequence[int] = range(len(self.given))
+        if len(self.given) == len(self.scene) and self.photo_views:  # else repeated ones were left out: numbers differ
+            candidates = self.photo_views
+        choose = report_views if self.options.budget.target_psnr is None else scored_views
+        return [candidates[i] for i in choose(len(candidates))]
 
     def candidates(self, members: Members) -> list[NetworkContext | None]:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
@@ -217,10 +222,11 @@ def prepare(
         photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
         name = options.networks(photos=photos, aligned=aligned)
         checkpoint, notes = find_networks(name, options)
-        scored = len(scored_views(len(scene))) if scene.images is not None else len(scene)
-        log.notes += [*notes, *([f"the input views are scored on {scored} of {len(scene)}"] * (scored < len(scene)))]
+        log.notes += notes
         options = choose_superpixels(canonical, members, options, log)
         limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
+        pixels = max(1, len(canonical) * canonical.pixels_per_view)
+        options = replace(options, fit=options.fit.with_steps_for((limits.count or limits.default) / pixels))
     prepared = PreparedScene(
         scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown
     )

@@ -46,13 +46,21 @@ def test_the_input_is_scored_as_its_file_has_it(scene: PixelScene) -> None:
 
 def test_many_views_are_scored_by_some(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of both the same ones, and it is said."""
-    monkeypatch.setattr("gsmerge.views.MAX_SCORED_VIEWS", 2)
+    monkeypatch.setattr("gsmerge.views.REPORT_VIEWS", 1)
     result = scenes.compacted(scene, fit="none")
-    some = scenes.take_views(scene, [0, 2])
+    some = scenes.take_views(scene, [1])
     assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)
     assert result.report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, some), abs=0.1)
-    assert result.report.notes == ["the input views are scored on 2 of 3"]
-    assert scenes.compacted(replace(scene, images=None)).report.notes == []
+    assert result.report.choices["scored_views"] == 1
+    assert "scored_views" not in scenes.compacted(replace(scene, images=None)).report.choices
+    better = scenes.compacted(scene, fit="none", quality="20dB")
+    assert better.report.choices["scored_views"] == len(scene)
+
+
+def test_more_gaussians_are_fitted_in_more_steps(scene: PixelScene) -> None:
+    few, many = (scenes.compacted(scene, effort="draft", superpixels=share).report for share in ("4%", "9.9%"))
+    assert (few.options["fit_steps"], few.choices["fit"]["steps"]) == (30, 30)
+    assert (many.options["fit_steps"], many.choices["fit"]["steps"]) == (45, 45)
 
 
 def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:

@@ -26,7 +26,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
         "seconds": {"segment": 1.0, "encode": 0.5},
         "psnr_before": 20.0,
         "psnr_after": 24.5,
-        "choices": {"merge": "wide", "merge_scores": {"wide": float("inf")}},
+        "choices": {"scored_views": 4, "merge": "wide", "merge_scores": {"wide": float("inf")}},
         "notes": ["a note"],
         "options": CompactOptions(seed=5).to_dict(),
         "peak_memory_bytes": 10**9,
@@ -64,7 +64,7 @@ def test_result_table(files: tuple[Path, Path]) -> None:
     assert [line.split() for line in table[1:]] == [
         ["Gaussians", "1,000", "25", "2.50", "%"],
         ["file", "2.5", "MB", "700", "B"],
-        ["PSNR", "20.00", "dB", "24.50", "dB", "of", "the", "input", "views"],
+        ["PSNR", "20.00", "dB", "24.50", "dB", "in", "4", "of", "the", "input", "views"],
         ["time", "1.9", "s", "most", "in", "segment", "1.0,", "encode", "0.5"],
         ["next", "gsmerge", "view", "scene", "small.ply"],
     ]

@@ -9,7 +9,16 @@ import pytest
 import scenes
 
 from gsmerge.types import PixelScene, UnalignedScene
-from gsmerge.views import MAX_SCORED_VIEWS, distinct_views, even_views, midpoint_views, scored_views, subset
+from gsmerge.views import (
+    MAX_SCORED_VIEWS,
+    REPORT_VIEWS,
+    distinct_views,
+    even_views,
+    midpoint_views,
+    report_views,
+    scored_views,
+    subset,
+)
 
 
 @pytest.mark.parametrize(
@@ -38,6 +47,12 @@ def test_few_views_are_all_judged_by_and_many_by_some() -> None:
     assert [scored_views(count) for count in (1, 2, 24)] == [[0], [0, 1], list(range(24))]
     assert len(scored_views(84)) == MAX_SCORED_VIEWS
     assert (scored_views(84)[0], scored_views(84)[-1]) == (0, 83)
+
+
+def test_the_report_is_of_few_views_that_are_spread() -> None:
+    assert [report_views(count) for count in (1, 3)] == [[0], [0, 1, 2]]
+    assert report_views(84) == [10, 31, 52, 73]
+    assert len(report_views(84)) == REPORT_VIEWS
 
 
 def test_targets_lie_midway() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.loss import image_gradient
-from gsmerge.stages.fit.options import EARLIER, HASTY_STEPS, LONG_STEPS, FitOptions, LearningRates, hasty_rates
+from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, LearningRates
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
 from gsmerge.types import Array, Gaussians
@@ -82,9 +82,7 @@ class Plan:
 
 
 def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: Masks | None = None) -> Plan:
-    """Held-out blocks, hidden pixels, dropout where there are few views, and rates of very short runs."""
-    if options.steps < HASTY_STEPS:
-        options = replace(options, rates=hasty_rates(options.rates))
+    """Held-out blocks, hidden pixels, and dropout where there are few views."""
     full = training_weights(photos[0], options.holdout, seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     default = DROPOUT if few else LONG_DROPOUT if options.steps >= LONG_STEPS else 0.0

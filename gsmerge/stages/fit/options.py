@@ -8,12 +8,12 @@ from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
-STEPS = {"draft": 12, "fast": 30, "default": 220, "best": 1000}  # of the full fit, by effort
+STEPS = {"draft": 30, "fast": 50, "default": 240, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
-HASTY_STEPS = 20  # shorter runs have no time for full-size photos, and take steps of their own:
-HASTY_FACTORS = {"scales_lr": 1.1, "opacities_lr": 1.33, "colors_lr": 0.67}
-HASTY_FORGETTING = 0.06  # of what the second moment forgets in a step: it is no more than their mean
+HASTY_STEPS = 20  # shorter runs have no time for full-size photos
+USUAL_SHARE = 0.044  # of Gaussians in the pixels that STEPS are for; more of them need more steps, up to
+MOST_STEPS = 2.0  # times as many
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -54,12 +54,6 @@ class LearningRates:
     min_scale: float = 0.5
 
 
-def hasty_rates(rates: LearningRates) -> LearningRates:
-    """The rates of runs below HASTY_STEPS, for some of longer runs."""
-    factors = {name: factor * getattr(rates, name) for name, factor in HASTY_FACTORS.items()}
-    return replace(rates, **factors, beta2=1 - HASTY_FORGETTING * (1 - rates.beta2))
-
-
 @dataclass(frozen=True)
 class FitOptions:
     """What is fitted to the photos.
@@ -67,7 +61,8 @@ class FitOptions:
     Args:
         fit: ``"full"``: all parameters; ``"color"``: the base colours; ``"none"``: nothing.
         effort: ``"draft"``, ``"fast"``, ``"default"`` or ``"best"``: what ``fit_steps`` are unless given.
-        fit_steps: Steps of the full fit, one view each; None: by effort.
+        fit_steps: Steps of the full fit, one view each; None: by effort, and more for more Gaussians, see
+            :meth:`with_steps_for`.
         time_budget: Seconds after which the full fit stops, None for no limit. The steps are then chosen from the
             measured time of the first ones, and the result is no longer the same on every machine.
         dropout: Share of the Gaussians that a step leaves out; None: 0.1 for five views or fewer and 150 steps or
@@ -83,8 +78,7 @@ class FitOptions:
             the photos do not need fades, instead of standing in front of other views.
         scale_reg: The same of the mean size, in units of each Gaussian's own at its start: fewer of them overlap, and
             a step takes a third less time.
-        rates: Steps and limits of the full fit; runs below 20 steps make other steps of them, see
-            :func:`hasty_rates`.
+        rates: Steps and limits of the full fit.
         iterations: Conjugate-gradient steps of the colour fit.
         prior_weight: Weight of the unfitted colours, relative to how much of each Gaussian is seen.
         huber: Colour error beyond which a pixel counts less (moving things, reflections).
@@ -127,6 +121,17 @@ class FitOptions:
     def steps(self) -> int:
         """Steps of the full fit."""
         return STEPS[self.effort] if self.fit_steps is None else self.fit_steps
+
+    def with_steps_for(self, share: float) -> FitOptions:
+        """With more steps for more Gaussians, unless steps are given.
+
+        Args:
+            share: Gaussians for each pixel of all views. Steps grow with its square root from USUAL_SHARE on.
+        """
+        factor = min(math.sqrt(share / USUAL_SHARE), MOST_STEPS)
+        if self.fit_steps is not None or factor <= 1:
+            return self
+        return replace(self, fit_steps=round(factor * self.steps))
 
     @property
     def half_res_part(self) -> float:

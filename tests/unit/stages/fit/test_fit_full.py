@@ -409,14 +409,3 @@ def test_longer_runs_end_with_smaller_steps() -> None:
     np.testing.assert_allclose(long, usual / 3, rtol=1e-6)
     np.testing.assert_array_equal(step_sizes(rates, 0.0, 300), step_sizes(rates, 0.0, 900))
     np.testing.assert_array_equal(step_sizes(rates, 1.0, 12), usual)
-
-
-def test_very_short_runs_take_steps_of_their_own(photos: Pair) -> None:
-    """Settings that a caller chose are changed in the same proportion."""
-    rates = LearningRates(colors_lr=0.06, beta2=0.5)
-    short, long = (plan_run(photos, FitOptions(fit_steps=steps, rates=rates), 0).options.rates for steps in (12, 30))
-    assert long == rates
-    assert (short.means_lr, short.decay) == (rates.means_lr, rates.decay)
-    assert short.colors_lr == pytest.approx(0.67 * rates.colors_lr)
-    assert short.opacities_lr > rates.opacities_lr
-    assert 1 - short.beta2 == pytest.approx(0.06 * (1 - rates.beta2))

@@ -66,7 +66,7 @@ def test_scale_is_chosen(scene: PixelScene, larger: float, settings: dict[str, A
     [
         (1.5, {"photo_scale": 4}, 1.5, "photo_scale 4 is 1.5: the photos are no larger"),
         (2, {"photo_scale": 2, "fit": "color"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
-        (2, {"photo_scale": 2, "effort": "draft"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
+        (2, {"photo_scale": 2, "fit_steps": 12}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
     ],
     ids=str,
 )
