@@ -246,8 +246,7 @@ def note_moves(prepared: PreparedScene, cameras: Cameras, log: RunLog) -> None:
         cause = "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit
     log.choices["poses"] = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
-    moved = describe_moves(log.choices["poses"])
-    log.notes.append(f"{cause}: cameras were moved by {moved}; --save-cameras writes them, --poses fixed keeps them")
+    log.notes.append(f"{cause}: cameras were moved by {describe_moves(log.choices['poses'])}")
 
 
 def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog, psnr: Psnr) -> CompactResult:

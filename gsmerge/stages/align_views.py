@@ -58,7 +58,7 @@ class _Level:
     scale: float  # pixels of the views per pixel
     points: list[np.ndarray]  # [n,3] float64 of each view, in its camera's frame
     greys: list[np.ndarray]  # [n] of each
-    depths: np.ndarray  # [v,h,w] at the size of the views
+    depths: np.ndarray  # [v,h,w] of the Gaussians at the pixels' middles, canonical units; NaN where there is none
     start: np.ndarray  # [v,4,4] poses as they were given
     pairs: list[tuple[int, int]]  # a view, and one that it is looked up in
 
@@ -87,15 +87,15 @@ def align_views(scene: PixelScene, views: Sequence[int], *, always: bool = False
         The scene; None where no pose is wrong, or nothing can be told.
     """
     start = scene.cameras.viewmats.astype(np.float64)
-    depths, (largest, shortest) = _depths(scene), (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
-    pairs = _choose_pairs(scene, depths, views)
+    largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
+    pairs = _choose_pairs(scene, views)
     sides = [side for side in SIDES if side < largest] or [largest]
     if not pairs or shortest * sides[0] < MIN_SIDE * largest:
         return None
     viewmats = start
     for side in sides:
         check = side == sides[0] and not always
-        level = _level_of(scene, depths, pairs, largest / side)
+        level = _level_of(scene, pairs, largest / side)
         viewmats, first, last = _descend(level, viewmats, check=check)
         if not np.isfinite(viewmats).all() or (check and not _any_wrong(level, first, last)):
             return None
@@ -121,22 +121,13 @@ def move_views(scene: PixelScene, viewmats: np.ndarray) -> PixelScene:
     return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
-def _depths(scene: PixelScene) -> np.ndarray:
-    """``[v,h,w]`` float32 depth of every pixel's Gaussian, canonical units; NaN where there is none."""
-    means = scene.gaussians.means.reshape(len(scene), -1, 3)
-    axes = scene.cameras.viewmats[:, 2].astype(means.dtype)
-    depths = np.einsum("vnj,vj->vn", means, axes[:, :3]) + axes[:, 3:]
-    shape = scene.valid.shape
-    return np.where(scene.valid & (depths.reshape(shape) > NEAR), depths.reshape(shape), np.nan).astype(np.float32)
-
-
-def _choose_pairs(scene: PixelScene, depths: np.ndarray, views: Sequence[int]) -> list[tuple[int, int]]:
+def _choose_pairs(scene: PixelScene, views: Sequence[int]) -> list[tuple[int, int]]:
     """Pairs of views, both ways round: of each its neighbours, which see most of it and look where it looks."""
     cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
     step = max(1, scene.pixels_per_view // OVERLAP_SAMPLES)
     size, pairs = np.array([cameras.width, cameras.height]), set()
     for view in views:
-        some = means[view, ::step][np.isfinite(depths[view].reshape(-1)[::step])]
+        some = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
         pixels, z = project(some, cameras)
         seen = ((z > NEAR) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1) if len(some) else np.zeros(len(z))
         overlap = seen * (cameras.viewmats[:, 2, :3] @ cameras.viewmats[view, 2, :3]).clip(0)
@@ -147,31 +138,34 @@ def _choose_pairs(scene: PixelScene, depths: np.ndarray, views: Sequence[int]) -
     return sorted(pairs)
 
 
-def _level_of(scene: PixelScene, depths: np.ndarray, pairs: list[tuple[int, int]], level: float) -> _Level:
+def _level_of(scene: PixelScene, pairs: list[tuple[int, int]], level: float) -> _Level:
     """The photos with their sides divided by ``level``, and the pixels where each changes most."""
     assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
     near = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
+    means = scene.gaussians.means.reshape(*scene.valid.shape, 3)
     spread = 0.5 + np.random.default_rng(0).random(shape)  # or all pixels would be those of one edge
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
-    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def one_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         grey = cv2.GaussianBlur(photos.images[view].mean(-1, dtype=np.float32), (0, 0), BLUR)
         down, right = np.gradient(grey)
-        depth = depths[view][near]
+        axis = scene.cameras.viewmats[view, 2]
+        depth = means[view][near] @ axis[:3] + axis[3]
+        depth = np.where(scene.valid[view][near] & (depth > NEAR), depth, np.nan)
         score = np.where(np.isfinite(depth), np.hypot(right, down) * spread, 0).ravel()
         chosen = np.argsort(-score, kind="stable")[:SAMPLES]
         chosen = chosen[score[chosen] > 0]
         y, x = np.divmod(chosen, photos.width)
         pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
         points = pixels @ np.linalg.inv(photos.Ks[view]).T * depth.ravel()[chosen, None]
-        return np.stack([grey, right, down], -1), points, grey.ravel()[chosen]
+        return np.stack([grey, right, down], -1), points, grey.ravel()[chosen], depth
 
-    pictures, points, greys = zip(*parallel_map(one_view, range(len(scene))), strict=True)
+    pictures, points, greys, depths = zip(*parallel_map(one_view, range(len(scene))), strict=True)
     scale, start = scene.cameras.width / photos.width, scene.cameras.viewmats.astype(np.float64)
-    return _Level(np.stack(pictures), photos.Ks, scale, list(points), list(greys), depths, start, pairs)
+    return _Level(np.stack(pictures), photos.Ks, scale, list(points), list(greys), np.stack(depths), start, pairs)
 
 
 def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, list[_Pair], list[_Pair]]:
@@ -203,12 +197,11 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
 
 def _compare(level: _Level, viewmats: np.ndarray, pair: tuple[int, int]) -> _Pair:
     """The pixels of one view looked up in another, under some poses."""
-    (a, b), (height, width), depths = pair, level.pictures.shape[1:3], level.depths
+    (a, b), (height, width) = pair, level.pictures.shape[1:3]
     x, y, z, u, v, world = _look_up(level, viewmats, a, b)
     inside = (z > NEAR) & (u > BORDER) & (u < width - BORDER) & (v > BORDER) & (v < height - BORDER)
-    rows, columns = (v * depths.shape[1] / height).astype(int), (u * depths.shape[2] / width).astype(int)
-    depth = depths[b][rows.clip(0, depths.shape[1] - 1), columns.clip(0, depths.shape[2] - 1)]
-    inside &= np.abs(np.log(depth / z)) < SAME_DEPTH  # not where there is none
+    rows, columns = v.clip(0, height - 1).astype(int), u.clip(0, width - 1).astype(int)
+    inside &= np.abs(np.log(level.depths[b, rows, columns] / z)) < SAME_DEPTH  # not where there is none
     if inside.sum() < MIN_SEEN:
         return _Pair(np.zeros((6, 6)), np.zeros(6), 0.0, 0.0)
     first = _look_up(level, level.start, a, b)
