@@ -279,7 +279,7 @@ def move_wrong_views(
     moved = align_views(scene, views, always=poses == "free")
     if poses == "auto":
         options = replace(options, fit=replace(options.fit, poses="fixed" if moved is None else "free"))
-    return moved or scene, options
+    return scene if moved is None else moved, options
 
 
 def find_networks(name: str, options: CompactOptions) -> tuple[Checkpoint | None, list[str]]:
