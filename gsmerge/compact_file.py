@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import (
     AUTO,
     ReadHints,
@@ -21,7 +21,7 @@ from gsmerge.io import (
     output_format,
     write_gaussians,
 )
-from gsmerge.io.cameras.json_files import write_viewer_cameras
+from gsmerge.io.cameras.json_files import write_transforms, write_viewer_cameras
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.formats.ply_file import LOGIT_COMMENT
 from gsmerge.options import CompactOptions
@@ -65,6 +65,7 @@ def compact_files(
     report_path: Path | None = None,
     normals: bool = True,
     cameras_path: Path | None = None,
+    saved_cameras: Path | None = None,
 ) -> dict[str, Any]:
     """Read a scene, compact it and write the result, its further levels of detail beside it, its views for viewers,
     and the report: all of them or none.
@@ -82,6 +83,7 @@ def compact_files(
         report_path: A file for the report; None: none is written.
         normals: As of :func:`gsmerge.write_gaussians`.
         cameras_path: A file for the views, where there are any; None: none is written.
+        saved_cameras: The same as ``transforms.json``, with all intrinsics.
 
     Returns:
         The report, see :func:`gsmerge.report.report_document`.
@@ -108,7 +110,11 @@ def compact_files(
             )
         cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
-            write_viewer_cameras(add(cameras_path), given.scene.cameras, given.scene.names)
+            write_viewer_cameras(add(cameras_path), result.cameras, given.scene.names)
+        if saved_cameras is not None:
+            if not len(given.scene):
+                raise UsageError(f"--save-cameras {saved_cameras}: expected a scene with cameras, got none")
+            write_transforms(add(saved_cameras), result.cameras, given.scene.names)
         lost = lost_harmonics(out, result.gaussians.sh_degree)
         document = report_document(
             result.report,
@@ -159,6 +165,7 @@ def recognised_of(loaded: SceneLoad) -> dict[str, Any]:
     cameras, recovery = loaded.scene.cameras, loaded.recovery
     views: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
     views |= {"dialects": [exporter.name for exporter in loaded.exporters], "rows": recovery and recovery.description}
+    views["moved_cameras"] = list(loaded.moves)
     return views | {name: getattr(loaded.ply, name) for name in names}
 
 

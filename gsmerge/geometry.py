@@ -1,7 +1,10 @@
-"""Quaternions, covariances, projection and medians, on batches of arrays."""
+"""Quaternions, covariances, projection, motions of cameras and medians, on batches of arrays."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import cv2
 import numpy as np
 
 from gsmerge.types import SH_C0, Array, Cameras
@@ -57,6 +60,16 @@ def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
     return normalize(ways[np.arange(len(best)), best])
 
 
+def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products of quaternions ``[...,4]`` wxyz: first ``b``, then ``a``."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    product = [
+        aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
+    ]  # fmt: skip
+    return np.stack(product, -1)
+
+
 def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Covariances ``R diag(scales)^2 R^T`` (paper section 3).
 
@@ -100,6 +113,33 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
     camera = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
     image = camera @ Ks.swapaxes(-1, -2)
     return image[..., :2] / image[..., 2:], camera[..., 2]
+
+
+def motion_matrices(vectors: np.ndarray) -> np.ndarray:
+    """``[v,4,4]`` float64 rigid motions of ``[v,6]``: a rotation vector about the origin (radians), and a shift."""
+    out = np.tile(np.eye(4), (len(vectors), 1, 1))
+    for matrix, vector in zip(out, vectors.astype(np.float64), strict=True):
+        matrix[:3, :3], matrix[:3, 3] = cv2.Rodrigues(vector[:3])[0], vector[3:]
+    return out
+
+
+def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """``[v,6]`` world motions that lead from viewmats ``[v,4,4]`` to others: ``end = start @ motion_matrices(...)``."""
+    motions = np.linalg.inv(start) @ end
+    return np.stack([np.concatenate([cv2.Rodrigues(m[:3, :3])[0][:, 0], m[:3, 3]]) for m in motions])
+
+
+def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
+    """The viewmats ``end [v,4,4]`` less what all did together since ``start``: the middle motion (mean, median)."""
+    common = middle(motion_vectors(start, end), axis=0)
+    return np.asarray(end @ np.linalg.inv(motion_matrices(common[None])))
+
+
+def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far cameras moved between viewmats ``[v,4,4]``: ``[v]`` degrees, and ``[v]`` distances of the centres."""
+    chords = np.linalg.norm(end[:, :3, :3] - start[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
+    before, after = (-np.einsum("vji,vj->vi", one[:, :3, :3], one[:, :3, 3]) for one in (start, end))
+    return np.degrees(2 * np.arcsin(chords.clip(0, 1))), np.linalg.norm(after - before, axis=1)
 
 
 def lower_median(values: np.ndarray) -> np.ndarray:

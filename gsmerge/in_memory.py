@@ -30,7 +30,7 @@ class CompactTensors:
         sh0: ``[n,1,3]`` harmonics of degree 0.
         shN: ``[n,k-1,3]`` higher harmonics, basis-major.
         report: What was done.
-        cameras: The views that they were made from, NumPy arrays.
+        cameras: The views that they were made from, NumPy arrays: moved where their poses were wrong.
         names: Of the views.
     """
 
@@ -140,4 +140,4 @@ def compact_tensors(
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes
     rows = {field.name: like(getattr(result.gaussians, field.name), means) for field in fields(Gaussians)}
-    return CompactTensors(**rows, report=result.report, cameras=scene.cameras, names=scene.names)
+    return CompactTensors(**rows, report=result.report, cameras=result.cameras, names=scene.names)

@@ -15,6 +15,7 @@ from typing import Any
 
 from gsmerge.baselines import choose_baseline
 from gsmerge.io import load_scene
+from gsmerge.io.cameras.moves import describe_moves, list_moves
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import NEAR, photo_psnr, scene_photos
@@ -34,9 +35,9 @@ from gsmerge.stages.fit import fit, fit_photos
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
-from gsmerge.stages.prepare import PreparedScene, prepare
+from gsmerge.stages.prepare import PreparedScene, prepare, scene_depth
 from gsmerge.stages.segment import scene_saliency
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 Psnr = Callable[[Gaussians, PreparedScene], float]
 
@@ -221,8 +222,11 @@ def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr
     """
     if prepared.hidden is not None:
         gaussians = Gaussians.concat([gaussians, prepared.hidden])
-    gaussians = prepared.frame.leave(gaussians)
+    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras(log.viewmats)
     after = None
+    if cameras is not prepared.given.cameras:
+        note_moves(prepared, cameras, log)
+        prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
     if prepared.given.images is not None:
         with log.stage("score"):
             after = (psnr or input_psnr)(gaussians, prepared)
@@ -232,7 +236,18 @@ def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr
     return CompactResult(
         gaussians,
         CompactReport(*counts, log.seconds, None, after, log.choices, log.notes, settings, peak_memory()),
+        cameras,
     )
+
+
+def note_moves(prepared: PreparedScene, cameras: Cameras, log: RunLog) -> None:
+    """Tell how far each camera was moved."""
+    given, cause = prepared.given, "poses are free"
+    if prepared.settings.fit.poses == "auto":
+        cause = "the photos of some views agree only under other poses"
+    depth = scene_depth(prepared.scene) * prepared.frame.unit
+    log.choices["poses"] = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
+    log.notes.append(f"{cause}: cameras were moved by {describe_moves(log.choices['poses'])}")
 
 
 def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog, psnr: Psnr) -> CompactResult:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gsmerge import __version__
 from gsmerge.options import to_schema
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.types import Gaussians
+from gsmerge.types import Cameras, Gaussians
 
 if TYPE_CHECKING:
     import torch
@@ -58,11 +58,14 @@ class CompactResult:
     Args:
         gaussians: The Gaussians.
         report: What was done.
+        cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
+            wrong, see ``poses`` of :class:`gsmerge.FitOptions`.
         coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
     """
 
     gaussians: Gaussians
     report: CompactReport
+    cameras: Cameras
     coarser: tuple[CompactResult, ...] = ()
 
     def to(self, device: torch.device | str) -> CompactResult:

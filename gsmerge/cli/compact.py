@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     opt.SCENE,
     f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
-    f"no_normals overwrite report no_viewer_cameras dry_run {opt.RUN}",
+    f"no_normals overwrite report no_viewer_cameras save_cameras dry_run {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -34,7 +34,9 @@ def compact(args: opt.Args) -> None:
     levels = [level_output(out, level) for level in range(1, args.levels or 1)]
     cameras = None if args.no_viewer_cameras else viewer_cameras_path(out)
     inputs = (*input_files(files), *checkpoint_files(args.checkpoint))
-    check_outputs((out, *levels, args.report, cameras), inputs, overwrite=args.overwrite or args.dry_run)
+    check_outputs(
+        (out, *levels, args.report, cameras, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
+    )
     settings = args.settings()
     check_format(out, settings.budget)
     if args.dry_run:
@@ -62,6 +64,7 @@ def compact(args: opt.Args) -> None:
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
             normals=not args.no_normals, cameras_path=cameras,
+            saved_cameras=args.save_cameras,
         )  # fmt: skip
 
     say_notes(document["notes"], quiet=args.silent)

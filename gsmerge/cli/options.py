@@ -241,7 +241,7 @@ TARGETS = "targets target_images"
 COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
 MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
 CLEAN = "crop drop_floaters"
-FIT = "fit effort device fit_steps photo_scale time_budget"
+FIT = "fit effort device fit_steps photo_scale time_budget poses"
 NETWORKS = "recipe checkpoint require_checkpoint"
 RUN = "seed threads"
 
@@ -332,6 +332,8 @@ _TABLE = (
                "size, for sharper results up close; auto: up to 2.", wording="auto", rare=True,
                parser=parse_photo_scale, metavar="NUMBER|auto"),
         option("time_budget", float, "Seconds that the full fit may take.", rare=True, min=0.0),
+        option("poses", ("auto", "fixed", "free"), "Whether cameras are moved to where the photos agree: free, fixed, "
+               "or auto: where some are wrong.", wording="auto", rare=True),
     ),
     panel(
         OUTPUT,
@@ -356,6 +358,8 @@ _TABLE = (
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
         switch("no_viewer_cameras", "Do not write the input views beside the result, as NAME.cameras.json for viewers.",
+               rare=True),
+        option("save_cameras", Path, "Write the cameras as used, moved where they were wrong, as transforms.json.",
                rare=True),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),

@@ -12,7 +12,7 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions, to_schema
-from gsmerge.pipeline import build, merge_views
+from gsmerge.pipeline import build, merge_views, note_moves
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
@@ -58,6 +58,8 @@ def encode_scene(
     log = RunLog(progress)
     with use_threads(options.threads):
         prepared = prepare(scene.numpy(), options, log)
+        if prepared.moved:
+            note_moves(prepared, prepared.final_cameras(None), log)
         require_children("max k", max_k or 1, prepared.checkpoint)
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):

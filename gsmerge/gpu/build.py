@@ -233,12 +233,12 @@ class DeviceScene:
 
         Rendered in the canonical frame, where the input's own Gaussians are on the device already.
         """
-        given, scene = prepared.given, prepared.scene
-        if gaussians is given.gaussians and len(gaussians) == len(scene.gaussians) and prepared.members is not None:
+        given, scene, members = prepared.given, prepared.scene, prepared.members
+        if gaussians is given.gaussians and len(gaussians) == len(scene.gaussians) and members and not prepared.moved:
             gaussians = self.members.gaussians
         else:
             gaussians = upload_gaussians(prepared.frame.enter(gaussians), self.device)
-        if given.images is scene.images:
+        if given.images is scene.images and not prepared.moved:
             photos = self.photos[0]
         else:
             cameras = prepared.frame.enter_cameras(given.cameras)

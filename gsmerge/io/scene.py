@@ -62,6 +62,8 @@ class SceneLoad:
     alignment: Alignment | None = None
     recovery: Recovery | None = None  # which reading of the rows won, and by how much; None for an unaligned scene
     problem: str | None = None  # why the scene is unaligned, in one sentence; None where it is not
+    # how far each camera was moved to its Gaussians; empty where none was
+    moves: Sequence[dict[str, Any]] = ()
 
     def pixel_scene(self) -> PixelScene:
         """The scene, for those who need one Gaussian per pixel. SceneError if it is unaligned; says why."""
@@ -157,7 +159,8 @@ def align_scene(
     sizes = pictures, photo_size(limited), fit.transform
     if fit.recovery is not None:
         large = find_large_photos(files, as_read, *sizes, fit.inputs.cameras)
-        return _aligned(ply, files, fit, fit.recovery, hints, notes, large)
+        load = _aligned(ply, files, fit, fit.recovery, hints, notes, large)
+        return load if fit.moved is None else replace(load, moves=fit.moved.moves)
     scene, camera_file, problem, more = make_unaligned(ply, files, fit, hints)
     scene = replace(scene, large_photos=find_large_photos(files, as_read, *sizes, scene.cameras))
     return _unaligned(ply, files, camera_file, scene, problem, hints, notes + more)

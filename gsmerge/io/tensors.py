@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import normalize, rgb_to_sh0
+from gsmerge.io.alignment.move_cameras import move_cameras
 from gsmerge.io.alignment.poses import choose_poses, other_conventions
 from gsmerge.io.alignment.rotations import choose_rotations
 from gsmerge.io.alignment.score import check_pairs, sample_pixels
@@ -90,7 +91,8 @@ def read_tensors(given: TensorInput) -> tuple[PixelScene | UnalignedScene, list[
         sizes = f"{len(cameras)} x {cameras.height} x {cameras.width} = {count}"
         problem = f"expected one Gaussian per pixel, {sizes} (views x height x width), found {len(gaussians)}"
         raise SceneError("means", problem, 'pass shape=(V, H, W) as the model has it, or order="none"')
-    notes += _check_pixels(gaussians, cameras, valid)
+    cameras, more = _check_pixels(gaussians, cameras, valid, names)
+    notes += more
     scene = PixelScene(gaussians, cameras, images, valid.reshape(-1, cameras.height, cameras.width), names)
     if given.check_rotations:
         _check_rotations(scene)
@@ -273,8 +275,13 @@ def _read_images(photos: np.ndarray, cameras: Cameras) -> np.ndarray:
     return to_float32(photos.reshape(expected)).clip(0, 1)
 
 
-def _check_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> list[str]:
-    """Refuse Gaussians that do not project into their own pixels, in the words of what would make them; and a note."""
+def _check_pixels(
+    gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
+) -> tuple[Cameras, list[str]]:
+    """Cameras under which the Gaussians project into their own pixels: those given, or moved a little; and a note.
+
+    Others are refused in the words of what would make them right.
+    """
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:
@@ -282,7 +289,7 @@ def _check_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
         near = float(np.median(pixel_errors(shifted, cameras.viewmats, cameras.Ks)))
         corners = near < _CORNER and float(np.median(alignment.median_px)) > 0.5 - _CORNER
         text = "the Gaussians project onto the corners of their pixels: if Ks take these for centres, add 0.5 to cx, cy"
-        return [text] if corners else []
+        return cameras, [text] if corners else []
     for poses in other_conventions(cameras.viewmats, W2C_OPENCV):
         if check_pairs(pairs, replace(cameras, viewmats=poses.viewmats)).ok:
             problem = "expected world-to-camera matrices with OpenCV axes, found that the means project into their own"
@@ -295,6 +302,9 @@ def _check_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
         remedy = f"multiply their first row by {factors[0]:.6g} and the second by {factors[1]:.6g}"
         raise SceneError("Ks", problem, remedy)
     reason = explain_misalignment(gaussians, cameras, valid, W2C_OPENCV)
+    moved = None if reason else move_cameras(pairs, cameras, names)
+    if moved is not None:
+        return moved.cameras, [moved.note]
     raise misalignment_error("means", alignment, reason)
 
 

@@ -94,7 +94,8 @@ def extend(
     _check(state, scene, options, max_k)
     log = RunLog(progress)
     with use_threads(options.threads):
-        prepared = prepare(scene.numpy(), options, log, None if state is None else state.frame)
+        fixed = replace(options, fit=replace(options.fit, poses="fixed"))  # batches have to stay where the others are
+        prepared = prepare(scene.numpy(), fixed, log, None if state is None else state.frame)
         require_children("max k", max_k, prepared.checkpoint)
         prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
         count = choose_count(prepared, build, log)

@@ -27,6 +27,7 @@ class RunLog:
     seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
     choices: dict[str, Any] = field(default_factory=dict)  # What the stages decided
     notes: list[str] = field(default_factory=list)  # Things worth telling, one sentence each
+    viewmats: Any = None  # [v,4,4] canonical poses of the prepared views where the fit moved them
 
     def fit_progress(self, step: int, steps: int, photos: float, held_out: float) -> None:
         """One step of the fit is done."""
@@ -38,6 +39,7 @@ class RunLog:
         if report is None:
             return
         self.choices["fit"] = asdict(report)
+        self.viewmats = self.choices["fit"].pop("viewmats", None)
         if not report.accepted:
             self.notes.append("the fit was not accepted: held-out parts of the photos did not get better")
 

@@ -22,6 +22,7 @@ from gsmerge.render.photos import scene_pictures
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.agreement import choose_superpixels
+from gsmerge.stages.align_views import align_views
 from gsmerge.stages.assign import ContributionOptions, split_unseen
 from gsmerge.stages.check_photos import leave_out_photos
 from gsmerge.stages.group import CountLimits, count_limits, with_tree
@@ -70,6 +71,12 @@ class Frame:
         means = gaussians.means.astype(np.float64) * self.unit + self.origin
         return replace(gaussians, means=means, scales=gaussians.scales * self.unit)
 
+    def leave_cameras(self, cameras: Cameras) -> Cameras:
+        """Canonical to world."""
+        viewmats = cameras.viewmats.astype(np.float64)
+        viewmats[:, :3, 3] = self.unit * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ self.origin
+        return replace(cameras, viewmats=viewmats)
+
     def enter_cameras(self, cameras: Cameras) -> Cameras:
         """World to canonical."""
         viewmats = cameras.viewmats.astype(np.float64)
@@ -84,17 +91,11 @@ def find_frame(scene: PixelScene) -> Frame:
     Raises:
         ValueError: If no Gaussian is valid.
     """
-    h, w = scene.cameras.height, scene.cameras.width
     rows = np.flatnonzero(scene.valid)
     if len(rows) == 0:
         raise ValueError("expected at least one valid Gaussian, got none")
     rows = rows[:: max(1, len(rows) // SAMPLES)]
-    means = scene.gaussians.means[rows].astype(np.float64)
-    viewmats = scene.cameras.viewmats[rows // (h * w)]
-    depths = (viewmats[:, 2, :3] * means).sum(1) + viewmats[:, 2, 3]
-    depth = float(lower_median(np.abs(depths)))
-    unit = 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
-    return Frame(lower_median(means), unit)
+    return Frame(lower_median(scene.gaussians.means[rows].astype(np.float64)), _unit(scene_depth(scene)))
 
 
 def find_unaligned_frame(scene: UnalignedScene) -> Frame:
@@ -106,12 +107,27 @@ def find_unaligned_frame(scene: UnalignedScene) -> Frame:
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].astype(np.float64)
+    return Frame(lower_median(means), _unit(scene_depth(scene)))
+
+
+def _unit(depth: float) -> float:
+    """The power of two nearest to a depth."""
+    return 2.0 ** round(math.log2(depth)) if depth > 0 and math.isfinite(depth) else 1.0
+
+
+def scene_depth(scene: PixelScene | UnalignedScene) -> float:
+    """Median depth of a sample of the Gaussians, each in its own view, or in all that see it; 0 where none does."""
+    if isinstance(scene, PixelScene):
+        rows = np.flatnonzero(scene.valid)
+        rows = rows[:: max(1, len(rows) // SAMPLES)]
+        means, viewmats = scene.gaussians.means[rows].astype(np.float64), scene.cameras.viewmats
+        viewmats = viewmats[rows // scene.pixels_per_view]
+        return float(lower_median(np.abs((viewmats[:, 2, :3] * means).sum(1) + viewmats[:, 2, 3])))
+    means = scene.gaussians.means[:: max(1, len(scene.gaussians) // SAMPLES)].astype(np.float64)
     views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
     pixels, depths = project(means, views)
-    size = np.array([views.width, views.height])
-    seen = (depths > 0) & ((pixels > 0) & (pixels < size)).all(-1)
-    depth = float(lower_median(depths[seen])) if seen.any() else 0.0
-    return Frame(lower_median(means), 2.0 ** round(math.log2(depth)) if depth > 0 else 1.0)
+    seen = (depths > 0) & ((pixels > 0) & (pixels < (views.width, views.height))).all(-1)
+    return float(lower_median(depths[seen])) if seen.any() else 0.0
 
 
 def scene_frame(scene: PixelScene | UnalignedScene) -> Frame:
@@ -146,6 +162,7 @@ class PreparedScene:
         tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
         hidden: Gaussians in place of those that no view sees, canonical; None without any.
         photo_views: Views whose photos a fit may use, see :mod:`gsmerge.stages.check_photos`.
+        moved: Whether views were moved to where their photos agree.
     """
 
     given: PixelScene | UnalignedScene
@@ -160,6 +177,7 @@ class PreparedScene:
     tree: RegionTree | None
     hidden: Gaussians | None
     photo_views: tuple[int, ...]
+    moved: bool
 
     def scored_views(self) -> list[int]:
         """The given views that input and result are scored on: some of those whose photos show the scene.
@@ -171,6 +189,23 @@ class PreparedScene:
             candidates = self.photo_views
         choose = report_views if self.options.budget.target_psnr is None else scored_views
         return [candidates[i] for i in choose(len(candidates))]
+
+    def final_cameras(self, viewmats: np.ndarray | None) -> Cameras:
+        """The given views' cameras as the result was made from them, in the world.
+
+        Args:
+            viewmats: Canonical poses of the photos that a fit used, where it moved them.
+        """
+        given, cameras = self.given.cameras, self.scene.cameras
+        if viewmats is None and not self.moved:
+            return given
+        if viewmats is not None:
+            poses = cameras.viewmats.astype(np.float64)
+            poses[list(self.photo_views)] = viewmats
+            cameras = replace(cameras, viewmats=poses)
+        views = distinct_views(self.given)
+        same = (given.viewmats[:, None] == given.viewmats[views]).all((2, 3))  # repeated views move with their first
+        return replace(given, viewmats=self.frame.leave_cameras(cameras).viewmats[same.argmax(1)])
 
     def candidates(self, members: Members) -> list[NetworkContext | None]:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
@@ -209,11 +244,12 @@ def prepare(
     with log.stage("prepare"):
         own, options = drop_repeats(scene, settings, log)
         canonical: PixelScene | UnalignedScene
-        members, hidden = None, None
+        members, hidden, moved = None, None, False
         if isinstance(own, PixelScene):
             aligned_scene, frame = canonicalise(own, frame)
-            canonical, options, shown = leave_out_photos(aligned_scene, options, log)
-            members = scene_members(aligned_scene)
+            aligned_scene, options, shown = leave_out_photos(aligned_scene, options, log)
+            canonical, options = move_wrong_views(aligned_scene, options, shown)
+            members, moved = scene_members(canonical), canonical is not aligned_scene
         else:
             unaligned, frame = canonicalise(add_views(own, log), frame)
             unaligned, options, shown = leave_out_photos(unaligned, options, log)
@@ -228,12 +264,28 @@ def prepare(
         pixels = max(1, len(canonical) * canonical.pixels_per_view)
         options = replace(options, fit=options.fit.with_steps_for((limits.count or limits.default) / pixels))
     prepared = PreparedScene(
-        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown
+        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown, moved
     )
     if settings.method != "gsmerge" or not (options.needs_tree or limits.count is not None):
         return prepared
     with log.stage("segment"):
         return with_tree(prepared)
+
+
+def move_wrong_views(
+    scene: PixelScene, options: CompactOptions, views: tuple[int, ...]
+) -> tuple[PixelScene, CompactOptions]:
+    """The canonical scene with its views where the photos agree, as far as ``poses`` asks for it; and the options.
+
+    Where it leaves that to the scene, the options say what came of it: the fit moves the cameras on, or it does not.
+    """
+    poses = options.fit.poses
+    if scene.images is None or options.method != "gsmerge" or poses == "fixed":
+        return scene, options
+    moved = align_views(scene, views, always=poses == "free")
+    if poses == "auto":
+        options = replace(options, fit=replace(options.fit, poses="fixed" if moved is None else "free"))
+    return scene if moved is None else moved, options
 
 
 def find_networks(name: str, options: CompactOptions) -> tuple[Checkpoint | None, list[str]]:

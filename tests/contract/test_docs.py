@@ -196,6 +196,7 @@ def test_defaults_in_help_are_the_library_s() -> None:
         "fit_steps",
         "seed",
         "photo_scale",
+        "poses",
     }
     known |= {"levels", "device", "checkpoint", "geometry", "k_low", "k_high", "k_rule", "min_opacity"}
     known |= {"neighbors", "overlap", "iou", "similarity", "max_color"}
@@ -226,7 +227,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
     """Merging and segmentation options carry the API's names."""
     fields = set(gsmerge.CompactOptions().to_dict())
     own = {"output", "overwrite", "report", "json", "quiet", "dry-run", "debug", "cameras", "images", "opacity"}
-    own |= {"exporter", "quats", "order", "scene-scale", "max-side", "no-normals", "no-viewer-cameras"}
+    own |= {"exporter", "quats", "order", "scene-scale", "max-side", "no-normals", "no-viewer-cameras", "save-cameras"}
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
     assert {name.replace("-", "_") for name in names} - fields == set()
 
@@ -272,7 +273,7 @@ def stability_rows(root: Path) -> list[tuple[str, str]]:
 
 def test_every_stability_case_is_listed(root: Path) -> None:
     numbers = [int(n) for case, _ in stability_rows(root) for n in case.split(",")]
-    assert numbers == list(range(1, 57))
+    assert numbers == list(range(1, 58))
 
 
 def test_stability_cases_name_tests_that_are_there(root: Path) -> None:

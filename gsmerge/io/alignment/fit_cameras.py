@@ -12,6 +12,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.alignment.grid import GridFit, other_grids, photo_grid, small_photos_error
 from gsmerge.io.alignment.layouts import MAY_BE_UNALIGNED
+from gsmerge.io.alignment.move_cameras import MovedCameras, recover_moved
 from gsmerge.io.alignment.poses import choose_fit, find_aligned_poses, other_conventions
 from gsmerge.io.alignment.recover import MARGIN, Recovery, recover
 from gsmerge.io.alignment.score import AlignmentInput, color_error
@@ -34,6 +35,7 @@ class CameraFit:
     camera_file: CameraFile  # as it was read in the end
     notes: list[str]  # what was adapted
     transform: PhotoTransform | None = None  # what was done to the photos
+    moved: MovedCameras | None = None  # the cameras of the input where they were moved to their Gaussians
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,12 @@ def fit_cameras(
         raise problem or SceneError(camera_file.path, "expected the image size of the cameras, found none")
     inputs, notes = _make_input(source, camera_file, plain), list(plain.notes)
     recovery = recover(inputs)
+    if recovery is None and order not in MAY_BE_UNALIGNED:
+        found = recover_moved(inputs, camera_file)
+        if found is not None:
+            moved, recovery = found
+            inputs, notes = replace(inputs, cameras=moved.cameras), [*notes, moved.note]
+            return CameraFit(inputs, recovery, camera_file, notes, plain.transform, moved)
     if recovery is None and not searched:
         other_size = _other_size(source, camera_file)
         if other_size is not None:

@@ -76,7 +76,7 @@ def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery |
     if plain is not None:
         return plain
     scores: list[AlignmentScore] = []
-    layouts = _exact(inputs)
+    layouts = exact_layouts_of(inputs)
     for effort in (0,) if exact_frames else (0, 1, 2):
         if not any(score.ok for score in scores):
             scores += [score for layout in layouts for score in _readings(inputs, layout, effort)]
@@ -163,7 +163,7 @@ def _stands_out(best: AlignmentScore, shuffled_px: float) -> bool:
     return best.ok and shuffled_px >= SHUFFLED_MARGIN * max(best.worst_px, _SMALLEST_PX)
 
 
-def _exact(inputs: AlignmentInput) -> list[Layout]:
+def exact_layouts_of(inputs: AlignmentInput) -> list[Layout]:
     """The layouts that the number of rows allows, or the depth maps next to the cameras."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     layouts = list(exact_layouts(count, len(cameras), cameras.width, cameras.height))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry import normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io.hints import QuatChoice
 from gsmerge.types import PixelScene
 
@@ -43,7 +43,7 @@ def read_rotations(scene: PixelScene, quats: QuatChoice) -> PixelScene:
         first, second = (_cosines(root, thinnest, normals) for root in roots)
         read = np.where((second > first)[:, None], roots[1], roots[0])
     else:
-        read = _multiply(_camera_quats(scene).repeat(scene.pixels_per_view, 0), stored)
+        read = multiply_quats(_camera_quats(scene).repeat(scene.pixels_per_view, 0), stored)
     return replace(scene, gaussians=replace(scene.gaussians, quats=read))
 
 
@@ -77,7 +77,7 @@ def choose_rotations(scene: PixelScene) -> tuple[QuatChoice, str]:
         return "wxyz", ""
     thinnest, quats = scene.gaussians.scales[rows].argmin(1), scene.gaussians.quats[rows]
     as_xyzw = from_xyzw(quats)
-    single = [quats, as_xyzw, _multiply(_camera_quats(scene)[views], quats)]
+    single = [quats, as_xyzw, multiply_quats(_camera_quats(scene)[views], quats)]
     means = (float(_cosines(read, thinnest, normals).mean()) for read in single)
     cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
     best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
@@ -166,13 +166,3 @@ def _normals(scene: PixelScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     across = (means[rows + _STEP] - means[rows - _STEP]).astype(np.float32)
     down = (means[rows + _STEP * w] - means[rows - _STEP * w]).astype(np.float32)
     return normalize(np.cross(across, down)), rows, rows // (h * w)
-
-
-def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products of quaternions wxyz: first ``b``, then ``a``."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
-    product = [
-        aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
-    ]  # fmt: skip
-    return np.stack(product, 1)

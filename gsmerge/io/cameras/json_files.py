@@ -20,6 +20,7 @@ from gsmerge.io.cameras.camera_file import (
     CameraFile,
     Lens,
     View,
+    from_viewmats,
     make_camera_file,
     make_lens,
     make_pinhole,
@@ -245,6 +246,20 @@ def viewer_cameras_path(output: Path) -> Path:
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
     ending = ".cameras.json"
     return output.with_name(os.fsencode(stem)[: _MAX_NAME - len(ending)].decode("utf-8", "ignore") + ending)
+
+
+def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    """Write cameras as nerfstudio's ``transforms.json``, with all intrinsics; :func:`read_transforms` reads it."""
+    poses = from_viewmats(cameras.viewmats.astype(np.float64), C2W_OPENGL)
+    frames = [
+        {
+            "file_path": name, "w": cameras.width, "h": cameras.height,
+            "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2]),
+            "transform_matrix": pose.tolist(),
+        }
+        for name, K, pose in zip(names, cameras.Ks, poses, strict=True)
+    ]  # fmt: skip
+    path.write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1) + "\n", encoding="utf-8")
 
 
 def write_viewer_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> None:

@@ -19,8 +19,8 @@ from gsmerge.stages.prepare import scene_frame
 from gsmerge.types import SH_C0, Cameras, PixelScene, UnalignedScene
 from gsmerge.views import even_views, subset
 
-Needs = Literal["anything", "pixels", "photos", "file"]
-Check = Literal["better", "same", "near", "once", "bits", "again", "convention"]
+Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]
+Check = Literal["better", "same", "near", "once", "bits", "again", "convention", "moved", "refused"]
 
 UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
 
@@ -32,6 +32,8 @@ PROPERTIES: dict[Check, str] = {
     "bits": "the same result, bit for bit",
     "again": "compacted again to the same count, not more than {same:g} dB below",
     "convention": "recognised, with every Gaussian at its pixel, or refused in one line",
+    "moved": "read with cameras moved to where every view's Gaussians lie in their pixels",
+    "refused": "refused in one line",
 }
 SEED = 7  # of all random choices
 FAR_SHARE = 2.5e-5  # share of the Gaussians that are moved far away
@@ -104,6 +106,28 @@ def perturb_poses(given: StressScene, degrees: float) -> StressScene:
     return replace(given, scene=replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats)))
 
 
+def move_view(given: StressScene, share: float) -> StressScene:
+    """The middle view, with its Gaussians, moved sideways by a share of the scene's size."""
+    scene = given.scene
+    assert isinstance(scene, PixelScene)
+    view, viewmats = len(scene) // 2, scene.cameras.viewmats.astype(np.float64)
+    step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
+    viewmats[view, :3, 3] -= viewmats[view, :3, :3] @ step
+    means = scene.gaussians.means.astype(np.float64)
+    means[view * scene.pixels_per_view : (view + 1) * scene.pixels_per_view] += step
+    gaussians = replace(scene.gaussians, means=means)
+    return replace(given, scene=replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats)))
+
+
+def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:
+    """Some cameras, without their Gaussians, turned about their centres, each about another axis."""
+    turned, rng = viewmats.copy(), np.random.default_rng(SEED)
+    for view in range(len(viewmats))[views]:
+        axis = rng.normal(size=3)
+        turned[view, :3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0] @ viewmats[view, :3]
+    return turned
+
+
 def change_exposure(given: StressScene, share: float) -> StressScene:
     """Photos, and the Gaussians of their views, alternately brighter and darker."""
     scene = given.scene
@@ -159,12 +183,14 @@ class Case:
     name: str  # on the command line
     words: str  # the change in words
     check: Check  # which property must hold, see ``PROPERTIES``
-    # "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file
+    # "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file; "pixel-file":
+    # that and one Gaussian per pixel
     needs: Needs = "anything"
     # returns the changed scene; None: the scene stays, the run differs
     change: Callable[[StressScene], StressScene] | None = None
     threads: int | None = None  # threads of the run; None: as in the options
     convention: tuple[str, str] | None = None  # pose convention to write, in the terms of camera files
+    cameras: Callable[[np.ndarray], np.ndarray] | None = None  # changes the viewmats of the camera file alone
 
 
 def _rewrite_poses(direction: str, axes: str) -> Case:
@@ -185,6 +211,11 @@ CASES: dict[str, Case] = {
         Case("poses-0.2", "poses 0.2 degrees off", "better", "photos", partial(perturb_poses, degrees=0.2)),
         Case("poses-1", "poses 1 degree off", "better", "photos", partial(perturb_poses, degrees=1.0)),
         Case("poses-5", "poses 5 degrees off", "better", "photos", partial(perturb_poses, degrees=5.0)),
+        Case("view-moved", "one view 2 % of the depth aside", "near", "photos", partial(move_view, share=0.02)),
+        Case("cameras-0.5", "cameras 0.5 degrees off, not their Gaussians", "moved", "pixel-file",
+             cameras=partial(turn_cameras, degrees=0.5, views=slice(None))),
+        Case("camera-far", "one camera 15 degrees off", "refused", "pixel-file",
+             cameras=partial(turn_cameras, degrees=15.0, views=slice(1))),
         Case("exposure", "exposure +-20 % by turns", "better", "photos", partial(change_exposure, share=0.2)),
         Case("utm", "moved to map coordinates", "same", "anything", partial(move, factor=1.0, shift=UTM)),
         Case("small", "scaled by 1e-4", "same", "anything", partial(move, factor=1e-4, shift=(0, 0, 0))),

@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.budget import BudgetOptions
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import SceneLoad, align_scene, read_ply_with_hints
-from gsmerge.io.cameras.camera_file import from_viewmats, to_viewmats
+from gsmerge.io.cameras.camera_file import CameraFile, from_viewmats, to_viewmats
 from gsmerge.io.formats.ply import OpacityChoice
 from gsmerge.io.hints import AUTO, ReadHints
 from gsmerge.measure.evaluate import EvaluateOptions, Views, evaluate
@@ -84,7 +84,7 @@ def stress(
     options = options or CompactOptions()
     report = progress or (lambda *_: None)
     given = StressScene(load.scene, targets)
-    base = _run(given, options) if any(CASES[name].check != "convention" for name in names) else None
+    base = _run(given, options) if any(CASES[name].needs not in ("file", "pixel-file") for name in names) else None
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
@@ -105,6 +105,8 @@ def _check_case(
         return None, problem
     if case.check == "convention":
         return _check_convention(case, load, hints)
+    if case.cameras is not None:
+        return _check_cameras(case, load, hints)
     assert base is not None
     try:
         if case.check == "again":
@@ -121,11 +123,11 @@ def _check_case(
 def _inapplicable(case: Case, load: SceneLoad) -> str | None:
     """Why a case does not apply to a scene; None where it does."""
     scene = load.scene
-    if case.needs in ("pixels", "photos") and not isinstance(scene, PixelScene):
+    if case.needs in ("pixels", "photos", "pixel-file") and not isinstance(scene, PixelScene):
         return "needs a Gaussian for each pixel"
     if case.needs == "photos" and scene.images is None:
         return "needs photos"
-    if case.needs == "file":
+    if case.needs in ("file", "pixel-file"):
         if load.cameras is None:
             return "needs cameras from a file"
         if case.convention == load.cameras.convention:
@@ -190,15 +192,35 @@ def _check_convention(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bo
     stored = from_viewmats(load.cameras.viewmats, case.convention)
     wrong = replace(load.cameras, viewmats=to_viewmats(stored, load.cameras.convention))
     try:
-        opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
-        ply = read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints)
-        read = align_scene(ply, load.files, wrong, hints=hints).scene
+        read = _read_again(load, wrong, hints).scene
     except SceneError as error:
         return True, f"refused: {error.problem}"
     expected, viewmats = load.scene.cameras.viewmats, read.cameras.viewmats
     tolerance = 1e-3 * (1 + np.abs(expected).max())
     same = expected.shape == viewmats.shape and np.allclose(expected, viewmats, atol=tolerance)
     return bool(same), "recognised" if same else "taken for something else"
+
+
+def _check_cameras(case: Case, load: SceneLoad, hints: ReadHints) -> tuple[bool, str]:
+    """The scene read from cameras that are off, whose Gaussians are not."""
+    assert load.cameras is not None
+    assert case.cameras is not None
+    wrong = replace(load.cameras, viewmats=case.cameras(load.cameras.viewmats))
+    try:
+        read = _read_again(load, wrong, hints)
+    except SceneError as error:
+        return case.check == "refused", f"refused: {error.problem}"
+    if read.alignment is None:
+        return False, "taken for an unaligned scene"
+    return case.check == "moved" and read.alignment.ok, f"{read.alignment.worst_px:.2f} px from the pixels"
+
+
+def _read_again(load: SceneLoad, cameras: CameraFile, hints: ReadHints) -> SceneLoad:
+    """The scene's own file with other cameras."""
+    opacity: OpacityChoice = "raw" if load.ply.opacity_encoding == "raw" else "logit"
+    return align_scene(
+        read_ply_with_hints(load.files.ply, opacity=opacity, hints=hints), load.files, cameras, hints=hints
+    )
 
 
 def _find_defect(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> str | None:

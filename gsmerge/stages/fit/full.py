@@ -25,6 +25,7 @@ from gsmerge.stages.fit.grow import grow_to
 from gsmerge.stages.fit.holdout import holdout_psnr, reduced, training_weights
 from gsmerge.stages.fit.loss import image_gradient
 from gsmerge.stages.fit.options import EARLIER, LONG_STEPS, FitOptions, LearningRates
+from gsmerge.stages.fit.poses import PoseState, start_poses
 from gsmerge.stages.fit.report import FitReport
 from gsmerge.stages.fit.state import State, gaussians_of, start_state
 from gsmerge.types import Array, Gaussians
@@ -65,6 +66,7 @@ class Plan:
         options: What a step does.
         dropout: Share of the Gaussians that a step leaves out.
         half_part: Share of the steps, the first ones, on half-size photos.
+        poses: The motions of the cameras; None where they are fixed.
     """
 
     photos: tuple[Photos, ...]
@@ -73,6 +75,7 @@ class Plan:
     options: FitOptions
     dropout: float
     half_part: float
+    poses: PoseState | None = None
 
     def level_at(self, step: int, progress: float) -> int:
         """Which photos a step looks at: half-size ones first, then full-size ones, and larger ones in between."""
@@ -96,7 +99,10 @@ def plan_run(photos: tuple[Photos, ...], options: FitOptions, seed: int, masks: 
     half_part = options.half_res_part
     if len(photos) > 2 and options.half_res_share is None:
         half_part -= EARLIER
-    return Plan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part)
+    poses = None
+    if options.poses == "free":
+        poses, photos = start_poses(photos)
+    return Plan(photos, weights, (everywhere, trained, *ones), options, dropout, half_part, poses)
 
 
 def _hidden(weights: list[np.ndarray], masks: np.ndarray) -> list[np.ndarray]:
@@ -118,7 +124,9 @@ def fit_step(state: State, plan: Plan, view: int, step: int, progress: float, rn
     colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
     image, transmittance = blend(drawn, colors, background)
     gradient, error = image_gradient(image, photos.image(view), weight, plan.options.ssim_lambda)
-    g = gradients_of(drawn, colors, image, transmittance, gradient, NO_LOSS, with_viewmat=False)
+    g = gradients_of(drawn, colors, image, transmittance, gradient, NO_LOSS, with_viewmat=plan.poses is not None)
+    if plan.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
+        plan.poses.step(view, g.viewmat, plan.options.rates, progress)
     rates, s, count = plan.options.rates, state.splats, max(len(state.x), 1)
     g.opacities[:] += np.float32(plan.options.opacity_reg / count)
     g.scales[:] += np.float32(plan.options.scale_reg / count) / state.units[g.ids, None]
@@ -261,7 +269,7 @@ def fit_full(
     while step < steps:
         part = step / steps
         if grows and part >= GROWTH and len(state.x) < count:
-            state = grow_to(state, photos[1], count)
+            state = grow_to(state, plan.photos[1], count)
         if part >= plan.half_part and not judged:
             after, judged = holdout_score(state, plan), True
             if after <= before:
@@ -281,9 +289,11 @@ def fit_full(
         why = f"held-out parts of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why)
     if grows:  # a time budget may end before the growth
-        state = grow_to(state, photos[1], count)
+        state = grow_to(state, plan.photos[1], count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
-    return gaussians_of(tail.of(state.x), state.splats.shN), FitReport("full", True, step, before, after, why)
+    viewmats = None if plan.poses is None else plan.poses.viewmats
+    fitted = gaussians_of(tail.of(state.x), state.splats.shN)
+    return fitted, FitReport("full", True, step, before, after, why, viewmats)
 
 
 def affordable_steps(seconds: float, plan: Plan) -> int:

@@ -8,6 +8,7 @@ from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
+Poses = Literal["auto", "fixed", "free"]
 STEPS = {"draft": 30, "fast": 50, "default": 240, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
@@ -27,7 +28,8 @@ class LearningRates:
         quats_lr: Step of a quaternion.
         opacities_lr: Step of an opacity's logit.
         colors_lr: Step of a colour, sRGB in [0, 1].
-        decay: Factor on all steps at the end of the run; runs of more than 300 steps end lower in proportion.
+        poses_lr: First step of a camera where cameras are moved: turns and shifts by so many pixels.
+        decay: Factor on all other steps at the end of the run; runs of more than 300 steps end lower in proportion.
         beta1: Decay of Adam's first moment.
         beta2: Decay of its second moment.
         max_mean_shift: Farthest that a mean may go from its start, in units of the Gaussian's size.
@@ -44,6 +46,7 @@ class LearningRates:
     quats_lr: float = 0.03
     opacities_lr: float = 0.3
     colors_lr: float = 0.03
+    poses_lr: float = 0.1
     decay: float = 0.4
     beta1: float = 0.5
     beta2: float = 0.9
@@ -88,6 +91,9 @@ class FitOptions:
         holdout: Share of the photos' blocks that decides whether a fit is accepted.
         min_contribution: Least blending weight at some pixel of some photo; Gaussians below it in all photos that they
             lie in are left out.
+        poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree before anything is
+            merged, and the full fit moves the cameras on (on the CPU); ``"fixed"``: cameras stay where they are;
+            ``"auto"``: free where the photos show that some view is more than 1.5 pixels off, fixed elsewhere.
         device: Where the fit runs, and in :func:`gsmerge.compact` all stages that can: ``"cpu"``; ``"cuda"``, which
             draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits; ``"auto"``: CUDA
             where it can be used and the scene is large enough that it pays.
@@ -115,6 +121,7 @@ class FitOptions:
     max_gain: float = 2.0
     holdout: float = 0.05
     min_contribution: float = 1 / 255
+    poses: Poses = "auto"
     device: Device = "cpu"
 
     @property
@@ -155,6 +162,8 @@ class FitOptions:
             object.__setattr__(self, "rates", LearningRates(**self.rates))
         if self.fit not in ("none", "color", "full"):
             raise ValueError(f'fit: expected "none", "color" or "full", got "{self.fit}"')
+        if self.poses not in ("auto", "fixed", "free"):
+            raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
         if self.effort not in STEPS:
             raise ValueError(f"effort: expected one of {', '.join(STEPS)}, got {self.effort!r}")
         if self.steps < 1:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class FitReport:
@@ -16,6 +18,7 @@ class FitReport:
         holdout_before: PSNR (dB) on the held-out blocks before the fit.
         holdout_after: The same after it.
         stopped: Why it ended.
+        viewmats: ``[v,4,4]`` poses of the photos after the fit; None where they were fixed.
     """
 
     method: str
@@ -24,3 +27,4 @@ class FitReport:
     holdout_before: float
     holdout_after: float
     stopped: str
+    viewmats: np.ndarray | None = None

@@ -120,9 +120,11 @@ def _better_of(
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report
-    if backend.photo_error(after, photos) <= backend.photo_error(before, photos):
+    moved: PhotosT = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats)  # type: ignore
+    if backend.photo_error(after, moved) <= backend.photo_error(before, photos):
         return after, report
-    return before, replace(report, method="none", accepted=False, stopped="the photos as a whole were shown worse")
+    why = "the photos as a whole were shown worse"
+    return before, replace(report, method="none", accepted=False, stopped=why, viewmats=None)
 
 
 def _device(options: FitOptions, photos: Photos) -> str:

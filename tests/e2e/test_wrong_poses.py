@@ -1,0 +1,85 @@
+"""Scenes whose cameras are wrong, as users meet them: moved with a note, written on request, or refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gsmerge.geometry import pose_changes
+from gsmerge.io import load_scene
+from gsmerge.io.cameras.read import read_cameras
+
+from .conftest import Run
+
+FAST = ("--effort", "fast", "--json")
+
+
+@pytest.fixture(scope="module")
+def exact(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Large enough that half a degree is more than a pixel and a half. Read only."""
+    return make_scene(tmp_path_factory.mktemp("poses") / "scene", num_views=5, width=288, height=192)
+
+
+def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:
+    """The cameras of a scene, or one of them, turned about their centres."""
+    path, rng = folder / "transforms.json", np.random.default_rng(0)
+    data = json.loads(path.read_text())
+    for i, frame in enumerate(data["frames"]):
+        axis = rng.normal(size=3)
+        if only in (None, i):
+            turn = np.eye(4)
+            turn[:3, :3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0]
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
+    path.write_text(json.dumps(data))
+
+
+@pytest.fixture
+def wrong(exact: Path, tmp_path: Path) -> Path:
+    folder = Path(shutil.copytree(exact, tmp_path / "wrong"))
+    turn_cameras(folder, 0.8)
+    return folder
+
+
+def test_cameras_that_are_a_little_off(exact: Path, wrong: Path, tmp_path: Path, run: Run) -> None:
+    psnr: dict[str, Any] = {}
+    for folder in (exact, wrong):
+        outcome = run("compact", folder, *FAST, "-o", tmp_path / f"{folder.name}.ply", "--overwrite")
+        assert outcome.code == 0, outcome.err
+        document = json.loads(outcome.out)
+        psnr[folder.name] = document["psnr_input_views"]
+        notes = [note for note in document["notes"] if "the cameras are off by a median of" in note]
+        moves = [move["degrees"] for move in document["input"]["moved_cameras"]]
+        assert (len(notes), len(moves)) == ((1, 5) if folder is wrong else (0, 0))
+    assert psnr["wrong"]["before"] == pytest.approx(psnr["scene"]["before"], abs=0.3)
+    assert psnr["wrong"]["after"] == pytest.approx(psnr["scene"]["after"], abs=0.5)
+
+
+def test_the_cameras_as_used_are_written(exact: Path, wrong: Path, tmp_path: Path, run: Run) -> None:
+    saved = tmp_path / "saved.json"
+    outcome = run("compact", wrong, *FAST, "-o", tmp_path / "a.ply", "--save-cameras", saved)
+    assert outcome.code == 0, outcome.err
+    truth, cameras = read_cameras(exact / "transforms.json"), read_cameras(saved)
+    assert pose_changes(truth.viewmats, cameras.viewmats)[0].max() < 0.1
+    np.testing.assert_allclose(cameras.Ks, truth.Ks)
+    shown = read_cameras(tmp_path / "a.cameras.json")
+    np.testing.assert_allclose(shown.viewmats, cameras.viewmats, atol=1e-6)
+    shutil.copy(saved, wrong / "transforms.json")  # in the place of the wrong ones
+    assert load_scene(wrong).moves == ()
+    assert run("compact", wrong, *FAST, "-o", tmp_path / "b.ply", "--save-cameras", saved).code == 2  # it exists
+
+
+def test_cameras_that_are_far_off(exact: Path, tmp_path: Path, run: Run) -> None:
+    folder = Path(shutil.copytree(exact, tmp_path / "far"))
+    turn_cameras(folder, 15, only=2)
+    outcome = run("compact", folder, *FAST, "-o", tmp_path / "a.ply")
+    assert outcome.code == 3
+    assert outcome.err.count("\n") == 1
+    assert "px of their own pixels, found a median of up to" in outcome.err
+    assert not (tmp_path / "a.ply").exists()

@@ -1,0 +1,117 @@
+"""Views that do not agree with each other are found and moved; those that agree are left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import PixelScene, compact
+from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
+from gsmerge.geometry import without_common_motion as without_common
+from gsmerge.runtime.threads import use_threads
+from gsmerge.stages.align_views import align_views, move_views
+
+VIEWS = range(5)
+
+
+@pytest.fixture(scope="module")
+def scene() -> PixelScene:
+    made = scenes.make_scene(scenes.room(), scenes.arc(5, 160, 120))
+    back = -np.median(made.gaussians.means[:, 2])  # the canonical frame is about the scene's middle
+    return scenes.move(made, np.eye(3), 0.5, np.array([0, 0, 0.5 * back]))
+
+
+def perturbed(scene: PixelScene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> PixelScene:
+    """Views moved with their Gaussians."""
+    vectors = np.random.default_rng(2).normal(size=(2, 5, 3))
+    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True)
+    motions = np.zeros((5, 6))
+    motions[views] = np.concatenate([np.deg2rad(degrees) * vectors[0], shift * vectors[1]], 1)[views]
+    return move_views(scene, motion_matrices(motions) @ scene.cameras.viewmats)
+
+
+def worst_error(scene: PixelScene, truth: PixelScene) -> tuple[float, float]:
+    """Degrees and distances between relative poses."""
+    relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
+    degrees, distances = pose_changes(*relative)
+    return float(degrees.max()), float(distances.max())
+
+
+def test_moved_gaussians_stay_at_their_pixels(scene: PixelScene) -> None:
+    moved = perturbed(scene)
+    for view in VIEWS:
+        rows = slice(view * scene.pixels_per_view, (view + 1) * scene.pixels_per_view)
+        (before,), _ = project(scene.gaussians.means[rows], scene.cameras[[view]])
+        (after,), _ = project(moved.gaussians.means[rows], moved.cameras[[view]])
+        np.testing.assert_allclose(before, after, atol=1e-2)
+        axes = [
+            one.cameras.viewmats[view, :3, :3] @ quat_to_rotmat(one.gaussians.quats[rows]) for one in (scene, moved)
+        ]
+        np.testing.assert_allclose(*axes, atol=1e-5)
+
+
+def test_views_that_agree_are_left_alone(scene: PixelScene) -> None:
+    assert align_views(scene, VIEWS) is None
+
+
+@pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
+def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) -> None:
+    wrong = perturbed(scene, views=views)
+    before = worst_error(wrong, scene)
+    found = align_views(wrong, VIEWS)
+    assert found is not None
+    degrees, distance = worst_error(found, scene)
+    assert degrees < 0.25 * before[0]
+    assert distance < 0.25 * before[1]
+    common = motion_vectors(wrong.cameras.viewmats, found.cameras.viewmats)
+    np.testing.assert_allclose(np.median(common, 0), 0, atol=2e-3)
+
+
+def test_the_same_with_one_thread(scene: PixelScene) -> None:
+    wrong, found = perturbed(scene), []
+    for threads in (1, 2):
+        with use_threads(threads):
+            found.append(align_views(wrong, VIEWS))
+    assert found[0] is not None
+    assert found[1] is not None
+    np.testing.assert_array_equal(found[0].cameras.viewmats, found[1].cameras.viewmats)
+    np.testing.assert_array_equal(found[0].gaussians.means, found[1].gaussians.means)
+
+
+@pytest.mark.parametrize("size", [(12, 8), (40, 1)])
+def test_nothing_can_be_told_of_tiny_photos(size: tuple[int, int]) -> None:
+    tiny = scenes.make_scene(scenes.room(), scenes.arc(3, *size))
+    assert align_views(tiny, range(3), always=True) is None
+
+
+def test_one_view_agrees_with_itself(scene: PixelScene) -> None:
+    assert align_views(scenes.take_views(scene, [0]), [0], always=True) is None
+
+
+def test_no_motion_in_common() -> None:
+    start = np.tile(np.eye(4), (3, 1, 1))
+    together = start @ motion_matrices(np.tile([0.1, 0.2, -0.1, 1.0, 2.0, 3.0], (3, 1)))
+    np.testing.assert_allclose(without_common(start, together, np.mean), start, atol=1e-12)
+
+
+def test_compacting_says_how_far_views_were_moved(scene: PixelScene) -> None:
+    wrong, settings = perturbed(scene), {"fit_steps": 12, "superpixels": "2%"}
+    fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
+    assert "poses" not in fixed.report.choices
+    np.testing.assert_array_equal(fixed.cameras.viewmats, wrong.cameras.viewmats)
+    assert [move["view"] for move in auto.report.choices["poses"]] == list(wrong.names)
+    assert sum("cameras were moved by" in note for note in auto.report.notes) == 1
+    assert worst_error(replace(wrong, cameras=auto.cameras), scene)[0] < 0.25 * worst_error(wrong, scene)[0]
+    assert len(auto.gaussians) < 0.7 * len(fixed.gaussians)  # what two views show is merged where they agree on it
+    assert auto.report.psnr_after > fixed.report.psnr_after - 0.2
+
+
+def test_right_poses_are_the_same_run(scene: PixelScene) -> None:
+    settings = {"fit_steps": 12, "superpixels": "2%"}
+    fixed, auto = (compact(scene, **settings, poses=poses) for poses in ("fixed", "auto"))
+    np.testing.assert_array_equal(fixed.gaussians.means, auto.gaussians.means)
+    np.testing.assert_array_equal(fixed.gaussians.sh0, auto.gaussians.sh0)
+    np.testing.assert_array_equal(auto.cameras.viewmats, scene.cameras.viewmats)
