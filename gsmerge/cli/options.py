@@ -353,6 +353,8 @@ _TABLE = (
                "do (Mip-Splatting)."),
         switch("no_normals", "Leave the three columns of zeros out of a .ply, 12 of its 68 bytes per Gaussian; a "
                "--budget in bytes counts them.", rare=True),
+        option("spz_version", int, "Version of a .spz: 3, which most programs read, or 4, with room for harmonics of "
+               "degree 4; it needs gsmerge[spz4].", default=3, rare=True, min=3, max=4),
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
         switch("no_viewer_cameras", "Do not write the input views beside the result, as NAME.cameras.json for viewers.",

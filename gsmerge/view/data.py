@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 import cv2
 import numpy as np
 
 from gsmerge.geometry import project
-from gsmerge.io.formats import spz_writer
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
 from gsmerge.measure.preview import Picture, to_picture
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views
 
-MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
-MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
-MIN_OPACITY = 1 / 255  # what is fainter is not drawn
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 
@@ -33,7 +30,7 @@ class Side:
     num_gaussians: int
     file_bytes: int
     mean: Quality  # over the views that count: the held-out ones where there are any
-    spz: bytes | None  # the Gaussians in the page's frame; None: too many for a page
+    splats: bytes | None  # the Gaussians in the page's frame, see :mod:`gsmerge.view.splats`; None: too many for a page
     sh_degree: int  # of the harmonics that the page has
     file_sh_degree: int  # of those in the file
 
@@ -155,27 +152,9 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 
 def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:
-    spz, degree = page_spz(gaussians)
+    splats, degree = pack_splats(gaussians)
     mean = result.mean(split)[1]
-    return Side(result.name, result.num_gaussians, file_bytes, mean, spz, degree, gaussians.sh_degree)
-
-
-def page_spz(gaussians: Gaussians) -> tuple[bytes | None, int]:
-    """Those that are drawn as ``.spz`` with as many harmonics as fit, and their degree; None where there are too many.
-
-    Args:
-        gaussians: In the page's frame, where what is seen is about 1 large: browsers keep means in 16 bits.
-    """
-    drawn = gaussians.opacities >= MIN_OPACITY
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
-        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
-    count = int(drawn.sum())
-    if count > MAX_GAUSSIANS:
-        return None, 0
-    sizes = {degree: (20 + 3 * ((degree + 1) ** 2 - 1)) * count for degree in range(spz_writer.MAX_DEGREE + 1)}
-    degree = max((d for d, size in sizes.items() if d <= gaussians.sh_degree and size <= MAX_SPZ_BYTES), default=0)
-    kept = replace(gaussians, shN=gaussians.shN[:, : (degree + 1) ** 2 - 1])[drawn]
-    return spz_writer.spz_bytes(kept), degree
+    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest_degree(gaussians.shN))
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
@@ -194,7 +173,7 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
     """What the page leaves out."""
     notes = []
     for side in sides:
-        if side.spz is None:
+        if side.splats is None:
             notes.append(
                 f"{side.name}: {side.num_gaussians:,} Gaussians are too many for a page, which takes"
                 f" {MAX_GAUSSIANS:,}: stills only"

@@ -73,12 +73,12 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     assert base64.b64decode(address.removeprefix("data:image/webp;base64,")) == data.views[1].stills[1]
     assert page.index("data:image/webp") < page.index("<script")
     for i, side in enumerate(data.sides):
-        assert base64.b64decode(block(page, f"splats-{i}")) == side.spz
+        assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
     assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
 
 
 def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
-    page = view_page(replace(data, sides=tuple(replace(side, spz=None) for side in data.sides)))
+    page = view_page(replace(data, sides=tuple(replace(side, splats=None) for side in data.sides)))
     assert 'id="engine"' not in page
     assert "class SplatView" not in page
     assert len(page) < 200_000
