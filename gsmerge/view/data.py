@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import cv2
@@ -11,14 +13,18 @@ import numpy as np
 
 from gsmerge.geometry import project
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
-from gsmerge.measure.preview import Picture, to_picture
+from gsmerge.measure.preview import Picture, borders, to_picture
+from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
+from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views
 
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
+OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
+OUTLINE_COLOR = (255, 230, 40)
 DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 
 
@@ -47,6 +53,7 @@ class PageView:
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
+    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,7 @@ class ViewData:
         num_views: Views that were measured, which may be more.
         reference: What scores compare with, in words.
         notes: Warnings and limits, one sentence each.
+        num_superpixels: Of each photo with outlines; None where there are none.
     """
 
     title: str
@@ -68,6 +76,7 @@ class ViewData:
     num_views: int
     reference: str
     notes: tuple[str, ...]
+    num_superpixels: int | None = None
 
     @property
     def held_out(self) -> bool:
@@ -82,6 +91,7 @@ def collect(
     file_bytes: Sequence[int],
     held_out: Views | None = None,
     *,
+    segmentation: SegmentOptions | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ViewData:
@@ -93,6 +103,7 @@ def collect(
         results: Gaussians by name, in the scene's world.
         file_bytes: Sizes of the scene's file and of those of the results.
         held_out: Views that were no input.
+        segmentation: How the input photos are cut into superpixels; None: as by default.
         threads: Threads to use; None: all processors.
         progress: As of :func:`gsmerge.evaluate`.
     """
@@ -126,9 +137,24 @@ def collect(
                 stills=tuple(stills[one.name, split, i] for one in evaluation.results),
                 scores=tuple(one.scores[len(views)].masked for one in evaluation.results),
             ))  # fmt: skip
-    shown = _shown(views)
+    with use_threads(threads):
+        shown, num_superpixels = with_outlines(_shown(views), scene.images, segmentation or SegmentOptions())
     notes = (*evaluation.notes, *_limits(sides, len(shown), len(views)))
-    return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes)
+    return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes, num_superpixels)
+
+
+def with_outlines(
+    views: Sequence[PageView], photos: np.ndarray | None, options: SegmentOptions
+) -> tuple[tuple[PageView, ...], int | None]:
+    """The views with outlines of the superpixels of the input photos ``[v,h,w,3]``, and how many those are."""
+    places = [i for i, view in enumerate(views) if not view.held_out]
+    if photos is None or not places:
+        return tuple(views), None
+    groups = segment(photos[[views[i].place for i in places]], options)
+    made = list(views)
+    for i, labels in zip(places, groups.labels, strict=True):
+        made[i] = replace(views[i], outlines=encode_outlines(labels))
+    return tuple(made), groups.counts[0]
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -141,6 +167,25 @@ def encode_still(picture: Picture) -> bytes:
     """A picture as WebP."""
     _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
     return bytes(data.tobytes())
+
+
+def encode_outlines(labels: np.ndarray) -> bytes:
+    """Borders between superpixels ``[h,w]`` as PNG of several times their size: fine lines on nothing."""
+    factor = max(1, OUTLINE_SIDE // max(labels.shape))
+    lines = borders(labels.repeat(factor, 0).repeat(factor, 1))
+    rows = np.pad(np.packbits(lines, axis=1), ((0, 0), (1, 0)))  # a zero begins each: stored as it is
+    parts = {
+        b"IHDR": struct.pack(">IIBBBBB", lines.shape[1], lines.shape[0], 1, 3, 0, 0, 0),  # one bit, a palette
+        b"PLTE": bytes(3) + bytes(OUTLINE_COLOR),
+        b"tRNS": bytes([0, 255]),
+        b"IDAT": zlib.compress(rows.tobytes(), 9),
+        b"IEND": b"",
+    }
+    chunks = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts.items()
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:

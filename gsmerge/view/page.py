@@ -51,6 +51,7 @@ def view_page(data: ViewData) -> str:
         first=first,
         json_data={"sources": sources, "photos": photos, "views": [_view(view) for view in data.views]},
         stills=stills,
+        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.views],
         splats=splats,
         engine=engine and base64_text(engine),
     )

@@ -163,6 +163,24 @@ def test_keys(opened: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
+def test_outlines_of_superpixels(opened: tuple[Browser, Any]) -> None:
+    """Yellow lines on stills and in 3D, where the camera is that of an input photo."""
+    tab, _ = opened
+    tab.run(f"{BARE} set('mode', 'blink'); set('other', false); jump(data.views.findIndex(view => !view.held_out))")
+    for solid in ("''", "'1'"):
+        tab.run(f"set('solid', {solid})")
+        plain = picture(tab)
+        tab.press("o", 79)
+        lines = picture(tab) - plain
+        assert lines[..., 0].mean() > lines[..., 2].mean() + 0.02
+        assert tab.run("document.querySelector('[data-set=outlines][data-value=\"1\"]').ariaPressed") == "true"
+        tab.run("jump(data.views.findIndex(view => view.held_out))")
+        assert tab.run("id('outlines').hidden") is True
+        tab.press("o", 79)
+        tab.run("jump(data.views.findIndex(view => !view.held_out))")
+        assert psnr(picture(tab), plain) > 45
+
+
 def test_it_fits_a_phone(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)

@@ -17,6 +17,7 @@ from gsmerge.io.formats.spz_writer import spz_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.measure.preview import to_picture
 from gsmerge.render.metrics import psnr
+from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.view import data, splats
 from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, short_names
 from gsmerge.view.splats import pack_splats
@@ -150,6 +151,33 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     whole, _ = pack_splats(half)
     counts = [struct.unpack_from("<I", unpacked(one), 8)[0] for one in (content, whole)]
     assert counts[0] == counts[1] - 2
+
+
+def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: PixelScene) -> None:
+    """Of the input photos alone, as compact cuts them."""
+    assert actual.num_superpixels == int(0.044 * 160 * 120)
+    assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
+    assert scene.images is not None
+    view = next(view for view in actual.views if view.place == 1)
+    labels = segment(scene.images, SegmentOptions()).labels[1]
+    picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    factor = 1280 // 160
+    assert picture.shape == (120 * factor, 160 * factor, 4)
+    lines = picture[..., 3] > 0
+    assert {tuple(color) for color in picture[lines]} == {(40, 230, 255, 255)}
+    right, below = lines[factor // 2 :: factor, ::factor], lines[::factor, factor // 2 :: factor]
+    np.testing.assert_array_equal(right[:, 1:], labels[:, 1:] != labels[:, :-1])
+    np.testing.assert_array_equal(below[1:], labels[1:] != labels[:-1])
+    assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
+
+
+def test_superpixels_as_asked_for(scene: PixelScene, half: Gaussians) -> None:
+    asked = collect("room", scene, {"half": half}, (2, 1), segmentation=SegmentOptions(superpixels=50))
+    assert asked.num_superpixels == 50
+    none = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
+    assert none.num_superpixels is None
+    assert {view.outlines for view in none.views} == {None}
 
 
 def test_many_views_are_thinned(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
