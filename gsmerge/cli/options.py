@@ -240,7 +240,7 @@ READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
 COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
 MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
-CLEAN = "crop drop_floaters"
+CLEAN = "crop drop_floaters drop_sky"
 FIT = "fit effort device fit_steps photo_scale time_budget"
 NETWORKS = "recipe checkpoint require_checkpoint"
 RUN = "seed threads"
@@ -339,6 +339,7 @@ _TABLE = (
                "world units; a budget is met after it.", metavar="SHAPE"),
         option("drop_floaters", bool, "Leave out Gaussians that are isolated or far beyond the scene.",
                "--drop-floaters", rare=True),
+        option("drop_sky", bool, "Leave out Gaussians that are sky in the photos.", "--drop-sky", rare=True),
     ),
     panel(
         MEASURING,
