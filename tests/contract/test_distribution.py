@@ -105,6 +105,22 @@ def test_the_image_has_the_pinned_versions(root: Path) -> None:
     steps = (root / "Dockerfile").read_text()
     assert steps.count("\nFROM python:3.11-slim") == 1
     assert "pip install --no-cache-dir -c constraints.txt ." in steps
-    assert re.search(r"^torch==\S+$", (root / "constraints.txt").read_text(), re.MULTILINE)
     copied = {word for line in re.findall(r"^COPY (.+) \S+$", steps, re.MULTILINE) for word in line.split()}
-    assert copied >= set(SOURCES)
+    assert copied >= {*SOURCES, "constraints.txt"}
+    assert [name for name in copied if not (root / name).exists()] == []
+    assert copied & set((root / ".dockerignore").read_text().split()) == set()
+
+
+def test_what_the_image_runs(root: Path, project: dict[str, Any]) -> None:
+    """Its shell's own words, where they need no network; the program, and the variable that it sets."""
+    steps = (root / "Dockerfile").read_text()
+    search = re.findall(r"torch=\$\((.+)\)", steps)
+    found = subprocess.run(["sh", "-c", search[0]], cwd=root, capture_output=True, text=True, check=True).stdout
+    assert re.fullmatch(r"torch==\d+\.\d+\.\d+\n", found)
+    assert 'pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu "$torch"' in steps
+    (entry,) = re.findall(r'^ENTRYPOINT \["(.+)"\]$', steps, re.MULTILINE)
+    assert entry in project["scripts"]
+    sources = "".join(path.read_text() for path in (root / "gsmerge").rglob("*.py"))
+    names = re.findall(r"^ENV (\w+)=", steps, re.MULTILINE)
+    assert names == ["GSMERGE_CACHE_DIR"]
+    assert all(f'"{name}"' in sources for name in names)
