@@ -39,22 +39,30 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
         cameras: v views.
         photos: ``[v,h,w,3]`` sRGB in [0, 1], of the cameras' size.
     """
-    regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
-    shown = [
-        view
-        for view, region in regions.items()
-        if _pales_downwards(photos[view], region) or _is_far(gaussians.means, cameras[[view]], region)
-    ]
-    found = np.zeros(len(gaussians), bool)
-    if len(shown) < max(LEAST_VIEWS, LEAST_SHARE * len(photos)):
+    regions, found = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
+    if not regions:
         return found
     for _ in range(LAYERS):  # what the sky in front has hidden comes next
         rows = np.flatnonzero(~found)
-        above = _mostly_inside(gaussians[rows], cameras, {view: regions[view] for view in shown})
+        above = _mostly_inside(gaussians[rows], cameras, regions)
         found[rows[above]] = True
         if above.sum() < LAST_LAYER * found.sum():
             break
     return found
+
+
+def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
+    """The sky ``[h,w]`` bool of the views that show any, by their number; none where only few do.
+
+    Arguments as of :func:`sky`; ``means`` are ``[n,3]``, in the frame of the cameras.
+    """
+    regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
+    shown = {
+        view: region
+        for view, region in regions.items()
+        if _pales_downwards(photos[view], region) or _is_far(means, cameras[[view]], region)
+    }
+    return shown if len(shown) >= max(LEAST_VIEWS, LEAST_SHARE * len(photos)) else {}
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:

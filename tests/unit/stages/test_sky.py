@@ -12,7 +12,7 @@ import scenes
 from gsmerge import CompactOptions, PixelScene, compact, render
 from gsmerge.errors import UsageError
 from gsmerge.stages.clean import CleanOptions, clean
-from gsmerge.stages.sky import sky, sky_region
+from gsmerge.stages.sky import sky, sky_region, sky_regions
 from gsmerge.types import SH_C0
 
 WIDTH, HEIGHT, HORIZON = 96, 72, 30
@@ -107,6 +107,14 @@ def test_indoors_nothing_changes() -> None:
     whole, same = compact(scene, **QUICK), compact(scene, **QUICK, drop_sky=True)
     np.testing.assert_array_equal(whole.gaussians.means, same.gaussians.means)
     assert same.report.choices["clean"] == {"sky": 0}
+
+
+def test_views_that_show_it_are_counted() -> None:
+    """For ``inspect``."""
+    indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
+    for scene, views in ((painted(ZENITH, HAZE)[0], [0, 1, 2, 3]), (indoors, [])):
+        assert scene.images is not None
+        assert list(sky_regions(scene.gaussians.means, scene.cameras, scene.images)) == views
 
 
 def test_what_cannot_be() -> None:
