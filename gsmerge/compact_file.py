@@ -64,6 +64,7 @@ def compact_files(
     seconds_before: Mapping[str, float] | None = None,
     report_path: Path | None = None,
     normals: bool = True,
+    spz_version: int = 3,
     cameras_path: Path | None = None,
     saved_cameras: Path | None = None,
 ) -> dict[str, Any]:
@@ -82,6 +83,7 @@ def compact_files(
         seconds_before: Wall time by name of what the caller did before.
         report_path: A file for the report; None: none is written.
         normals: As of :func:`gsmerge.write_gaussians`.
+        spz_version: As of the same.
         cameras_path: A file for the views, where there are any; None: none is written.
         saved_cameras: The same as ``transforms.json``, with all intrinsics.
 
@@ -92,7 +94,7 @@ def compact_files(
         SceneError: If the scene cannot be read or the result cannot be written.
         UsageError: If the settings need what the scene does not have, or the name has no known ending.
     """
-    start, ending = perf_counter(), output_format(out)
+    start, ending = perf_counter(), output_format(out, spz_version)
     with atomic_outputs(overwrite=overwrite) as add:
         at = {path: add(path) for path in (out, report_path) if path is not None}
         given = read_input(files, opacity=opacity, hints=hints)
@@ -106,8 +108,9 @@ def compact_files(
         at |= {path: add(path) for path, _ in coarser}
         for path, one in ((out, result), *coarser):
             write_gaussians(
-                at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending, normals=normals
-            )
+                at[path], one.gaussians, overwrite=True, comments=given.comments, ending=ending, normals=normals,
+                spz_version=spz_version,
+            )  # fmt: skip
         cameras_path = cameras_path if len(given.scene) else None
         if cameras_path is not None:
             write_viewer_cameras(add(cameras_path), result.cameras, given.scene.names)
@@ -115,7 +118,7 @@ def compact_files(
             if not len(given.scene):
                 raise UsageError(f"--save-cameras {saved_cameras}: expected a scene with cameras, got none")
             write_transforms(add(saved_cameras), result.cameras, given.scene.names)
-        lost = lost_harmonics(out, result.gaussians.sh_degree)
+        lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
         document = report_document(
             result.report,
             input_path=files.ply,

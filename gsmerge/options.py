@@ -64,8 +64,8 @@ class CompactOptions:
         threads: Threads to use; None: all processors. The result does not depend on it.
 
     Raises:
-        ValueError: If a PSNR is asked for of a crop; if the method is unknown, or another than ``"gsmerge"`` is asked
-            to find the number of Gaussians; if a checkpoint is required and none is named.
+        ValueError: If a PSNR is asked for of a crop, or without the sky; if the method is unknown, or another than
+            ``"gsmerge"`` is asked to find the number of Gaussians; if a checkpoint is required and none is named.
     """
 
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -95,9 +95,12 @@ class CompactOptions:
             raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
-        if self.clean.crop is not None and self.budget.target_psnr is not None:
-            quality = f"quality {self.budget.quality}"
-            raise ValueError(f"crop: expected a budget or superpixels, got {quality}: photos show what it leaves out")
+        for name, wanted in {"crop": self.clean.crop is not None, "drop_sky": self.clean.drop_sky}.items():
+            if wanted and self.budget.target_psnr is not None:
+                quality = f"quality {self.budget.quality}"
+                raise ValueError(
+                    f"{name}: expected a budget or superpixels, got {quality}: photos show what it leaves out"
+                )
         if self.method == "gsmerge":
             return
         asked = {"budget auto": self.budget.auto, "levels": self.budget.levels > 1}
@@ -157,6 +160,7 @@ class CompactOptions:
         asked = {f"method {self.method}": self.method != "gsmerge", "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "k mixed": self.decode.k == MIXED}
         asked |= {"crop": self.clean.crop is not None, "drop_floaters": self.clean.drop_floaters}
+        asked |= {"drop_sky": self.clean.drop_sky}
         return [name for name, wanted in asked.items() if wanted]
 
     def to_dict(self) -> dict[str, Any]:

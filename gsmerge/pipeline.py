@@ -134,15 +134,14 @@ def clean_up(prepared: PreparedScene, make: Build) -> tuple[PreparedScene, Build
     """The prepared scene without hidden Gaussians that are not wanted, and ``make`` with clean-up of what it makes."""
     options, scene, lost = prepared.options.clean, prepared.scene, 0
     if prepared.hidden is not None:
-        kept = clean(prepared.hidden, options, prepared.frame.leave)[0]
+        kept = clean(prepared.hidden, options, scene, prepared.frame.leave)[0]
         lost = len(prepared.hidden) - len(kept)
         prepared = replace(prepared, hidden=kept)
-    given = scene.gaussians[scene.valid.reshape(-1)] if isinstance(scene, PixelScene) else scene.gaussians
 
     def build_clean(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
         wanted = None if count is None else count + lost
         leave = prepared.frame.leave
-        return make_clean(lambda asked, own: make(prepared, asked, own), wanted, options, leave, given, log)
+        return make_clean(lambda asked, own: make(prepared, asked, own), wanted, options, scene, leave, log)
 
     return prepared, build_clean
 

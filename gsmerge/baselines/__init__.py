@@ -27,7 +27,7 @@ _ALL = (
     Baseline("splat-transform", splat_transform.run, needs=("node",)),
 )
 BASELINES = {baseline.name: baseline for baseline in _ALL}
-COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop_floaters"}  # that every method uses
+COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop_floaters", "drop_sky"}  # that every method uses
 
 
 def find_baseline(name: str) -> Baseline | None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     opt.SCENE,
     f"{opt.READING} {opt.COUNTS} {opt.MERGE} method {opt.NETWORKS} {opt.FIT} {opt.CLEAN}",
     opt.output(opt.COMPACT_SCENE, "SCENE.compact.ply"),
-    f"no_normals overwrite report no_viewer_cameras save_cameras dry_run {opt.RUN}",
+    f"no_normals spz_version overwrite report no_viewer_cameras save_cameras dry_run {opt.RUN}",
 )
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
@@ -38,7 +38,7 @@ def compact(args: opt.Args) -> None:
         (out, *levels, args.report, cameras, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run
     )
     settings = args.settings()
-    check_format(out, settings.budget)
+    check_format(out, args.spz_version, settings.budget)
     if args.dry_run:
         from gsmerge.cli.plan import print_plan
 
@@ -63,7 +63,7 @@ def compact(args: opt.Args) -> None:
         document = compact_files(
             files, settings, out, opacity=args.opacity, hints=hints, overwrite=args.overwrite, progress=move,
             hashed=args.json or args.report is not None, seconds_before=seconds_before, report_path=args.report,
-            normals=not args.no_normals, cameras_path=cameras,
+            normals=not args.no_normals, spz_version=args.spz_version, cameras_path=cameras,
             saved_cameras=args.save_cameras,
         )  # fmt: skip
 

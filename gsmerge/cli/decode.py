@@ -23,14 +23,14 @@ from gsmerge.errors import SceneError
                 show_default="full where there are photos"),
     "effort device fit_steps time_budget",
     opt.output(opt.COMPACT_SCENE, "ENCODED.compact.ply"),
-    f"no_normals overwrite dry_run {opt.RUN}",
+    f"no_normals spz_version overwrite dry_run {opt.RUN}",
 )  # fmt: skip
 def decode(args: opt.Args) -> None:
     """Write a compact scene from an encoded one, as compact --fit none, or from a state, fitted to its photos."""
     start = perf_counter()
     out = args.output or default_output(args.encoded)
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite or args.dry_run)
-    check_format(out)
+    check_format(out, args.spz_version)
     import numpy as np
 
     from gsmerge.encoded.decode import plan_decode
@@ -42,7 +42,7 @@ def decode(args: opt.Args) -> None:
     settings, imported, path = args.settings(), perf_counter(), args.encoded
     count = {"k": args.k, "budget": args.budget}
     stored = load_stored(path)
-    lost, read = lost_harmonics(out, stored.sh_degree), perf_counter()
+    lost, read = lost_harmonics(out, stored.sh_degree, args.spz_version), perf_counter()
     document: dict[str, Any] = {
         **document_head(),
         "input": {
@@ -75,7 +75,7 @@ def decode(args: opt.Args) -> None:
         done, ending = perf_counter(), output_format(out)
         write_gaussians(
             temporary, decoded.gaussians, overwrite=True, comments=_comments(stored.about), ending=ending,
-            normals=not args.no_normals,
+            normals=not args.no_normals, spz_version=args.spz_version,
         )  # fmt: skip
     seconds = {"import": imported - start, "read": read - imported, "decode": done - read}
     seconds["write"] = perf_counter() - done

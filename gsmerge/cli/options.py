@@ -240,7 +240,7 @@ READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
 COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
 MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
-CLEAN = "crop drop_floaters"
+CLEAN = "crop drop_floaters drop_sky"
 FIT = "fit effort device fit_steps photo_scale time_budget poses"
 NETWORKS = "recipe checkpoint require_checkpoint"
 RUN = "seed threads"
@@ -341,6 +341,7 @@ _TABLE = (
                "world units; a budget is met after it.", metavar="SHAPE"),
         option("drop_floaters", bool, "Leave out Gaussians that are isolated or far beyond the scene.",
                "--drop-floaters", rare=True),
+        option("drop_sky", bool, "Leave out Gaussians that are sky in the photos.", "--drop-sky", rare=True),
     ),
     panel(
         MEASURING,
@@ -355,6 +356,8 @@ _TABLE = (
                "do (Mip-Splatting)."),
         switch("no_normals", "Leave the three columns of zeros out of a .ply, 12 of its 68 bytes per Gaussian; a "
                "--budget in bytes counts them.", rare=True),
+        option("spz_version", int, "Version of a .spz: 3, which most programs read, or 4, with room for harmonics of "
+               "degree 4; it needs gsmerge[spz4].", default=3, rare=True, min=3, max=4),
         switch("overwrite", "Replace the output if it exists."),
         option("report", Path, "Write the JSON report to this file."),
         switch("no_viewer_cameras", "Do not write the input views beside the result, as NAME.cameras.json for viewers.",

@@ -20,11 +20,13 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def check_format(output: Path, budget: BudgetOptions | None = None) -> None:
-    """Refuse an output whose name says no known format, or a budget in bytes for a format of unknown size."""
+def check_format(output: Path, spz_version: int, budget: BudgetOptions | None = None) -> None:
+    """Refuse an output whose name says no known format, what that needs and is not installed, or a budget in bytes for
+    a format of unknown size.
+    """
     from gsmerge.io import output_format
 
-    ending = output_format(output)
+    ending = output_format(output, spz_version)
     if budget is not None and budget.in_bytes and ending != ".ply":
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 

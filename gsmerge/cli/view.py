@@ -17,14 +17,20 @@ from gsmerge.errors import UsageError
     opt.BEFORE,
     opt.AFTER,
     f"{opt.READING} {opt.TARGETS}",
+    opt.changed("superpixels", hidden=True, help="Superpixels per view of the outlines on the page: what the results "
+                "were made with."),
+    opt.changed("segmentation", help="Superpixel method of these outlines."),
     opt.output("The page, .html.", wording="AFTER.compare.html, beside it"),
     *opt.panel(opt.OUTPUT, opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True)),
     "overwrite dry_run threads",
-)
+)  # fmt: skip
 def view(args: opt.Args) -> None:
     """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
     from gsmerge.report import document_head
+    from gsmerge.stages.segment import SegmentOptions
 
+    with opt.usage_errors():
+        segmentation = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))
     files, after = args.files(args.before), args.after
     output = args.output or after[0].with_name(f"{after[0].stem}.compare.html")
     inputs = (*input_files(files), *after, args.targets, args.target_images)
@@ -44,8 +50,9 @@ def view(args: opt.Args) -> None:
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(
-            title, given.scene, given.gaussians, sizes, given.held_out, threads=args.threads, progress=progress
-        )
+            title, given.scene, given.gaussians, sizes, given.held_out, segmentation=segmentation,
+            threads=args.threads, progress=progress,
+        )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, overwrite=args.overwrite)
     say_notes(data.notes, quiet=args.silent)

@@ -36,6 +36,7 @@ from gsmerge.runtime.estimate import estimate_run
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.group import default_count
+from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 MAX_SAMPLES = 200_000  # Gaussians that are measured
@@ -111,6 +112,7 @@ class Inspection:
     # how many of the Gaussians the cameras see, and how far colours are from the photos; None without cameras that fit
     sight: CameraCheck | None = None
     coverage: tuple[Coverage, ...] = ()  # what every view shows
+    num_sky_views: int = 0  # views whose photos show sky, where those are enough for ``drop_sky``
     # what ``compact`` would make of it by default: ``num_gaussians``, ``ratio``, ``bytes``, ``seconds``,
     # ``memory_bytes`` and ``machine_memory_bytes``; right within a factor of about two. None where it would refuse the
     # scene.
@@ -188,6 +190,7 @@ def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, A
     facts |= {"notes": load.notes, "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(load.scene), "estimate": estimate(load.scene), "sight": _sight(load)}
+    facts |= {"num_sky_views": _num_sky_views(load.scene)}
     if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {
@@ -200,6 +203,13 @@ def _of_views(ply: PlyScene, files: SceneFiles, hints: ReadHints) -> dict[str, A
         "alignment_margin": load.recovery.margin,
         "rows": load.recovery.description,
     }
+
+
+def _num_sky_views(scene: PixelScene | UnalignedScene) -> int:
+    if len(scene) == 0 or scene.images is None:
+        return 0
+    stored = scene.stored.reshape(-1) if isinstance(scene, PixelScene) else np.isfinite(scene.gaussians.means).all(1)
+    return len(sky_regions(scene.gaussians.means[stored], scene.cameras, scene.images))
 
 
 def _sight(load: SceneLoad) -> CameraCheck | None:

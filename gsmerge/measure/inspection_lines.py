@@ -29,6 +29,9 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.2g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
         " compact --drop-floaters leaves them out",
+        f"sky        in {scene['num_sky_views']} photos; compact --drop-sky leaves it out"
+        if scene["num_sky_views"]
+        else "",
         f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"
         f" {size['diagonal']:.3g}; {100 * size['share_huge']:.2g} % above a tenth of it",
         f"cameras    {_cameras(scene)}",

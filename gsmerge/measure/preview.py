@@ -86,11 +86,17 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
 
 def draw_borders(image: np.ndarray, labels: np.ndarray) -> Picture:
     """The photo ``[h,w,3]`` (sRGB in [0, 1]) with the borders between superpixels ``[h,w]`` in yellow."""
-    picture, border = to_picture(image), np.zeros(labels.shape, bool)
+    picture = to_picture(image)
+    picture[borders(labels)] = (255, 230, 40)
+    return picture
+
+
+def borders(labels: np.ndarray) -> np.ndarray:
+    """``[h,w]`` bool: pixels whose left or upper neighbour belongs to another superpixel ``[h,w]``."""
+    border = np.zeros(labels.shape, bool)
     border[:, 1:] |= labels[:, 1:] != labels[:, :-1]
     border[1:] |= labels[1:] != labels[:-1]
-    picture[border] = (255, 230, 40)
-    return picture
+    return border
 
 
 def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:

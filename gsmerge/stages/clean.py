@@ -1,4 +1,4 @@
-"""fitted Gaussians -> those that are wanted: cropped to a box or a sphere, without floaters.
+"""fitted Gaussians -> those that are wanted: cropped to a box or a sphere, without floaters or sky.
 
 A budget is met after clean-up: more Gaussians are made than are asked for, and the faintest of what is too many are
 left out (:func:`make_clean`).
@@ -16,7 +16,8 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.runtime.run_log import RunLog
-from gsmerge.types import Gaussians
+from gsmerge.stages.sky import sky
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -30,6 +31,8 @@ SIZES = {"sphere": 4, "box": 6}  # numbers of a crop
 
 Make = Callable[[int | None, RunLog], Gaussians]
 ToWorld = Callable[[Gaussians], Gaussians]
+Scene = PixelScene | UnalignedScene
+Counts = dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class CleanOptions:
         crop: Keep the Gaussians whose centre is inside: ``"sphere:x,y,z,radius"`` or ``"box:x0,y0,z0,x1,y1,z1"``, in
             the scene's world units; None: all.
         drop_floaters: Leave out Gaussians that are isolated or far beyond the scene, see :func:`floaters`.
+        drop_sky: Leave out Gaussians that are sky in the photos, see :func:`gsmerge.stages.sky.sky`.
 
     Raises:
         ValueError: If the crop is none, or holds nothing.
@@ -47,6 +51,7 @@ class CleanOptions:
 
     crop: str | None = None
     drop_floaters: bool = False
+    drop_sky: bool = False
 
     def __post_init__(self) -> None:
         if self.crop is not None:
@@ -55,7 +60,7 @@ class CleanOptions:
     @property
     def asked(self) -> bool:
         """Whether anything is to be left out."""
-        return self.crop is not None or self.drop_floaters
+        return self.crop is not None or self.drop_floaters or self.drop_sky
 
 
 def parse_crop(text: str) -> tuple[str, np.ndarray]:
@@ -127,18 +132,27 @@ def floater_share(gaussians: Gaussians) -> float:
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
 
-def clean(gaussians: Gaussians, options: CleanOptions, to_world: ToWorld) -> tuple[Gaussians, dict[str, int]]:
-    """The Gaussians that are wanted, and how many are left out by reason: ``cropped``, ``floaters``.
+def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: ToWorld) -> tuple[Gaussians, Counts]:
+    """The Gaussians that are wanted, and how many are left out by reason: ``cropped``, ``sky``, ``floaters``.
 
     Args:
         gaussians: In the canonical frame.
         options: What is left out.
+        scene: In the same frame; its photos say where the sky is.
         to_world: From that frame to the world's, which a crop is in.
+
+    Raises:
+        UsageError: If sky is to be left out and there are no photos.
     """
     counts = {}
     if options.crop is not None:
         inside = inside_crop(to_world(gaussians).means, options.crop)
         gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
+    if options.drop_sky:
+        if scene.images is None:
+            raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
+        above = sky(gaussians, scene.cameras, scene.images)
+        gaussians, counts["sky"] = gaussians[~above], int(above.sum())
     if options.drop_floaters:
         loose = floaters(gaussians)
         gaussians, counts["floaters"] = gaussians[~loose], int(loose.sum())
@@ -146,7 +160,7 @@ def clean(gaussians: Gaussians, options: CleanOptions, to_world: ToWorld) -> tup
 
 
 def make_clean(
-    make: Make, count: int | None, options: CleanOptions, to_world: ToWorld, given: Gaussians, log: RunLog
+    make: Make, count: int | None, options: CleanOptions, scene: Scene, to_world: ToWorld, log: RunLog
 ) -> Gaussians:
     """Gaussians after clean-up: exactly ``count`` of them, unless the whole scene does not hold so many.
 
@@ -154,13 +168,14 @@ def make_clean(
         make: Makes that many Gaussians before clean-up.
         count: Gaussians in the result; None: as many as are left.
         options: What is left out.
-        to_world: From the canonical frame, which all Gaussians are in, to the world's.
-        given: The scene's own Gaussians, which say how many a crop is likely to leave.
+        scene: In the canonical frame, as all Gaussians are; its own say how many a crop is likely to leave.
+        to_world: From that frame to the world's.
         log: Takes seconds, counts and notes.
 
     Raises:
-        UsageError: If the crop holds none of the scene.
+        UsageError: If the crop holds none of the scene; as of :func:`clean`.
     """
+    given = scene.gaussians[scene.valid.reshape(-1)] if isinstance(scene, PixelScene) else scene.gaussians
     most, asked = len(given), count
     share = 1.0 if options.crop is None else float(inside_crop(to_world(given).means, options.crop).mean())
     if share == 0:
@@ -171,7 +186,7 @@ def make_clean(
     best: tuple[Gaussians, dict[str, int], RunLog] | None = None
     for _ in range(MAX_BUILDS):
         own = RunLog(log.progress)
-        gaussians, counts = clean(make(asked, own), options, to_world)
+        gaussians, counts = clean(make(asked, own), options, scene, to_world)
         for name, value in own.seconds.items():
             log.seconds[name] = log.seconds.get(name, 0.0) + value
         if best is None or count is None or len(best[0]) < len(gaussians):
@@ -195,9 +210,15 @@ def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
 
 
 def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> list[str]:
-    words = {"cropped": "outside of the crop", "floaters": "floater(s)", "surplus": "more than the budget"}
+    words = {
+        "cropped": "outside of the crop",
+        "sky": "sky",
+        "floaters": "floater(s)",
+        "surplus": "more than the budget",
+    }
     parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
-    scores = ["PSNR of the input views counts what the crop leaves out as errors"] * ("cropped" in counts)
+    shown = [name for name in ("cropped", "sky") if counts.get(name)]
+    scores = ["PSNR of the input views counts what is left out as errors"] * bool(shown)
     short = []
     if count is not None and left < count:
         short = [f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
@@ -10,18 +12,19 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import project
-from gsmerge.io.formats import spz_writer
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
-from gsmerge.measure.preview import Picture, to_picture
+from gsmerge.measure.preview import Picture, borders, to_picture
+from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
+from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.view.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.views import even_views
 
-MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
-MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
-MIN_OPACITY = 1 / 255  # what is fainter is not drawn
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
+OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
+OUTLINE_COLOR = (255, 230, 40)
 DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 
 
@@ -33,7 +36,7 @@ class Side:
     num_gaussians: int
     file_bytes: int
     mean: Quality  # over the views that count: the held-out ones where there are any
-    spz: bytes | None  # the Gaussians in the page's frame; None: too many for a page
+    splats: bytes | None  # the Gaussians in the page's frame, see :mod:`gsmerge.view.splats`; None: too many for a page
     sh_degree: int  # of the harmonics that the page has
     file_sh_degree: int  # of those in the file
 
@@ -50,6 +53,7 @@ class PageView:
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
+    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class ViewData:
         num_views: Views that were measured, which may be more.
         reference: What scores compare with, in words.
         notes: Warnings and limits, one sentence each.
+        num_superpixels: Of each photo with outlines; None where there are none.
     """
 
     title: str
@@ -71,6 +76,7 @@ class ViewData:
     num_views: int
     reference: str
     notes: tuple[str, ...]
+    num_superpixels: int | None = None
 
     @property
     def held_out(self) -> bool:
@@ -85,6 +91,7 @@ def collect(
     file_bytes: Sequence[int],
     held_out: Views | None = None,
     *,
+    segmentation: SegmentOptions | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> ViewData:
@@ -96,6 +103,7 @@ def collect(
         results: Gaussians by name, in the scene's world.
         file_bytes: Sizes of the scene's file and of those of the results.
         held_out: Views that were no input.
+        segmentation: How the input photos are cut into superpixels; None: as by default.
         threads: Threads to use; None: all processors.
         progress: As of :func:`gsmerge.evaluate`.
     """
@@ -129,9 +137,24 @@ def collect(
                 stills=tuple(stills[one.name, split, i] for one in evaluation.results),
                 scores=tuple(one.scores[len(views)].masked for one in evaluation.results),
             ))  # fmt: skip
-    shown = _shown(views)
+    with use_threads(threads):
+        shown, num_superpixels = with_outlines(_shown(views), scene.images, segmentation or SegmentOptions())
     notes = (*evaluation.notes, *_limits(sides, len(shown), len(views)))
-    return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes)
+    return ViewData(title, tuple(sides), shown, len(views), evaluation.reference, notes, num_superpixels)
+
+
+def with_outlines(
+    views: Sequence[PageView], photos: np.ndarray | None, options: SegmentOptions
+) -> tuple[tuple[PageView, ...], int | None]:
+    """The views with outlines of the superpixels of the input photos ``[v,h,w,3]``, and how many those are."""
+    places = [i for i, view in enumerate(views) if not view.held_out]
+    if photos is None or not places:
+        return tuple(views), None
+    groups = segment(photos[[views[i].place for i in places]], options)
+    made = list(views)
+    for i, labels in zip(places, groups.labels, strict=True):
+        made[i] = replace(views[i], outlines=encode_outlines(labels))
+    return tuple(made), groups.counts[0]
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -146,6 +169,25 @@ def encode_still(picture: Picture) -> bytes:
     return bytes(data.tobytes())
 
 
+def encode_outlines(labels: np.ndarray) -> bytes:
+    """Borders between superpixels ``[h,w]`` as PNG of several times their size: fine lines on nothing."""
+    factor = max(1, OUTLINE_SIDE // max(labels.shape))
+    lines = borders(labels.repeat(factor, 0).repeat(factor, 1))
+    rows = np.pad(np.packbits(lines, axis=1), ((0, 0), (1, 0)))  # a zero begins each: stored as it is
+    parts = {
+        b"IHDR": struct.pack(">IIBBBBB", lines.shape[1], lines.shape[0], 1, 3, 0, 0, 0),  # one bit, a palette
+        b"PLTE": bytes(3) + bytes(OUTLINE_COLOR),
+        b"tRNS": bytes([0, 255]),
+        b"IDAT": zlib.compress(rows.tobytes(), 9),
+        b"IEND": b"",
+    }
+    chunks = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts.items()
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
     """Median depth of the points ``[n,3]`` that one camera has in its picture; 1 where there is none."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
@@ -155,27 +197,9 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 
 def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:
-    spz, degree = page_spz(gaussians)
+    splats, degree = pack_splats(gaussians)
     mean = result.mean(split)[1]
-    return Side(result.name, result.num_gaussians, file_bytes, mean, spz, degree, gaussians.sh_degree)
-
-
-def page_spz(gaussians: Gaussians) -> tuple[bytes | None, int]:
-    """Those that are drawn as ``.spz`` with as many harmonics as fit, and their degree; None where there are too many.
-
-    Args:
-        gaussians: In the page's frame, where what is seen is about 1 large: browsers keep means in 16 bits.
-    """
-    drawn = gaussians.opacities >= MIN_OPACITY
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
-        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
-    count = int(drawn.sum())
-    if count > MAX_GAUSSIANS:
-        return None, 0
-    sizes = {degree: (20 + 3 * ((degree + 1) ** 2 - 1)) * count for degree in range(spz_writer.MAX_DEGREE + 1)}
-    degree = max((d for d, size in sizes.items() if d <= gaussians.sh_degree and size <= MAX_SPZ_BYTES), default=0)
-    kept = replace(gaussians, shN=gaussians.shN[:, : (degree + 1) ** 2 - 1])[drawn]
-    return spz_writer.spz_bytes(kept), degree
+    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest_degree(gaussians.shN))
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
@@ -194,7 +218,7 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
     """What the page leaves out."""
     notes = []
     for side in sides:
-        if side.spz is None:
+        if side.splats is None:
             notes.append(
                 f"{side.name}: {side.num_gaussians:,} Gaussians are too many for a page, which takes"
                 f" {MAX_GAUSSIANS:,}: stills only"

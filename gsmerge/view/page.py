@@ -28,7 +28,7 @@ def view_page(data: ViewData) -> str:
     photos = any(view.photo is not None for view in data.views)
     sources: list[dict[str, Any]] = [{"name": "photo", "splats": None, "count": 0}] if photos else []
     sources += [
-        {"name": side.name, "splats": None if side.spz is None else f"splats-{i}", "count": side.num_gaussians}
+        {"name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians}
         for i, side in enumerate(data.sides)
     ]
     left, right = int(photos), int(photos) + 1
@@ -38,7 +38,7 @@ def view_page(data: ViewData) -> str:
     ]
     first = {side: stills[0][side] for side in (left, right)}  # in the page itself, to be seen at once
     stills[0][left] = stills[0][right] = None
-    splats = {f"splats-{i}": base64_text(side.spz) for i, side in enumerate(data.sides) if side.spz is not None}
+    splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = files("gsmerge.view").joinpath(ENGINE).read_bytes() if splats else None
     return render_template(
         "view.html",
@@ -51,6 +51,7 @@ def view_page(data: ViewData) -> str:
         first=first,
         json_data={"sources": sources, "photos": photos, "views": [_view(view) for view in data.views]},
         stills=stills,
+        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.views],
         splats=splats,
         engine=engine and base64_text(engine),
     )

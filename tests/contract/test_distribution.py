@@ -17,6 +17,7 @@ import pytest
 import tomllib
 
 import gsmerge
+from gsmerge.io.formats import spz_writer
 from gsmerge.render.cuda import INSTALL
 from gsmerge.research.charts.draw import INSTALL_HINT
 
@@ -93,7 +94,8 @@ def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
 
 def test_messages_install_what_the_extras_ask_for(root: Path, project: dict[str, Any]) -> None:
     extras = project["optional-dependencies"]
-    assert [f'pip install "{extras[name][0]}"' for name in ("cuda", "chart")] == [INSTALL, INSTALL_HINT]
+    hints = [INSTALL, INSTALL_HINT, spz_writer.INSTALL]
+    assert [f'pip install "{extras[name][0]}"' for name in ("cuda", "chart", "spz4")] == hints
     assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "batch" / "ray_engine.py").read_text()
     pages = (*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "gsmerge").rglob("*.py"))
     assert [str(page) for page in pages if re.search(r"""pip install ["']gsmerge""", page.read_text())] == []
@@ -103,6 +105,22 @@ def test_the_image_has_the_pinned_versions(root: Path) -> None:
     steps = (root / "Dockerfile").read_text()
     assert steps.count("\nFROM python:3.11-slim") == 1
     assert "pip install --no-cache-dir -c constraints.txt ." in steps
-    assert re.search(r"^torch==\S+$", (root / "constraints.txt").read_text(), re.MULTILINE)
     copied = {word for line in re.findall(r"^COPY (.+) \S+$", steps, re.MULTILINE) for word in line.split()}
-    assert copied >= set(SOURCES)
+    assert copied >= {*SOURCES, "constraints.txt"}
+    assert [name for name in copied if not (root / name).exists()] == []
+    assert copied & set((root / ".dockerignore").read_text().split()) == set()
+
+
+def test_what_the_image_runs(root: Path, project: dict[str, Any]) -> None:
+    """Its shell's own words, where they need no network; the program, and the variable that it sets."""
+    steps = (root / "Dockerfile").read_text()
+    search = re.findall(r"torch=\$\((.+)\)", steps)
+    found = subprocess.run(["sh", "-c", search[0]], cwd=root, capture_output=True, text=True, check=True).stdout
+    assert re.fullmatch(r"torch==\d+\.\d+\.\d+\n", found)
+    assert 'pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu "$torch"' in steps
+    (entry,) = re.findall(r'^ENTRYPOINT \["(.+)"\]$', steps, re.MULTILINE)
+    assert entry in project["scripts"]
+    sources = "".join(path.read_text() for path in (root / "gsmerge").rglob("*.py"))
+    names = re.findall(r"^ENV (\w+)=", steps, re.MULTILINE)
+    assert names == ["GSMERGE_CACHE_DIR"]
+    assert all(f'"{name}"' in sources for name in names)

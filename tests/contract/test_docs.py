@@ -227,7 +227,8 @@ def test_every_option_is_a_field_of_the_api() -> None:
     """Merging and segmentation options carry the API's names."""
     fields = set(gsmerge.CompactOptions().to_dict())
     own = {"output", "overwrite", "report", "json", "quiet", "dry-run", "debug", "cameras", "images", "opacity"}
-    own |= {"exporter", "quats", "order", "scene-scale", "max-side", "no-normals", "no-viewer-cameras", "save-cameras"}
+    own |= {"exporter", "quats", "order", "scene-scale", "max-side", "no-normals", "spz-version"}
+    own |= {"no-viewer-cameras", "save-cameras"}
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own - {"no-robust"}
     assert {name.replace("-", "_") for name in names} - fields == set()
 

@@ -6,6 +6,7 @@ import base64
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 
 import gsmerge
+from gsmerge.geometry import rotmat_to_quat
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.render.metrics import psnr
+from gsmerge.view.data import middle_depth
 
 from .browser import Browser, browser
 
@@ -40,15 +43,30 @@ def opened(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     scene = make_scene(folder / "room", num_views=3, width=WIDTH, height=HEIGHT)
     small, page = scene / "small<b>.ply", folder / "page.html"
     assert main(["compact", str(scene), "-o", str(small), "--effort", "draft", "-q"]) == 0
+    results = [gsmerge.read_ply(small).gaussians]
+    results += [with_one_from_outside(results[0], gsmerge.read_scene(scene).cameras[[0]])]
+    gsmerge.write_ply(wide := scene / "wide.ply", results[1])
     targets = ["--targets", str(scene / "targets")]
-    assert main(["view", str(scene), str(small), *targets, "-o", str(page), "--no-open", "-q"]) == 0
+    assert main(["view", str(scene), str(small), str(wide), *targets, "-o", str(page), "--no-open", "-q"]) == 0
     assert CHROMIUM is not None
     with browser(CHROMIUM, folder / "profile", "--enable-unsafe-swiftshader") as tab:
         tab.open(page)
         wait(tab, "solid !== null")
         tab.run("set('solid', '1')")
         wait(tab, SETTLED)
-        yield tab, (gsmerge.read_scene(scene), gsmerge.read_ply(small).gaussians)
+        yield tab, (gsmerge.read_scene(scene), *results)
+
+
+def with_one_from_outside(gaussians: gsmerge.Gaussians, camera: gsmerge.Cameras) -> gsmerge.Gaussians:
+    """With a long Gaussian that reaches into the camera's picture from three half pictures to its right."""
+    rotation, shift = camera.viewmats[0, :3, :3], camera.viewmats[0, :3, 3]
+    depth = 0.5 * middle_depth(gaussians.means, camera)
+    side = depth * WIDTH / 2 / camera.Ks[0, 0, 0]  # of half a picture
+    place = rotation.T @ ((3 * side, 0, depth) - shift)
+    new = {"means": place, "scales": (2 * side, side / 2, side / 2), "quats": rotmat_to_quat(rotation.T[None])[0]}
+    new |= {"opacities": 0.7, "sh0": [(1.5, -1.0, -1.0)], "shN": 0 * gaussians.shN[0]}
+    columns = {name: np.asarray(value, np.float32)[None] for name, value in new.items()}
+    return replace(gaussians, **{name: np.concatenate([getattr(gaussians, name), c]) for name, c in columns.items()})
 
 
 def wait(tab: Browser, condition: str) -> None:
@@ -70,7 +88,7 @@ def picture(tab: Browser) -> np.ndarray:
 
 
 def test_3d_is_what_we_render_at_every_input_view(opened: tuple[Browser, Any]) -> None:
-    tab, (scene, small) = opened
+    tab, (scene, small, _) = opened
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); clearInterval(blinking)")
     inputs = tab.run("data.views.map((view, i) => [view.held_out, view.name, i]).filter(one => !one[0])")
     assert len(inputs) == 3
@@ -83,6 +101,21 @@ def test_3d_is_what_we_render_at_every_input_view(opened: tuple[Browser, Any]) -
                 tab.run(f"set('solid', {solid}); set('other', {other})")
                 assert psnr(picture(tab), drawn) > least
     assert tab.run("state.atCamera") is True
+
+
+def test_a_gaussian_reaches_in_from_outside(opened: tuple[Browser, Any]) -> None:
+    tab, (scene, small, wide) = opened
+    tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); set('solid', '1'); set('other', false)")
+    name = scene.names[0].rpartition("/")[2].removesuffix(".png")
+    tab.run(f"jump(data.views.findIndex(view => view.name === '{name}' && !view.held_out))")
+    drawn = [
+        gsmerge.render(one, scene.cameras[[0]], near=near_plane(scene)).images[0].clip(0, 1) for one in (small, wide)
+    ]
+    assert psnr(*drawn) < 25
+    tab.run("set('left', state.right + 1)")
+    wait(tab, "solid.has(state.left)")
+    assert psnr(picture(tab), drawn[1]) > 30
+    tab.run("set('left', state.right - 1)")
 
 
 def test_leaving_a_camera_and_coming_back(opened: tuple[Browser, Any]) -> None:
@@ -128,6 +161,24 @@ def test_keys(opened: tuple[Browser, Any]) -> None:
         tab.press(key, code)
     assert tab.run("[state.at, state.view, state.mode, state.solid]") == [0.48, 1, "side", "1"]
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
+
+
+def test_outlines_of_superpixels(opened: tuple[Browser, Any]) -> None:
+    """Yellow lines on stills and in 3D, where the camera is that of an input photo."""
+    tab, _ = opened
+    tab.run(f"{BARE} set('mode', 'blink'); set('other', false); jump(data.views.findIndex(view => !view.held_out))")
+    for solid in ("''", "'1'"):
+        tab.run(f"set('solid', {solid})")
+        plain = picture(tab)
+        tab.press("o", 79)
+        lines = picture(tab) - plain
+        assert lines[..., 0].mean() > lines[..., 2].mean() + 0.02
+        assert tab.run("document.querySelector('[data-set=outlines][data-value=\"1\"]').ariaPressed") == "true"
+        tab.run("jump(data.views.findIndex(view => view.held_out))")
+        assert tab.run("id('outlines').hidden") is True
+        tab.press("o", 79)
+        tab.run("jump(data.views.findIndex(view => !view.held_out))")
+        assert psnr(picture(tab), plain) > 45
 
 
 def test_it_fits_a_phone(opened: tuple[Browser, Any]) -> None:

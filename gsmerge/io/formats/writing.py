@@ -29,31 +29,33 @@ from gsmerge.types import Gaussians
 OUTPUT_FORMATS = {
     ".compressed.ply": compressed.MAX_DEGREE,
     ".ply": 4,
-    ".spz": spz_writer.MAX_DEGREE,
+    ".spz": spz_writer.MAX_DEGREES[3],
     ".sog": sog_writer.MAX_DEGREE,
     ".splat": splat.MAX_DEGREE,
     ".glb": glb_writer.MAX_DEGREE,
 }
 
 
-def output_format(path: str | os.PathLike[str]) -> str:
+def output_format(path: str | os.PathLike[str], spz_version: int = 3) -> str:
     """The ending of an output's name that says how it is written.
 
     Raises:
-        UsageError: If it is none of ``OUTPUT_FORMATS``.
+        UsageError: If it is none of ``OUTPUT_FORMATS``, or a ``.spz`` of that version needs what is not installed.
     """
     name = Path(path).name.lower()
     ending = next((ending for ending in OUTPUT_FORMATS if name.endswith(ending)), None)
     if ending is None:
         *first, last = OUTPUT_FORMATS
         raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}")
+    if ending == ".spz" and spz_version == 4:
+        spz_writer.zstandard()
     return ending
 
 
-def lost_harmonics(path: str | os.PathLike[str], sh_degree: int) -> str | None:
+def lost_harmonics(path: str | os.PathLike[str], sh_degree: int, spz_version: int = 3) -> str | None:
     """What a format has no room for, as a note; None if it holds everything. Raises as :func:`output_format`."""
     ending = output_format(path)
-    highest = OUTPUT_FORMATS[ending]
+    highest = spz_writer.MAX_DEGREES[spz_version] if ending == ".spz" else OUTPUT_FORMATS[ending]
     return None if sh_degree <= highest else f"{ending} has no room for harmonics above degree {highest}: left out"
 
 
@@ -65,6 +67,7 @@ def write_gaussians(
     comments: Sequence[str] = (),
     ending: str | None = None,
     normals: bool = True,
+    spz_version: int = 3,
 ) -> None:
     """Write Gaussians in one of ``OUTPUT_FORMATS``, by the ending of the name.
 
@@ -77,11 +80,13 @@ def write_gaussians(
         comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Format to write instead of the name's.
         normals: Of a ``.ply``, as of :func:`write_ply`.
+        spz_version: Of a ``.spz``: 3, which most programs read, or 4, which has room for harmonics of degree 4 and
+            needs ``zstandard``.
 
     Raises:
-        UsageError: If the name ends in none of these.
+        UsageError: If the name ends in none of these, or ``zstandard`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, or a comment is no line of ASCII.
+        ValueError: If there is NaN or inf, a comment is no line of ASCII, or there is no such version.
     """
     ending = output_format(path) if ending is None else ending
     if ending == ".ply":
@@ -89,16 +94,18 @@ def write_gaussians(
         return
     _check_comments(comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(_content(gaussians, ending, comments))
+        temporary.write_bytes(_content(gaussians, ending, comments, spz_version))
 
 
-def _content(gaussians: Gaussians, ending: str, comments: Sequence[str]) -> bytes:
+def _content(gaussians: Gaussians, ending: str, comments: Sequence[str], spz_version: int) -> bytes:
     if ending == ".compressed.ply":
         return compressed.compressed_bytes(gaussians, comments)
     if ending in (".splat", ".glb"):
         return splat.splat_bytes(gaussians) if ending == ".splat" else glb_writer.glb_bytes(gaussians)
-    write = spz_writer.spz_bytes if ending == ".spz" else sog_writer.sog_bytes
-    return write(gaussians, mip=MIP_COMMENT in comments)
+    mip = MIP_COMMENT in comments
+    if ending == ".spz":
+        return spz_writer.spz_bytes(gaussians, mip=mip, version=spz_version)
+    return sog_writer.sog_bytes(gaussians, mip=mip)
 
 
 def write_ply(

@@ -6,6 +6,16 @@ const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // names of rend
 const SLOW_FRAME = 90; // milliseconds
 const REST = 160; // milliseconds without a movement after which the camera is at rest
 const GAIN_POINTS = 1.6; // pixels of the screen per point
+const HEADER = 16; // bytes of a .spz, followed here by four of the checksum of all
+const CHECKSUM = 4;
+const BLOCK = 65535; // most bytes of a block that is not compressed
+// Spark leaves out Gaussians whose centre is far outside the picture, for their footprints grow without bounds there.
+// gsmerge, like gsplat, draws them with the footprint of a direction 15 % outside.
+const EVERYWHERE = 1e6; // half pictures from the middle
+const FOOTPRINT = "vec2 J2 = -(J1 * viewCenter.xy) * invZ;";
+const BOUNDED_FOOTPRINT = `vec2 seen = clamp(clipCenter.xy / clipCenter.w, -1.3, 1.3);
+  vec2 principal = vec2(projectionMatrix[2][0], projectionMatrix[2][1]);
+  vec2 J2 = J1 * (seen + principal) / vec2(projectionMatrix[0][0], projectionMatrix[1][1]);`;
 const COLORS = { input: [1, 0.78, 0.28], held: [0.42, 0.78, 1], current: [1, 1, 1] };
 
 // Bytes of a script element that holds them in base64; the element's text is given up.
@@ -20,11 +30,40 @@ function takeBytes(name) {
   return bytes;
 }
 
+async function gunzip(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+// The .spz of what view/splats.py packs: sums down every column of bytes, in a gzip stream that is not compressed.
+async function unpackSplats(packed) {
+  const bytes = await gunzip(packed);
+  const numbers = new DataView(bytes.buffer);
+  const [count, degree] = [numbers.getUint32(8, true), bytes[12]];
+  const columns = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)];
+  const raw = new Uint8Array(bytes.length - CHECKSUM);
+  raw.set(bytes.subarray(0, HEADER));
+  let [from, to] = [HEADER + CHECKSUM, HEADER];
+  for (const width of columns) {
+    for (let column = 0; column < width; column++) {
+      for (let row = 0, at = to + column, sum = 0; row < count; row++, at += width) raw[at] = sum += bytes[from++];
+    }
+    to += width * count;
+  }
+  const blocks = [new Uint8Array([31, 139, 8, 0, 0, 0, 0, 0, 0, 255])];
+  for (let start = 0; start < raw.length; start += BLOCK) {
+    const size = Math.min(BLOCK, raw.length - start);
+    const last = Number(start + size === raw.length);
+    blocks.push(new Uint8Array([last, size & 255, size >> 8, ~size & 255, (~size >> 8) & 255]), raw.subarray(start, start + size));
+  }
+  blocks.push(bytes.subarray(HEADER, HEADER + CHECKSUM), new Uint32Array([raw.length]));
+  return new Uint8Array(await new Blob(blocks).arrayBuffer());
+}
+
 // Runs the compressed script of the renderer; its exports are then in `Vendor`.
 async function loadVendor() {
-  const packed = new Blob([takeBytes("engine")]).stream().pipeThrough(new DecompressionStream("gzip"));
   const script = document.createElement("script");
-  script.src = URL.createObjectURL(new Blob([await new Response(packed).arrayBuffer()], { type: "text/javascript" }));
+  script.src = URL.createObjectURL(new Blob([await gunzip(takeBytes("engine"))], { type: "text/javascript" }));
   await new Promise((resolve, reject) => {
     script.onload = resolve;
     script.onerror = () => reject(new Error("the renderer does not load"));
@@ -62,14 +101,16 @@ class SplatView {
     return this.results.has(source);
   }
 
-  async add(source, bytes) {
-    const mesh = new Vendor.SplatMesh({ fileBytes: bytes, fileName: "scene.spz" });
+  async add(source, packed) {
+    const mesh = new Vendor.SplatMesh({ fileBytes: await unpackSplats(packed), fileName: "scene.spz" });
     await mesh.initialized;
     // As gsmerge's own renderer: sorted by depth, 0.3 square pixels of low-pass, nothing below 1/255
     const spark = new Vendor.SparkRenderer({
       renderer: this.renderer, autoUpdate: false, sortRadial: false, preBlurAmount: 0.3, blurAmount: 0,
-      maxStdDev: Math.sqrt(2 * Math.log(255)), minAlpha: 1 / 255, maxPixelRadius: 4096, onDirty: () => this.request(),
+      maxStdDev: Math.sqrt(2 * Math.log(255)), minAlpha: 1 / 255, maxPixelRadius: 4096, clipXY: EVERYWHERE, onDirty: () => this.request(),
     });
+    if (!spark.material.vertexShader.includes(FOOTPRINT)) throw new Error("another renderer than expected");
+    spark.material.vertexShader = spark.material.vertexShader.replace(FOOTPRINT, BOUNDED_FOOTPRINT);
     const pane = spark.uniforms.renderSize.value;
     spark.onBeforeRender = (...values) => { // which would take the whole canvas for the size of the picture
       Vendor.SparkRenderer.prototype.onBeforeRender.apply(spark, values);

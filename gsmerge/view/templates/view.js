@@ -6,13 +6,14 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: 0, mode: "swipe", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, other: false, atCamera: true, left: 0, right: 0,
+  order: "worst", overlay: 0, outlines: "", other: false, atCamera: true, left: 0, right: 0,
 };
 const KEYS = { 1: "swipe", 2: "side", 3: "blink", 4: "difference" };
 const BLINK = 700; // milliseconds
 const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those of the first view are in the page itself
+let outlines = []; // per view the borders of its superpixels, where there are any
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
@@ -96,11 +97,15 @@ function show() {
   id("overlay").hidden = !photo || !state.atCamera || state.overlay === 0;
   if (!id("overlay").hidden) id("overlay").style.backgroundImage = `url("${photo}")`;
   id("overlay").style.opacity = state.overlay;
+  const outline = outlines[state.view];
+  id("outlines").hidden = !outline || !state.atCamera || !state.outlines;
+  if (!id("outlines").hidden) id("outlines").style.backgroundImage = `url("${outline}")`;
   if (id("overlay-share")) id("overlay-share").disabled = !state.atCamera;
   for (const button of document.querySelectorAll("[data-set]")) {
     button.setAttribute("aria-pressed", String(String(state[button.dataset.set]) === button.dataset.value));
     if (["shape", "frustums", "background", "pixels"].includes(button.dataset.set)) button.disabled = !state.solid;
     if (button.dataset.set === "solid" && button.dataset.value) button.disabled = !solid;
+    if (button.dataset.set === "outlines") button.disabled = !outline || !state.atCamera;
   }
   if (solid && state.solid) solid.request();
 }
@@ -176,7 +181,7 @@ function onKey(event) {
   const actions = {
     arrowleft: () => swipeTo(state.at - 0.02), arrowright: () => swipeTo(state.at + 0.02),
     home: () => swipeTo(0), end: () => swipeTo(1), arrowup: () => step(-1), arrowdown: () => step(1),
-    s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
+    o: () => set("outlines", state.outlines ? "" : "1"), s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
     " ": () => { state.other = true; show(); },
   };
   if (KEYS[key]) set("mode", KEYS[key]);
@@ -252,6 +257,7 @@ function drag(last, event, other) {
 // The strip, when the stills have come.
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
+  outlines = JSON.parse(id("outline-pictures").textContent);
   stills[0] = stills[0].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos); // without photos the result: the scene itself is its own reference
   for (const card of id("strip").children) {

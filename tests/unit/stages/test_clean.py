@@ -63,7 +63,7 @@ def test_crops_keep_what_is_inside() -> None:
     assert parse_crop("sphere:1,2,3,4")[1].tolist() == [1, 2, 3, 4]
 
 
-def test_floaters_are_alone_or_far_away() -> None:
+def test_floaters_are_alone_or_far_away(scene: PixelScene) -> None:
     given = wall()
     assert not floaters(given).any()
     means = given.means.copy()
@@ -75,7 +75,7 @@ def test_floaters_are_alone_or_far_away() -> None:
     large = replace(moved, scales=np.full((1600, 3), 4, np.float32))  # which touch across the gap
     assert np.flatnonzero(floaters(large)).tolist() == list(range(6, 16))
     assert not floaters(given[:8]).any()
-    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop_floaters=True), lambda g: g)
+    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop_floaters=True), scene, lambda g: g)
     assert (len(left), counts) == (1589, {"cropped": 10, "floaters": 1})
 
 

@@ -38,7 +38,7 @@ def test_it_loads_nothing_and_escapes_names(page: str) -> None:
 
 def test_the_headline_comes_first_then_pictures(page: str) -> None:
     places = [
-        page.index(words) for words in ("50.0 % of the Gaussians", "2.0 kB", "data:image/webp", "<h2>Storage</h2>")
+        page.index(words) for words in ("50.0\u00a0% of the Gaussians", "2.0 kB", "data:image/webp", "<h2>Storage</h2>")
     ]
     assert places == sorted(places)
     assert page.count('class="compare"') == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -12,11 +13,14 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, PixelScene, evaluate, render
+from gsmerge.io.formats.spz_writer import spz_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, Views, near_plane
 from gsmerge.measure.preview import to_picture
 from gsmerge.render.metrics import psnr
-from gsmerge.view import data
-from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, page_spz, short_names
+from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.view import data, splats
+from gsmerge.view.data import ViewData, collect, encode_still, middle_depth, short_names
+from gsmerge.view.splats import pack_splats
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +50,21 @@ def decoded(still: bytes | None) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(still, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     return np.asarray(image[..., ::-1], np.float32) / 255
+
+
+def unpacked(packed: bytes | None) -> bytes:
+    """The uncompressed .spz of what the page holds: sums down every column."""
+    assert packed is not None
+    raw = gzip.decompress(packed)
+    count, degree = struct.unpack_from("<IB", raw, 8)
+    columns, at = [], 20
+    for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
+        planes = np.frombuffer(raw, np.uint8, width * count, at).reshape(width, count)
+        columns.append(np.cumsum(planes, axis=1, dtype=np.uint8).T.tobytes())
+        at += width * count
+    content = raw[:16] + b"".join(columns)
+    assert (len(raw), zlib.crc32(content)) == (at, struct.unpack_from("<I", raw, 16)[0])
+    return content
 
 
 def test_numbers_are_those_of_evaluate(actual: ViewData, scene: PixelScene, half: Gaussians, held_out: Views) -> None:
@@ -79,11 +98,9 @@ def test_stills_are_our_renders(actual: ViewData, scene: PixelScene, half: Gauss
 
 def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: PixelScene) -> None:
     """What a view sees in the world it sees in the page's frame."""
-    spz = actual.sides[1].spz
-    assert spz is not None
-    raw = gzip.decompress(spz)
+    raw = unpacked(actual.sides[1].splats)
     count, _, fraction = struct.unpack_from("<IBB", raw, 8)
-    drawn = half.means[half.opacities >= data.MIN_OPACITY]
+    drawn = half.means[half.opacities >= splats.MIN_OPACITY]
     assert count == len(drawn)
     triples = np.frombuffer(raw, np.uint8, 9 * count, 16).reshape(-1, 3)
     fixed = np.pad(triples, ((0, 0), (0, 1))).view("<i4")[:, 0]
@@ -96,32 +113,71 @@ def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussian
 
 
 def test_too_many_gaussians_are_left_out(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
+    monkeypatch.setattr(splats, "MAX_GAUSSIANS", len(half) + 1)
     actual = collect("room", scene, {"half": half}, (2, 1))
-    assert actual.sides[0].spz is None
-    assert actual.sides[1].spz is not None
+    assert actual.sides[0].splats is None
+    assert actual.sides[1].splats is not None
     assert any("input: " in note and "stills only" in note for note in actual.notes)
 
 
 def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     curved = replace(half, shN=np.full((len(half), 15, 3), 0.1, np.float32))
-    assert page_spz(curved)[1] == 3
-    monkeypatch.setattr(data, "MAX_SPZ_BYTES", 45 * len(half))
-    content, degree = page_spz(curved)
+    assert pack_splats(curved)[1] == 3
+    monkeypatch.setattr(splats, "MAX_SPZ_BYTES", 45 * len(half))
+    content, degree = pack_splats(curved)
     assert degree == 2
-    assert content is not None
-    assert len(gzip.decompress(content)) < 45 * len(half)
+    assert len(unpacked(content)) < 45 * len(half)
+
+
+def test_harmonics_of_zeros_are_left_out(scene: PixelScene, half: Gaussians) -> None:
+    flat = np.zeros((len(half), 15, 3), np.float32)
+    flat[:, :3] = 0.1
+    assert pack_splats(replace(half, shN=flat))[1] == 1
+    assert pack_splats(replace(half, shN=0 * flat)) == pack_splats(half)
+    actual = collect("room", scene, {"half": replace(half, shN=flat)}, (2, 1))
+    assert not any("harmonics" in note for note in actual.notes)
+
+
+def test_pixels_in_order_take_less_than_their_spz(scene: PixelScene) -> None:
+    packed, _ = pack_splats(scene.gaussians)
+    assert packed is not None
+    assert len(packed) < 0.8 * len(spz_bytes(scene.gaussians))
 
 
 def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     means, opacities = half.means.copy(), half.opacities.copy()
     means[0, 1], opacities[1] = np.nan, 0.003
-    content, _ = page_spz(replace(half, means=means, opacities=opacities))
-    whole, _ = page_spz(half)
-    assert content is not None
-    assert whole is not None
-    counts = [struct.unpack_from("<I", gzip.decompress(one), 8)[0] for one in (content, whole)]
+    content, _ = pack_splats(replace(half, means=means, opacities=opacities))
+    whole, _ = pack_splats(half)
+    counts = [struct.unpack_from("<I", unpacked(one), 8)[0] for one in (content, whole)]
     assert counts[0] == counts[1] - 2
+
+
+def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: PixelScene) -> None:
+    """Of the input photos alone, as compact cuts them."""
+    assert actual.num_superpixels == int(0.044 * 160 * 120)
+    assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
+    assert scene.images is not None
+    view = next(view for view in actual.views if view.place == 1)
+    labels = segment(scene.images, SegmentOptions()).labels[1]
+    picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    factor = 1280 // 160
+    assert picture.shape == (120 * factor, 160 * factor, 4)
+    lines = picture[..., 3] > 0
+    assert {tuple(color) for color in picture[lines]} == {(40, 230, 255, 255)}
+    right, below = lines[factor // 2 :: factor, ::factor], lines[::factor, factor // 2 :: factor]
+    np.testing.assert_array_equal(right[:, 1:], labels[:, 1:] != labels[:, :-1])
+    np.testing.assert_array_equal(below[1:], labels[1:] != labels[:-1])
+    assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
+
+
+def test_superpixels_as_asked_for(scene: PixelScene, half: Gaussians) -> None:
+    asked = collect("room", scene, {"half": half}, (2, 1), segmentation=SegmentOptions(superpixels=50))
+    assert asked.num_superpixels == 50
+    none = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
+    assert none.num_superpixels is None
+    assert {view.outlines for view in none.views} == {None}
 
 
 def test_many_views_are_thinned(scene: PixelScene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:

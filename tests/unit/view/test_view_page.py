@@ -71,14 +71,18 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     assert stills[0][1:] == [None, None]  # those are in the page itself
     address = stills[1][2]
     assert base64.b64decode(address.removeprefix("data:image/webp;base64,")) == data.views[1].stills[1]
+    outlines = json.loads(block(page, "outline-pictures"))
+    assert [one and base64.b64decode(one.removeprefix("data:image/png;base64,")) for one in outlines] == [
+        view.outlines for view in data.views
+    ]
     assert page.index("data:image/webp") < page.index("<script")
     for i, side in enumerate(data.sides):
-        assert base64.b64decode(block(page, f"splats-{i}")) == side.spz
+        assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
     assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
 
 
 def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
-    page = view_page(replace(data, sides=tuple(replace(side, spz=None) for side in data.sides)))
+    page = view_page(replace(data, sides=tuple(replace(side, splats=None) for side in data.sides)))
     assert 'id="engine"' not in page
     assert "class SplatView" not in page
     assert len(page) < 200_000
@@ -88,6 +92,13 @@ def test_without_photos(data: ViewData) -> None:
     page = view_page(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
     assert [source["name"] for source in json.loads(block(page, "data"))["sources"]] == ["input", EVIL]
     assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_without_superpixels(data: ViewData, page: str) -> None:
+    bare = view_page(replace(data, num_superpixels=None))
+    for words in ('data-set="outlines"', "<kbd>O</kbd>", "Superpixels: "):
+        assert words in page
+        assert words not in bare
 
 
 def test_halves_of_characters_become_question_marks(data: ViewData) -> None:

@@ -1,0 +1,116 @@
+"""Which Gaussians are sky, by what the photos show: no network, and nothing that has to be downloaded.
+
+In each photo sky is a smooth region that comes down from the upper border, nowhere warmer than grey, and that pales
+towards the horizon, as air does; without that, as under clouds, it has to be several times as far away as the rest.
+Ceilings and white walls have the first three in common with it, seldom the others, and never in several views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from gsmerge.geometry import project
+from gsmerge.render import plan_view, prepare
+from gsmerge.render.photos import NEAR
+from gsmerge.render.weights import apply_transposed, view_weights
+from gsmerge.types import Cameras, Gaussians
+
+SIDE = 480.0  # pixels of the longer side that gradients are measured for
+SMOOTH = 0.02  # largest gradient of a colour per pixel
+DARK, WHITE, GREY = 0.35, 0.75, 0.12  # sky is blue and no darker, or brighter than the second with so little chroma
+WARM = 0.03  # most that red exceeds blue, in nine tenths of the region
+LEAST_AREA, LEAST_TOP = 0.02, 0.4  # of the picture, and of its upper border
+PALER, PALER_RANGE = -0.12, 0.08  # correlation of saturation with the row, at most; and spread of saturation, at least
+FAR = 3.0  # times the depth of the rest
+LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # views that show sky, and their share of all: fewer may be mistaken
+AGREEMENT = 0.7  # least share of a Gaussian's blending weights that lies in the sky
+LAYERS, LAST_LAYER = 6, 0.02  # most rounds; share of what was found in a round that is the last
+MAX_SAMPLES = 200_000  # Gaussians that depths are taken from
+
+
+def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
+    """``[n]`` bool: which Gaussians are sky, because most of what they add to the photos that show sky lies in it.
+
+    Args:
+        gaussians: n finite ones, in the canonical frame.
+        cameras: v views.
+        photos: ``[v,h,w,3]`` sRGB in [0, 1], of the cameras' size.
+    """
+    regions, found = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
+    if not regions:
+        return found
+    for _ in range(LAYERS):  # what the sky in front has hidden comes next
+        rows = np.flatnonzero(~found)
+        above = _mostly_inside(gaussians[rows], cameras, regions)
+        found[rows[above]] = True
+        if above.sum() < LAST_LAYER * found.sum():
+            break
+    return found
+
+
+def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
+    """The sky ``[h,w]`` bool of the views that show any, by their number; none where only few do.
+
+    Arguments as of :func:`sky`; ``means`` are ``[n,3]``, in the frame of the cameras.
+    """
+    regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
+    shown = {
+        view: region
+        for view, region in regions.items()
+        if _pales_downwards(photos[view], region) or _is_far(means, cameras[[view]], region)
+    }
+    return shown if len(shown) >= max(LEAST_VIEWS, LEAST_SHARE * len(photos)) else {}
+
+
+def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
+    """``[n]`` bool: which Gaussians have most of their blending weights inside regions ``[h,w]`` of some views."""
+    splats = prepare(gaussians)
+    inside, total = np.zeros(len(splats)), np.zeros(len(splats))
+    for view, region in regions.items():
+        viewmat, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
+        weights = view_weights(plan_view(splats, viewmat, K, cameras.width, cameras.height, near=NEAR))
+        sums = apply_transposed(weights, np.stack([region, np.ones_like(region)], 2).astype(np.float32))
+        inside[weights.ids] += sums[:, 0]
+        total[weights.ids] += sums[:, 1]
+    return np.asarray((inside > 0) & (inside >= AGREEMENT * total))
+
+
+def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
+    """Whether what a region ``[h,w]`` shows lies several times as far away as the rest of the picture."""
+    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLES))], camera)
+    inside = (depths > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
+    x, y = pixels[inside].astype(int).T
+    hit, depths = region[y, x], depths[inside]
+    return bool(hit.any() and not hit.all() and np.median(depths[hit]) > FAR * np.median(depths[~hit]))
+
+
+def sky_region(photo: np.ndarray) -> np.ndarray:
+    """``[h,w]`` bool: the smooth blue or white regions that begin at a photo's upper border; none if they are small."""
+    height, width = photo.shape[:2]
+    scale = max(height, width) / SIDE
+    soft = cv2.GaussianBlur(photo.astype(np.float32), (0, 0), max(1.5 * scale, 0.5))
+    slopes = [np.abs(cv2.Sobel(soft, cv2.CV_32F, *way, ksize=3)).max(2) / 8 for way in ((1, 0), (0, 1))]
+    red, green, blue = np.moveaxis(soft, 2, 0)
+    bright = soft.max(2)
+    is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK)
+    is_white = (bright > WHITE) & (bright - soft.min(2) < GREY)
+    candidates = (np.hypot(*slopes) * scale < SMOOTH) & (is_blue | is_white)
+    _, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=4)
+    region = np.isin(labels, np.setdiff1d(labels[0], 0))
+    small = region.mean() < LEAST_AREA or region[0].mean() < LEAST_TOP
+    warm = small or np.percentile((blue - red)[region], 10) < -WARM
+    return np.zeros_like(region) if warm else region
+
+
+def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
+    """Whether the colours of a region lose saturation towards the picture's lower border."""
+    colors, rows = photo[region], np.nonzero(region)[0]
+    bright = colors.max(1)
+    saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
+    low, high = np.percentile(saturation, (10, 90))
+    if high - low < PALER_RANGE or np.ptp(rows) == 0:
+        return False
+    return bool(np.corrcoef(rows, saturation)[0, 1] <= PALER)

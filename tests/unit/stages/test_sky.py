@@ -1,0 +1,126 @@
+"""Gaussians of sky: found where photos show one, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import CompactOptions, PixelScene, compact, render
+from gsmerge.errors import UsageError
+from gsmerge.stages.clean import CleanOptions, clean
+from gsmerge.stages.sky import sky, sky_region, sky_regions
+from gsmerge.types import SH_C0
+
+WIDTH, HEIGHT, HORIZON = 96, 72, 30
+QUICK: dict[str, Any] = {"effort": "draft", "superpixels": 120}
+ZENITH, HAZE = np.array([0.35, 0.6, 0.95]), np.array([0.85, 0.92, 0.98])
+OVERCAST, CEILING = np.array([0.85, 0.86, 0.88]), np.array([0.85, 0.83, 0.78])
+
+
+def painted(top: np.ndarray, bottom: np.ndarray, depth: float = 1.0) -> tuple[PixelScene, np.ndarray]:
+    """A room whose upper part is painted over, from one colour to another, at so many times its depth; and where."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
+    assert scene.images is not None
+    images, colors = scene.images.copy(), scene.gaussians.sh0.copy()
+    shade = np.linspace(0, 1, HORIZON)[:, None, None]
+    images[:, :HORIZON] = (1 - shade) * top + shade * bottom
+    painted = np.zeros(images.shape[:3], bool)
+    painted[:, :HORIZON] = True
+    rows = painted.reshape(-1)
+    colors[rows, 0] = (images[painted] - 0.5) / SH_C0
+    means, scales = scene.gaussians.means.copy(), scene.gaussians.scales.copy()
+    centres = np.repeat(scene.cameras.centres, HEIGHT * WIDTH, 0)[rows]
+    means[rows] = centres + depth * (means[rows] - centres)
+    scales[rows] *= depth
+    gaussians = replace(scene.gaussians, means=means.astype(np.float32), scales=scales, sh0=colors)
+    return replace(scene, gaussians=gaussians, images=images.astype(np.float32)), rows
+
+
+@pytest.mark.parametrize(
+    ("top", "bottom", "depth"), [(ZENITH, HAZE, 1.0), (ZENITH, HAZE, 8.0), (OVERCAST, OVERCAST, 8.0)]
+)
+def test_sky_is_found(top: np.ndarray, bottom: np.ndarray, depth: float) -> None:
+    scene, rows = painted(top, bottom, depth)
+    assert scene.images is not None
+    found = sky(scene.gaussians, scene.cameras, scene.images)
+    assert found[rows].mean() > 0.8
+    assert found[~rows].mean() < 0.02
+
+
+@pytest.mark.parametrize(("top", "bottom"), [(CEILING, CEILING), (OVERCAST, OVERCAST), (HAZE, ZENITH)])
+def test_ceilings_and_walls_are_not(top: np.ndarray, bottom: np.ndarray) -> None:
+    """Warm white, cold white as near as the rest, and blue that grows paler upwards."""
+    scene, _ = painted(top, bottom)
+    assert scene.images is not None
+    assert not sky(scene.gaussians, scene.cameras, scene.images).any()
+
+
+def test_a_room_has_none() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
+    assert scene.images is not None
+    assert not sky(scene.gaussians, scene.cameras, scene.images).any()
+
+
+def test_one_view_may_be_mistaken() -> None:
+    scene, _ = painted(ZENITH, HAZE)
+    indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT)).images
+    assert scene.images is not None
+    assert indoors is not None
+    photos = np.concatenate([scene.images[:1], indoors[1:]])
+    assert not sky(scene.gaussians, scene.cameras, photos).any()
+
+
+def test_a_region_begins_above() -> None:
+    photo = np.full((HEIGHT, WIDTH, 3), (0.4, 0.3, 0.2), np.float32)
+    photo[:20] = ZENITH
+    photo[40:60] = ZENITH
+    photo[:, : WIDTH // 3] = (0.4, 0.3, 0.2)
+    region = sky_region(photo)
+    assert region[:16, WIDTH // 3 + 4 :].all()
+    assert not region[24:].any()
+    assert not region[:, : WIDTH // 3].any()
+    noise = np.random.default_rng(0).normal(0, 0.4, (360, 480, 3)).astype(np.float32)
+    assert not sky_region((ZENITH + noise).clip(0, 1)).any()  # as leaves in blue light
+
+
+def test_compact_leaves_it_out_and_counts_it() -> None:
+    scene, _ = painted(ZENITH, HAZE, 4.0)
+    whole, without = compact(scene, **QUICK), compact(scene, **QUICK, drop_sky=True)
+    count = without.report.choices["clean"]["sky"]
+    assert count > 0.1 * len(whole.gaussians)  # large ones
+    assert len(without.gaussians) == len(whole.gaussians) - count
+    assert any(f"left out by clean-up: {count:,} sky" in note for note in without.report.notes)
+    assert any("PSNR of the input views counts what is left out as errors" in note for note in without.report.notes)
+    shown = render(without.gaussians, scene.cameras).alphas[..., 0]
+    assert shown[:, : HORIZON - 4].mean() < 0.3
+    assert shown[:, HORIZON + 4 :].mean() > 0.9
+    exact = compact(scene, **QUICK, drop_sky=True, budget=200)
+    assert len(exact.gaussians) == 200
+
+
+def test_indoors_nothing_changes() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
+    whole, same = compact(scene, **QUICK), compact(scene, **QUICK, drop_sky=True)
+    np.testing.assert_array_equal(whole.gaussians.means, same.gaussians.means)
+    assert same.report.choices["clean"] == {"sky": 0}
+
+
+def test_views_that_show_it_are_counted() -> None:
+    """For ``inspect``."""
+    indoors = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
+    for scene, views in ((painted(ZENITH, HAZE)[0], [0, 1, 2, 3]), (indoors, [])):
+        assert scene.images is not None
+        assert list(sky_regions(scene.gaussians.means, scene.cameras, scene.images)) == views
+
+
+def test_what_cannot_be() -> None:
+    scene, _ = painted(ZENITH, HAZE)
+    with pytest.raises(UsageError, match="drop_sky: expected photos"):
+        clean(scene.gaussians, CleanOptions(drop_sky=True), replace(scene, images=None), lambda g: g)
+    with pytest.raises(ValueError, match="drop_sky: expected a budget or superpixels, got quality 30dB"):
+        CompactOptions().with_settings({"drop_sky": True, "quality": "30dB"})
+    assert CompactOptions().with_settings({"drop_sky": True}).whole_only == ["drop_sky"]
