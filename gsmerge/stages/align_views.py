@@ -47,9 +47,9 @@ CLEAR = 0.03  # residual, grey, from which on what two poses leave is compared b
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0  # radians and canonical units a pose is thought to be off; weight
 LIMIT_PX = 1.5  # motion in the views, pixels, from which on poses count as wrong
 # Share of what disagrees that the motion must take away besides: of some view at every size, and in the end more of it,
-# or of all views. Wrong depth moves right views as well, for up to 0.14 of a view and 0.06 of all at the largest size, and
-# a depth camera's own track 0.28 and 0.18. Views half a degree off gain 0.22 of all and more, one alone 0.32 of itself
-# (14 captures). Those in between stay where they are: whoever has other photos of the scene has them in its frame.
+# or of all views. Wrong depth moves right views as well, for up to 0.14 of a view and 0.06 of all at the largest size,
+# and a depth camera's own track 0.28 and 0.18. Views half a degree off gain 0.22 of all and more, one alone 0.32 of
+# itself (14 captures). Those in between stay where they are: other photos of the scene are in the frame that was given.
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 

@@ -98,7 +98,7 @@ def test_no_motion_in_common() -> None:
 
 
 def test_compacting_says_how_far_views_were_moved(scene: PixelScene) -> None:
-    wrong, settings = perturbed(scene), {"fit_steps": 12, "superpixels": "2%"}
+    wrong, settings = perturbed(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
     fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
     assert "poses" not in fixed.report.choices
     np.testing.assert_array_equal(fixed.cameras.viewmats, wrong.cameras.viewmats)
