@@ -91,6 +91,9 @@ def _check_folder() -> None:
         raise SceneError(os.curdir, f"the working directory cannot be used ({error.strerror})", "change it") from error
 
 
+_SOON = 0.02  # seconds after which a signal that was lost in a callback is raised again, when that has ended
+
+
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """A block that SIGTERM and SIGHUP end as Ctrl-C does, so that nothing unfinished is left; adds those that came.
@@ -102,15 +105,24 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
         signals.append(signal.Signals(number))
         raise KeyboardInterrupt
 
+    def try_again(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is KeyboardInterrupt:  # it came in a library's callback, which has nobody to raise it to
+            number = signals[-1] if signals else signal.SIGINT
+            threading.Timer(_SOON, signal.raise_signal, (number,)).start()
+        else:
+            told(lost)
+
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     if threading.current_thread() is not threading.main_thread():
         numbers = []
     ours = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
     for number in ours:
         signal.signal(number, stop)
+    told, sys.unraisablehook = sys.unraisablehook, try_again
     try:
         yield
     finally:
+        sys.unraisablehook = told
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import signal
@@ -135,6 +136,26 @@ def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root:
     assert process.returncode == code
     assert err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert listing(scene_copy) == before
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_in_a_callback_is_not_lost(
+    name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels are compiled and loaded with calls back into Python, which cannot hand an exception on."""
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.Signals[name]))
+
+    def busy(*_: object, **__: object) -> None:
+        callback()
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    monkeypatch.setattr("gsmerge.compact_file.compact", busy)
+    outcome = run("compact", scene_copy)
+    assert outcome.code == code
+    assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert not (scene_copy / "scene.compact.ply").exists()
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
