@@ -110,7 +110,7 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
             number = signals[-1] if signals else signal.SIGINT
             threading.Timer(_SOON, signal.raise_signal, (number,)).start()
         else:
-            told(lost)
+            print_it(lost)
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     if threading.current_thread() is not threading.main_thread():
@@ -118,11 +118,11 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     ours = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
     for number in ours:
         signal.signal(number, stop)
-    told, sys.unraisablehook = sys.unraisablehook, try_again
+    print_it, sys.unraisablehook = sys.unraisablehook, try_again
     try:
         yield
     finally:
-        sys.unraisablehook = told
+        sys.unraisablehook = print_it
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
 
@@ -132,6 +132,9 @@ def run(args: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if args is None else args)
 
     def fail(message: str, code: int) -> int:
+        cause = getattr(sys.exc_info()[1], "__cause__", None)
+        if code < 128 and (signals or isinstance(cause, KeyboardInterrupt)):
+            return stopped()  # libraries make errors of their own of it
         if "--debug" in words:
             traceback.print_exc()
         say(f"{PROGRAM}: error: {message}")

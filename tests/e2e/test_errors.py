@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from gsmerge.errors import OUT_OF_MEMORY
+from gsmerge.errors import OUT_OF_MEMORY, SceneError
 
 from .conftest import Run, listing
 
@@ -156,6 +156,23 @@ def test_a_signal_in_a_callback_is_not_lost(
     assert outcome.code == code
     assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert not (scene_copy / "scene.compact.ply").exists()
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+@pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
+def test_a_signal_that_a_library_makes_an_error_of(
+    name: str, code: int, error: Exception, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compact(*_: object, **__: object) -> None:
+        try:
+            signal.raise_signal(signal.Signals[name])
+        except KeyboardInterrupt as interrupt:
+            raise error from interrupt
+
+    monkeypatch.setattr("gsmerge.compact_file.compact", compact)
+    outcome = run("compact", scene_copy)
+    assert outcome.code == code
+    assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
