@@ -184,7 +184,11 @@ class Trial:
         process = gsmerge(self.words)
         time.sleep(max(0.0, start + seconds - time.perf_counter()))
         process.send_signal(signal.Signals[name])
-        _, err = process.communicate(timeout=PATIENCE)
+        try:
+            _, err = process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return 1, f"still runs after {PATIENCE} s", PATIENCE
         return process.returncode, err, time.perf_counter() - start
 
     def check(self, name: str, code: int, err: str, before: Contents, *, again: bool) -> list[str]:

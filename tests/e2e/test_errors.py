@@ -159,6 +159,30 @@ def test_a_signal_in_a_callback_is_not_lost(
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_waits_for_the_lock_of_the_compiler(
+    name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between taking it and being about to give it back: the pool's threads would wait for it for ever."""
+    from numba.core.compiler_lock import global_compiler_lock
+
+    events = []
+
+    def compile_something(*_: object, **__: object) -> None:
+        global_compiler_lock.acquire()
+        signal.raise_signal(signal.Signals[name])
+        events.append("compiled")
+        global_compiler_lock.release()
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    monkeypatch.setattr("gsmerge.compact_file.compact", compile_something)
+    assert run("compact", scene_copy).code == code
+    assert events == ["compiled"]
+    assert not global_compiler_lock.is_locked()
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 @pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
 def test_a_signal_that_a_library_makes_an_error_of(
     name: str, code: int, error: Exception, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
