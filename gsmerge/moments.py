@@ -116,7 +116,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
     Args:
         members: The scene's Gaussians.
         starts: ``[g+1]`` int64 into ``ids``.
-        ids: ``[m]`` int64 rows of ``members``.
+        ids: ``[m]`` int32 rows of ``members``.
         rule: ``"depth"``: the members' own covariances are added to the spread of their means, and the optical
             depth is what they have together. ``"paper"``: the paper's moment matching (eq. teacher_mean,
             teacher_cov), which states no opacity: the members' mean.

@@ -11,12 +11,12 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.baselines import choose_baseline
 from gsmerge.io import load_scene
 from gsmerge.io.cameras.moves import describe_moves, list_moves
-from gsmerge.moments import feature_to_gaussians
+from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.options import CompactOptions
 from gsmerge.render.photos import NEAR, photo_psnr, scene_photos
 from gsmerge.report import CompactReport, CompactResult
@@ -37,7 +37,10 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.prepare import PreparedScene, prepare, scene_depth
 from gsmerge.stages.segment import scene_saliency
-from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PixelScene, Segmentation, UnalignedScene
+
+if TYPE_CHECKING:
+    from gsmerge.networks.apply import NetworkContext
 
 Psnr = Callable[[Gaussians, PreparedScene], float]
 
@@ -181,29 +184,8 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
     saliency = scene_saliency(prepared.pictures) if options.decode.k == MIXED else None
     starts = []
     for networks in prepared.candidates(members):
-        robust = None
-        with log.stage("encode"):
-            features = encode(scene, members, segmentation.groups, options.encode, networks)
-        if prepared.limits.robust and (networks is None or options.robust.robust):  # networks stand in for the choice
-            with log.stage("robust"):
-                coarse = encode_backing(scene, members, segmentation.coarse, options.backing, features)
-                photos, aligned = scene_photos(scene, 2), isinstance(scene, PixelScene)
-                robust = choose_merge(features, coarse, photos, options.robust, leave_out=aligned)
-                features = robust.features
-        elif networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
-            features = weaken_contradicted(features, members, scene.cameras)
-        with log.stage("match"):
-            matches = match(features, options.match, networks)
-            merged = merge(features, matches, networks)
-        if networks is not None:
-            with log.stage("refine"):
-                merged = refine(merged, networks)
-        choices: dict[str, Any] = {"groups": len(features), "clusters": matches.count}
-        if robust is not None:
-            with log.stage("close"):
-                closed = close_holes(merged, robust, options.robust)
-                merged, choices = closed.features, choices | closed.choices
-        starts.append(MergedViews(merged, members, segmentation, networks, choices, saliency=saliency))
+        features, choices = merge_with(networks, prepared, members, segmentation, log)
+        starts.append(MergedViews(features, members, segmentation, networks, choices, saliency=saliency))
     start = starts[0]
     if len(starts) > 1:
         with log.stage("choose"):
@@ -212,6 +194,40 @@ def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> Merg
     if start.networks is not None and prepared.checkpoint is not None:
         log.choices["networks"] = prepared.checkpoint.facts()
     return start
+
+
+def merge_with(
+    networks: NetworkContext | None, prepared: PreparedScene, members: Members, segmentation: Segmentation, log: RunLog
+) -> tuple[FeatureGaussians, dict[str, Any]]:
+    """Feature Gaussians of superpixels, merged and refined with these networks or with none; what the stages decided.
+
+    What it holds besides the scene is as large as the result, several times: nothing of it outlives this function.
+    """
+    scene, options = prepared.scene, prepared.options
+    robust = None
+    with log.stage("encode"):
+        features = encode(scene, members, segmentation.groups, options.encode, networks)
+    if prepared.limits.robust and (networks is None or options.robust.robust):  # networks stand in for the choice
+        with log.stage("robust"):
+            coarse = encode_backing(scene, members, segmentation.coarse, options.backing, features)
+            photos, aligned = scene_photos(scene, 2), isinstance(scene, PixelScene)
+            robust = choose_merge(features, coarse, photos, options.robust, leave_out=aligned)
+            features = robust.features
+    elif networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
+        features = weaken_contradicted(features, members, scene.cameras)
+    with log.stage("match"):
+        matches = match(features, options.match, networks)
+        merged = merge(features, matches, networks)
+    choices: dict[str, Any] = {"groups": len(features), "clusters": matches.count}
+    del features, matches
+    if networks is not None:
+        with log.stage("refine"):
+            merged = refine(merged, networks)
+    if robust is None:
+        return merged, choices
+    with log.stage("close"):
+        closed = close_holes(merged, replace(robust, features=merged), options.robust)
+    return closed.features, choices | closed.choices
 
 
 def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr | None = None) -> CompactResult:

@@ -376,7 +376,7 @@ class FeatureGaussians:
     views: np.ndarray  # [g] int64, the view of the group, -1 when it was merged from several
     backing: np.ndarray  # [g] bool: belongs to the coarse layer behind the surfaces
     starts: np.ndarray  # [g+1] int64 into `members`
-    members: np.ndarray  # [m] int64 rows of the scene's Gaussians, group by group
+    members: np.ndarray  # [m] int32 rows of the scene's Gaussians, group by group: as many as they are, in every copy
     latents: Array  # [g,d] what the networks remember of the group (paper section 4.2), a tensor; without: d = 0
 
     def __post_init__(self) -> None:

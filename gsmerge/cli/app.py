@@ -91,6 +91,9 @@ def _check_folder() -> None:
         raise SceneError(os.curdir, f"the working directory cannot be used ({error.strerror})", "change it") from error
 
 
+_SOON = 0.02  # seconds after which a signal is raised again that came where it could not be handled
+
+
 @contextmanager
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """A block that SIGTERM and SIGHUP end as Ctrl-C does, so that nothing unfinished is left; adds those that came.
@@ -98,21 +101,45 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     What the caller has handled or ignored, as under nohup, stays so.
     """
 
+    def again(number: int) -> None:
+        timer = threading.Timer(_SOON, signal.raise_signal, (number,))
+        timer.daemon = True
+        timer.start()
+
     def stop(number: int, _: object) -> None:
-        signals.append(signal.Signals(number))
+        if _is_compiling():  # numba would keep its lock, for which other threads wait
+            again(number)
+            return
+        if number != signal.SIGINT:
+            signals.append(signal.Signals(number))
         raise KeyboardInterrupt
 
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    def try_again(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is KeyboardInterrupt:  # it came in a library's callback, which has nobody to raise it to
+            again(signals[-1] if signals else signal.SIGINT)
+        else:
+            print_it(lost)
+
+    usual = {signal.SIGINT: signal.default_int_handler}
+    usual |= {getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
     if threading.current_thread() is not threading.main_thread():
-        numbers = []
-    ours = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+        usual = {}
+    ours = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}
     for number in ours:
         signal.signal(number, stop)
+    print_it, sys.unraisablehook = sys.unraisablehook, try_again
     try:
         yield
     finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
+        sys.unraisablehook = print_it
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+
+
+def _is_compiling() -> bool:
+    """Whether this thread compiles or loads a kernel; numba is not imported to find out."""
+    module = sys.modules.get("numba.core.compiler_lock")
+    return module is not None and bool(module.global_compiler_lock.is_locked())
 
 
 def run(args: Sequence[str] | None = None) -> int:
@@ -120,6 +147,9 @@ def run(args: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if args is None else args)
 
     def fail(message: str, code: int) -> int:
+        cause = getattr(sys.exc_info()[1], "__cause__", None)
+        if code < 128 and (signals or isinstance(cause, KeyboardInterrupt)):
+            return stopped()  # libraries make errors of their own of it
         if "--debug" in words:
             traceback.print_exc()
         say(f"{PROGRAM}: error: {message}")

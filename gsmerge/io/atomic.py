@@ -14,7 +14,7 @@ import shutil
 import socket
 import stat
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -51,7 +51,11 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 @contextmanager
 def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path]]:
-    """A block that writes several files, all of them or none: the function makes each, as :func:`atomic_output`."""
+    """A block that writes several files, all of them or none: the function makes each, as :func:`atomic_output`.
+
+    Where one cannot take its name, the others lose theirs, and earlier files of these names are back. A process that is
+    killed while the files take their names leaves each whole, old or new.
+    """
     made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
 
     def add(path: Path) -> Path:
@@ -75,8 +79,7 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
             _refuse(path, overwrite)  # somebody else may have been quicker
         for temporary in made:
             _flush(temporary)
-        for temporary, (_, target) in made.items():
-            os.replace(temporary, target)
+        _rename_all([(temporary, target) for temporary, (_, target) in made.items()])
         for folder in {target.parent for _, target in made.values()}:
             with suppress(OSError):  # not every system can
                 _flush(folder)
@@ -91,10 +94,57 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[Callable[[Path], Path
         path = made.get(str(error.filename), next(iter(made.values())))[0]
         raise SceneError(path, f"could not be written ({error.strerror})") from error
     finally:
-        for temporary in made:
-            with suppress(OSError):
-                os.unlink(temporary)
-            _written.discard(temporary)
+        _remove(made)
+        _written.difference_update(made)
+
+
+def _rename_all(files: list[tuple[str, Path]]) -> None:
+    """Give all temporary files their names, or, where one cannot take its own, none."""
+    earlier: dict[str, str] = {}  # temporary file -> another name of what it replaces
+    try:
+        for temporary, target in files[:-1]:  # once the last has its name, nothing is to be undone
+            if os.path.lexists(target):
+                earlier[temporary] = str(temporary_path(target))
+                _keep(target, earlier[temporary])
+        for temporary, target in files:
+            os.replace(temporary, target)
+    except BaseException:
+        for temporary, target in reversed(files):
+            if not os.path.lexists(temporary):  # it has taken its name
+                _put_back(target, earlier.pop(temporary, None))
+        _remove(earlier.values())
+        raise
+    _remove(earlier.values())
+
+
+def _keep(target: Path, other: str) -> None:
+    """Give a file another name beside its own, so that it is there at every moment."""
+    try:
+        try:
+            os.link(target, other)
+        except OSError:  # not every file system has links, and not every file may be linked to
+            shutil.copy2(target, other)
+    except OSError as error:
+        problem = f"could not be kept until all files are written ({error.strerror})"
+        raise SceneError(target, problem, "remove it first") from error
+
+
+def _put_back(target: Path, other: str | None) -> None:
+    """Give a name back to the file that had it before, or to none."""
+    try:
+        if other is None:
+            os.unlink(target)
+        else:
+            os.replace(other, target)
+    except OSError as error:
+        remedy = "remove it" if other is None else f"what was there before is {other}, move it before the next run"
+        raise SceneError(target, f"is new, but other files are not ({error.strerror})", remedy) from error
+
+
+def _remove(paths: Iterable[str]) -> None:
+    for path in paths:
+        with suppress(OSError):
+            os.unlink(path)
 
 
 def _flush(path: str | Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -18,6 +19,7 @@ from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, as_array, as_tenso
 
 MEAN, SIZE, ROTATION, LOGIT, COLOR = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 RESIDUAL = 13
+ROWS = 65_536  # that are moved at once: their float64 matrices are ten times as large as they
 HALF = 0.5  # share of the bounds that each stage before the decoder may use
 
 
@@ -103,15 +105,26 @@ def move_features(features: FeatureGaussians, base: Gaussians, residuals: Tensor
         residuals: ``[g,13]``, whose gradients end here; the tenth is added to the logarithm of the optical depth.
         frames: ``[g,3,3]`` axes of each group as columns, world.
     """
-    f = {name: as_tensor(getattr(features, name)) for name in ("means", "covars", "masses", "extinctions", "sh0")}
-    wide, frames = residuals.double(), frames.double()
+    starts = range(0, max(1, len(features)), ROWS)
+    parts = [_move_rows(features, base, residuals, frames, slice(first, first + ROWS)) for first in starts]
+    return replace(features, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def _move_rows(
+    features: FeatureGaussians, base: Gaussians, residuals: Tensor, frames: Tensor, rows: slice
+) -> dict[str, np.ndarray]:
+    """The columns of some rows that :func:`move_features` changes."""
+    names = ("means", "covars", "masses", "extinctions", "sh0", "spreads")
+    f = {name: as_tensor(getattr(features, name)[rows]) for name in names}
+    base, residuals = base[rows], residuals[rows]
+    wide, frames = residuals.double(), frames[rows].double()
     axes = quat_to_rotmat(base.quats.double())
     stretch = torch.eye(3).double() + axes @ (torch.expm1(wide[:, SIZE])[:, :, None] * axes.transpose(1, 2))
     change = rotation_matrices(rotate_vectors(frames, wide[:, ROTATION])) @ stretch
     covars = change @ f["covars"].double() @ change.transpose(1, 2)
     depth = wide[:, LOGIT]
     disc = wide[:, SIZE][:, 1:].sum(1)  # of the two larger axes: principal axes are in ascending order
-    sizes = gaussian_sizes(base.scales / as_tensor(features.spreads)[:, None]).double()
+    sizes = gaussian_sizes(base.scales / f["spreads"][:, None]).double()
     shift = rotate_vectors(frames, wide[:, MEAN] * sizes[:, None])
     shift = torch.where(shift.isfinite(), shift, 0)  # for means as far away as float32 allows
     moved = {
@@ -121,4 +134,4 @@ def move_features(features: FeatureGaussians, base: Gaussians, residuals: Tensor
         "extinctions": f["extinctions"] * torch.exp(depth + disc),
         "sh0": f["sh0"] + residuals[:, None, COLOR] / SH_C0,
     }
-    return replace(features, **{name: as_array(values.float()) for name, values in moved.items()})
+    return {name: as_array(values.float()) for name, values in moved.items()}

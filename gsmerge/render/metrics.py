@@ -46,8 +46,11 @@ def psnr(image: Array, reference: Array, mask: Array | None = None) -> float:
         ValueError: If the shapes differ or no pixel counts.
     """
     first, second = image_pair(image, reference)
-    squares = np.subtract(first, second, dtype=np.float64) ** 2
-    error = float(squares.mean() if mask is None else squares[pixel_mask(mask, first)].mean())
+    if mask is not None:  # first, as float64 of a whole photo is more than all else that is known of it
+        chosen = pixel_mask(mask, first)
+        first, second = first[chosen], second[chosen]
+    errors = np.subtract(first, second, dtype=np.float64)
+    error = float(np.square(errors, out=errors).mean())
     return -10 * float(np.log10(error)) if error > 0 else float("inf")
 
 

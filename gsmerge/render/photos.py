@@ -163,7 +163,7 @@ def photo_psnr(
     def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
         chosen = tiles(view)
         mask = None if chosen is None else chosen.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
-        return psnr(np.clip(image, 0, 1), photos.images[view], mask)
+        return psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
 
     return float(np.mean(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings)))
 

@@ -12,7 +12,7 @@ from gsmerge.runtime.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
 # stages that leave much behind that was freed in other threads
-RELEASED = ("encode", "robust", "match", "refine", "close", "choose", "fit")
+RELEASED = ("prepare", "segment", "encode", "robust", "match", "refine", "close", "choose", "fit")
 STAGES = (
     "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "close",
     "cover", "decode", "choose", "join", "fit", "score", "input",

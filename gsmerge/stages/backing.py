@@ -94,7 +94,7 @@ def _draw_in_members(
 ) -> Members:
     """The members moved along their rays to within one footprint of their group's median depth."""
     means, scales = members.means.copy(), members.scales.copy()
-    pixels, inverse, factors = scene.pixels_per_view, np.ones(len(means)), np.ones(len(means))
+    pixels = scene.pixels_per_view
 
     def one_view(item: tuple[int, slice]) -> None:
         view, groups = item
@@ -102,11 +102,14 @@ def _draw_in_members(
         eye = (-viewmat[:3, :3].T @ viewmat[:3, 3]).astype(np.float32)
         own = starts[groups.start : groups.stop + 1]
         seen = ids[own[0] : own[-1]]
-        rows = slice(view * pixels, (view + 1) * pixels) if members.pixels is None else seen
+        rows: slice | np.ndarray = seen
+        places = np.arange(len(seen))
+        if members.pixels is None:
+            rows, places = slice(view * pixels, (view + 1) * pixels), seen - view * pixels
         depths = means[rows] @ viewmat[2, :3].astype(np.float32) + np.float32(viewmat[2, 3])
-        inverse[rows] = 1 / np.maximum(depths, 1e-6)
-        draw_in(own - own[0], seen, inverse, 1 / abs(fx), factors)
-        shrink = factors[rows].astype(np.float32)[:, None]
+        inverse, factors = (1 / np.maximum(depths, 1e-6)).astype(np.float64), np.ones(len(depths))
+        draw_in(own - own[0], places, inverse, 1 / abs(fx), factors)
+        shrink = factors.astype(np.float32)[:, None]
         means[rows] = eye + (means[rows] - eye) * shrink
         scales[rows] *= shrink
 

@@ -18,6 +18,7 @@ from gsmerge.geometry import sh0_to_rgb
 from gsmerge.moments import Rule, feature_to_gaussians
 from gsmerge.render import plan_view, prepare, splat_adjoint
 from gsmerge.render.photos import Photos, photo_errors, photo_psnr, scene_photos, scene_pictures
+from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.threads import in_turn
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.merge import MergedViews
@@ -26,6 +27,10 @@ from gsmerge.views import pick_views, scored_views
 
 MAX_VIEWS = 6  # that a start is judged by
 MIN_VIEWS = 3  # with two, leaving one out leaves nothing to compare
+
+# A name, and the layers that are drawn together: members of both in one array are as large as the scene, and only the
+# candidate that wins needs them.
+Candidate = tuple[str, tuple[FeatureGaussians, ...]]
 
 
 @dataclass(frozen=True)
@@ -116,15 +121,16 @@ def close_holes(merged: FeatureGaussians, chosen: RobustMerge, options: RobustOp
         chosen: What they were before.
         options: The family.
     """
-    family, coarse = [("as it is", merged)], chosen.coarse
+    family: list[Candidate] = [("as it is", (merged,))]
+    coarse = chosen.coarse
     wide = replace(merged, spreads=merged.spreads * options.widen)
     narrow = not bool(merged.backing.all()) and float(merged.spreads[~merged.backing].max()) <= 1
     if narrow:
-        family.append(("wide", wide))
+        family.append(("wide", (wide,)))
     if coarse is not None and not bool(merged.backing.any()):
-        family.append(("back", FeatureGaussians.concat([merged, coarse])))
+        family.append(("back", (merged, coarse)))
         if narrow:
-            family.append(("wide+back", FeatureGaussians.concat([wide, coarse])))
+            family.append(("wide+back", (wide, coarse)))
     name, best, scores = _best(family, chosen.photos, left_out=False)
     return replace(chosen, features=best, choices=chosen.choices | {"closed": name, "closed_scores": scores})
 
@@ -135,46 +141,49 @@ def photos_choose(robust: bool | None, fit: str, effort: str) -> bool:
 
 
 def _best(
-    family: Iterable[tuple[str, FeatureGaussians]], photos: Photos, *, left_out: bool
+    family: Iterable[Candidate], photos: Photos, *, left_out: bool
 ) -> tuple[str, FeatureGaussians, dict[str, float]]:
     """The member of the family with the best score, the first of equals, its name, and all scores."""
     scores: dict[str, float] = {}
-    best: tuple[str, FeatureGaussians] | None = None
-    for name, candidate in family:
-        scores[name] = merge_psnr(candidate, photos, left_out=left_out)
+    best: Candidate | None = None
+    for name, layers in family:
+        scores[name] = merge_psnr(layers, photos, left_out=left_out)
         if best is None or scores[name] > scores[best[0]]:
-            best = name, candidate
+            best = name, layers
     assert best is not None
-    return *best, scores
+    name, layers = best
+    return name, layers[0] if len(layers) == 1 else FeatureGaussians.concat(layers), scores
 
 
 def _family(
     features: FeatureGaussians, backing: FeatureGaussians | None, photos: Photos, options: RobustOptions
-) -> Iterator[tuple[str, FeatureGaussians]]:
+) -> Iterator[Candidate]:
     """Plain, wide, weighed, and with the backing layer behind."""
     wide = replace(features, spreads=features.spreads * options.widen)
-    yield "plain", features
-    yield "wide", wide
+    yield "plain", (features,)
+    yield "wide", (wide,)
     if backing is not None:
-        yield "wide+back", FeatureGaussians.concat([wide, backing])
+        yield "wide+back", (wide, backing)
     for name, base in (("plain", features), ("wide", wide)):
         weighed = replace(base, gains=weigh(base, photos, options))
-        yield f"{name}+weigh", weighed
+        yield f"{name}+weigh", (weighed,)
         if backing is not None:
-            yield f"{name}+weigh+back", FeatureGaussians.concat([weighed, backing])
+            yield f"{name}+weigh+back", (weighed, backing)
 
 
-def _spreads(features: FeatureGaussians, options: RobustOptions) -> Iterator[tuple[str, FeatureGaussians]]:
+def _spreads(features: FeatureGaussians, options: RobustOptions) -> Iterator[Candidate]:
     """Plain, wide, and wider still."""
-    yield "plain", features
+    yield "plain", (features,)
     for name, power in (("wide", 1), ("wider", 2)):
-        yield name, replace(features, spreads=features.spreads * options.widen**power)
+        yield name, (replace(features, spreads=features.spreads * options.widen**power),)
 
 
-def merge_psnr(features: FeatureGaussians, photos: Photos, *, left_out: bool) -> float:
+def merge_psnr(layers: Sequence[FeatureGaussians], photos: Photos, *, left_out: bool) -> float:
     """Mean PSNR (dB) of the photos, of many some, rendered from all Gaussians, or those of the other views only."""
-    keep = (lambda view: features.views != view) if left_out else None
-    return photo_psnr(feature_to_gaussians(features), photos, scored_views(len(photos)), keep=keep)
+    views = np.concatenate([layer.views for layer in layers])
+    keep = (lambda view: views != view) if left_out else None
+    gaussians = Gaussians.concat([feature_to_gaussians(layer) for layer in layers])
+    return photo_psnr(gaussians, photos, scored_views(len(photos)), keep=keep)
 
 
 def weigh(features: FeatureGaussians, photos: Photos, options: RobustOptions) -> np.ndarray:
@@ -231,6 +240,7 @@ def choose_start(
     for start in starts:
         name = "analytic" if start.networks is None else "learned"
         ones = decode(start.features, start.members, replace(options, k=1), None, rule, start.networks)
+        release_memory()  # of the networks, in other threads
         scores[name] = views_psnr(ones, scene)
         if scores[name] >= max(scores.values()):
             best = replace(start, k1_gaussians=ones)

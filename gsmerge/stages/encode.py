@@ -70,7 +70,7 @@ def encode(
 def member_rows(
     scene: PixelScene | UnalignedScene, members: Members, groups: Groups
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Members by superpixel: ``starts [g+1]``, ``ids [m]``, ``views [g]``; empty superpixels left out."""
+    """Members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty superpixels left out."""
     if isinstance(scene, PixelScene):
         return group_rows(scene, groups)
     assert members.pixels is not None
@@ -79,18 +79,18 @@ def member_rows(
     labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]
     labels = np.where(members.pixels >= 0, labels, -1).astype(np.int32)
     starts, ids = group_members(labels, int(counts.sum()))
-    filled = np.diff(starts) > 0
-    return np.append(starts[:-1][filled], starts[-1]), ids, np.repeat(np.arange(len(counts)), counts)[filled]
+    filled, views = np.diff(starts) > 0, np.repeat(np.arange(len(counts)), counts)
+    return np.append(starts[:-1][filled], starts[-1]), ids.astype(np.int32), views[filled]
 
 
 def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the scene by superpixel: ``starts [g+1]``, ``ids [m]``, ``views [g]``; empty superpixels left out."""
+    """Rows of the scene by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``; empty ones left out."""
     pixels = scene.pixels_per_view
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
         labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
         starts, ids = group_members(labels, groups.counts[view])
-        return np.diff(starts), ids + view * pixels
+        return np.diff(starts), (ids + view * pixels).astype(np.int32)
 
     parts = parallel_map(one_view, range(len(scene)))
     sizes = np.concatenate([p[0] for p in parts])

@@ -100,8 +100,9 @@ def _gather(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, 
     """Members of the indexed Feature Gaussians, one after the other: starts and rows."""
     begin, sizes = features.starts[index], np.diff(features.starts)[index]
     starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
-    offsets = np.arange(starts[-1]) - starts[:-1].repeat(sizes)
-    return starts, features.members[begin.repeat(sizes) + offsets]
+    places = (begin - starts[:-1]).astype(np.int32).repeat(sizes)
+    places += np.arange(starts[-1], dtype=np.int32)
+    return starts, features.members[places]
 
 
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import signal
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from gsmerge.errors import OUT_OF_MEMORY
+from gsmerge.errors import OUT_OF_MEMORY, SceneError
 
 from .conftest import Run, listing
 
@@ -135,6 +136,67 @@ def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root:
     assert process.returncode == code
     assert err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert listing(scene_copy) == before
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_in_a_callback_is_not_lost(
+    name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels are compiled and loaded with calls back into Python, which cannot hand an exception on."""
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.Signals[name]))
+
+    def busy(*_: object, **__: object) -> None:
+        callback()
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    monkeypatch.setattr("gsmerge.compact_file.compact", busy)
+    outcome = run("compact", scene_copy)
+    assert outcome.code == code
+    assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
+    assert not (scene_copy / "scene.compact.ply").exists()
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+def test_a_signal_waits_for_the_lock_of_the_compiler(
+    name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between taking it and being about to give it back: the pool's threads would wait for it for ever."""
+    from numba.core.compiler_lock import global_compiler_lock
+
+    events = []
+
+    def compile_something(*_: object, **__: object) -> None:
+        global_compiler_lock.acquire()
+        signal.raise_signal(signal.Signals[name])
+        events.append("compiled")
+        global_compiler_lock.release()
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    monkeypatch.setattr("gsmerge.compact_file.compact", compile_something)
+    assert run("compact", scene_copy).code == code
+    assert events == ["compiled"]
+    assert not global_compiler_lock.is_locked()
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
+@pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
+def test_a_signal_that_a_library_makes_an_error_of(
+    name: str, code: int, error: Exception, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compact(*_: object, **__: object) -> None:
+        try:
+            signal.raise_signal(signal.Signals[name])
+        except KeyboardInterrupt as interrupt:
+            raise error from interrupt
+
+    monkeypatch.setattr("gsmerge.compact_file.compact", compact)
+    outcome = run("compact", scene_copy)
+    assert outcome.code == code
+    assert outcome.err == f"gsmerge: error: {'interrupted' if code == 130 else f'ended by {name}'}\n"
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")

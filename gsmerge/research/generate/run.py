@@ -155,17 +155,20 @@ def write_scene(folder: Path, scene: SyntheticScene, key: Mapping[str, Any]) -> 
 def _folder(folder: Path) -> Iterator[Path]:
     """A hidden folder next to the final one, which takes its place when the block succeeds."""
     remove_stale(folder.parent)
-    temporary = temporary_path(folder)
+    temporary, earlier = temporary_path(folder), temporary_path(folder)
     try:
         temporary.mkdir(parents=True)
         yield temporary
         if folder.exists():
-            shutil.rmtree(folder)
+            folder.rename(earlier)
         temporary.rename(folder)
     except OSError as error:
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if earlier.exists() and not folder.exists():
+            earlier.rename(folder)
+        for path in (temporary, earlier):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:

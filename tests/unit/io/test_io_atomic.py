@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
+import signal
 import stat
 import subprocess
 import sys
@@ -154,6 +156,104 @@ def test_several_files_are_all_there_or_none(tmp_path: Path) -> None:
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"b.txt": "old"}
     write_both(tmp_path, "b.txt")
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"a.txt": "new", "b.txt": "new"}
+
+
+def fail_at(monkeypatch: pytest.MonkeyPatch, call: int, error: BaseException) -> None:
+    """Let the rename of that number fail, counted from 0."""
+    replace, calls = os.replace, itertools.count()
+
+    def rename(*paths: Any) -> None:
+        if next(calls) == call:
+            raise error
+        replace(*paths)
+
+    monkeypatch.setattr(os, "replace", rename)
+
+
+def write_three(folder: Path) -> None:
+    with atomic_outputs(overwrite=True) as add:
+        for name in ("a.txt", "b.txt", "c.txt"):
+            add(folder / name).write_text(f"new {name}")
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("earlier", [(), ("a.txt",), ("b.txt", "c.txt"), ("a.txt", "b.txt", "c.txt")])
+@pytest.mark.parametrize("call", [0, 1, 2])
+def test_a_rename_that_fails_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int, earlier: tuple[str, ...], links: bool
+) -> None:
+    for name in earlier:
+        (tmp_path / name).write_text(f"old {name}")
+    before = contents(tmp_path)
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_: os.stat(tmp_path / "no links here"))
+    fail_at(monkeypatch, call, OSError(errno.EIO, "Input/output error"))
+    with pytest.raises(SceneError, match="could not be written"):
+        write_three(tmp_path)
+    assert contents(tmp_path) == before
+    fail_at(monkeypatch, call, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        write_three(tmp_path)
+    assert contents(tmp_path) == before
+    monkeypatch.undo()
+    write_three(tmp_path)
+    assert contents(tmp_path) == {name: f"new {name}" for name in ("a.txt", "b.txt", "c.txt")}
+
+
+def test_an_earlier_file_that_cannot_be_put_back_is_named_and_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    replace = os.replace
+
+    def rename(source: Any, target: Any) -> None:
+        if Path(target).name != "a.txt" or (tmp_path / "a.txt").read_text() != "old":
+            raise OSError(errno.EIO, "Input/output error")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", rename)
+    with pytest.raises(SceneError, match="what was there before is") as raised:
+        write_three(tmp_path)
+    named = str(raised.value).split("before is ")[1].split(", move")[0]
+    assert Path(named).read_text() == "old"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals as POSIX has them")
+@pytest.mark.parametrize("call", range(6))
+def test_a_kill_between_renames_loses_nothing(tmp_path: Path, call: int) -> None:
+    """Two files have to be kept and three to be renamed: a kill before each of that, and after the last."""
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text("old")
+    program = f"""
+import itertools, os, signal
+from pathlib import Path
+from gsmerge.io import atomic_outputs
+calls = itertools.count()
+def before(function):
+    def wrapper(*paths):
+        if next(calls) == {call}:
+            os.kill(os.getpid(), signal.SIGKILL)
+        function(*paths)
+    return wrapper
+os.replace, os.link = before(os.replace), before(os.link)
+with atomic_outputs(overwrite=True) as add:
+    for name in ("a.txt", "b.txt", "c.txt"):
+        add(Path({str(tmp_path)!r}, name)).write_text("new")
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    names = max(0, call - 2)  # renames that were done
+    expected = {name: "new" if i < names else "old" for i, name in enumerate(("a.txt", "b.txt"))}
+    assert {name: (tmp_path / name).read_text() for name in expected} == expected
+    with atomic_output(tmp_path / "next.txt"):
+        pass
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"a.txt", "b.txt", "next.txt"} | ({"c.txt"} if call == 5 else set())
 
 
 def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:

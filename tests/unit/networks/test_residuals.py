@@ -61,6 +61,18 @@ def test_zero_changes_no_bit() -> None:
             assert type(getattr(before, f.name)) is type(getattr(after, f.name)), f.name
 
 
+@pytest.mark.parametrize("rows", [1, 7, 20])
+def test_any_number_of_rows_at_once_gives_the_same_bits(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    features, residuals = some(), 0.3 * torch.randn(20, RESIDUAL, generator=torch.Generator().manual_seed(5))
+    whole = move_features(features, base_of(features), residuals, frames())
+    monkeypatch.setattr("gsmerge.networks.residuals.ROWS", rows)
+    parts = move_features(features, base_of(features), residuals, frames())
+    for f in fields(whole):
+        assert np.array_equal(getattr(whole, f.name), getattr(parts, f.name)), f.name
+    none = make_features(np.zeros((0, 3)))
+    assert len(move_features(none, base_of(none), residuals[:0], frames()[:0])) == 0
+
+
 def test_gaussians_move_as_told() -> None:
     base = base_of(some())
     residuals = torch.zeros(20, RESIDUAL)

@@ -55,8 +55,8 @@ def test_best_score_wins(features: FeatureGaussians, backing: FeatureGaussians, 
     name, scores = chosen.choices["merge"], chosen.choices["merge_scores"]
     assert sorted(scores) == sorted(NAMES)
     assert scores[name] == max(scores.values())
-    assert merge_psnr(chosen.features, photos, left_out=True) == pytest.approx(scores[name], abs=1e-9)
-    assert scores["plain"] == pytest.approx(merge_psnr(features, photos, left_out=True), abs=1e-9)
+    assert merge_psnr([chosen.features], photos, left_out=True) == pytest.approx(scores[name], abs=1e-9)
+    assert scores["plain"] == pytest.approx(merge_psnr([features], photos, left_out=True), abs=1e-9)
     assert bool(chosen.features.backing.any()) == name.endswith("back")
 
 
@@ -66,7 +66,7 @@ def test_leaving_out_renders_the_others_only(features: FeatureGaussians, photos:
     for view in range(3):
         image = scenes.images_of(gaussians[features.views != view], scene.cameras[view : view + 1])[0][0]
         scores.append(psnr(np.clip(image, 0, 1), photos.images[view]))
-    assert merge_psnr(features, photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
+    assert merge_psnr([features], photos, left_out=True) == pytest.approx(np.mean(scores), abs=0.01)
 
 
 def test_many_views_are_judged_by_some(
@@ -77,7 +77,7 @@ def test_many_views_are_judged_by_some(
     others = feature_to_gaussians(features)[features.views != 1]
     image = scenes.images_of(others, scene.cameras[1:2])[0][0]
     expected = psnr(np.clip(image, 0, 1), photos.images[1])
-    assert merge_psnr(features, photos, left_out=True) == pytest.approx(expected, abs=0.01)
+    assert merge_psnr([features], photos, left_out=True) == pytest.approx(expected, abs=0.01)
 
 
 def test_weighing_lowers_what_other_photos_contradict(features: FeatureGaussians, photos: Photos) -> None:
@@ -147,7 +147,7 @@ def test_few_views_differ_in_spread_alone(scene: PixelScene, members: Members, v
     np.testing.assert_allclose(chosen.features.spreads, np.full(len(features), 1.2**power), rtol=1e-6)
     for name in ("means", "covars", "gains", "extinctions"):
         assert np.array_equal(getattr(chosen.features, name), getattr(features, name))
-    assert scores["plain"] == pytest.approx(merge_psnr(features, photos, left_out=False), abs=1e-9)
+    assert scores["plain"] == pytest.approx(merge_psnr([features], photos, left_out=False), abs=1e-9)
 
 
 def test_without_a_backing_layer_no_candidate_has_one(features: FeatureGaussians, photos: Photos) -> None:
@@ -161,9 +161,9 @@ def test_rendering_everything_shows_more(features: FeatureGaussians, photos: Pho
     gaussians = feature_to_gaussians(features)
     images = scenes.images_of(gaussians, scene.cameras)[0]
     expected = np.mean([psnr(np.clip(i, 0, 1), p) for i, p in zip(images, photos.images, strict=True)])
-    everything = merge_psnr(features, photos, left_out=False)
+    everything = merge_psnr([features], photos, left_out=False)
     assert everything == pytest.approx(expected, abs=0.01)
-    assert everything > merge_psnr(features, photos, left_out=True)
+    assert everything > merge_psnr([features], photos, left_out=True)
 
 
 # holes after merging
@@ -188,7 +188,7 @@ def test_holes_are_closed_by_what_shows_the_photos_best(
     assert list(scores) == ["as it is", "wide", "back", "wide+back"]
     assert scores[name] == max(scores.values())
     assert name != "as it is"
-    assert merge_psnr(chosen.features, photos, left_out=False) == pytest.approx(scores[name], abs=1e-9)
+    assert merge_psnr([chosen.features], photos, left_out=False) == pytest.approx(scores[name], abs=1e-9)
     assert bool(chosen.features.backing.any()) == name.endswith("back")
 
 

@@ -137,6 +137,21 @@ def test_what_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_scene_that_cannot_be_replaced_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    generate(tmp_path, 1, TINY)
+    before, rename = contents(tmp_path), Path.rename
+
+    def new_one_fails(path: Path, target: Path) -> Path:
+        if target.name == "scene_0000" and (path / "scene.ply").read_bytes() != before["scene_0000/scene.ply"]:
+            raise OSError(5, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", new_one_fails)
+    with pytest.raises(SceneError, match="Input/output error"):
+        generate(tmp_path, 1, TINY, seed=5, overwrite=True)
+    assert contents(tmp_path) == before
+
+
 def test_counts_and_seeds_are_checked(tmp_path: Path) -> None:
     for count, seed in ((0, 0), (1, -1)):
         with pytest.raises(ValueError, match="expected at least 1 scene"):

@@ -1,0 +1,500 @@
+"""Generated hostile inputs through the whole command: a result or one clear line, whatever a file holds.
+
+python benchmarks/hostile.py                          # 1,000 inputs over all readers; about twenty minutes
+python benchmarks/hostile.py --only sog "gsm, state" --count 100
+python benchmarks/hostile.py --only sog --case 17 --keep DIR    # one of them again, its files kept
+
+Each input is a sound file of its kind with something changed: bytes, words of a header, numbers, entries of a document,
+also inside what is compressed. Each runs in a process of its own with limits of memory and time, forked from one that
+has imported everything. Checked are exit code, errors, output folder, input, and the peak of memory: that of the sound
+file's run, and three times the input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import hashlib
+import importlib
+import io
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import zipfile
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+import cv2
+import numpy as np
+
+import gsmerge
+from gsmerge.cli import main as command
+
+ROOT = Path(__file__).resolve().parent.parent
+COUNT = 1000
+SECONDS, MEMORY = 60, 3 << 30  # limits of a process
+TIMES_INPUT, SLACK = 3, 32 << 20  # memory beyond the sound run's: times the input, and what differs by chance
+CODES = (0, 2, 3, 4, 5)
+FAST = ("--effort", "draft", "--fit-steps", "4", "--threads", "1", "--checkpoint", "none")
+
+Mutate = Callable[[random.Random, bytes], bytes]
+WORDS: list[Any] = [float("nan"), float("inf"), -1, 0, 1e300, 1e-300, 10**400, 2**31, 2**63, "wide", "", None, True,
+                    [], {}, [1, 2], {"a": 1}, "../../etc/passwd", "a\0b", "\u202e", -0.0, 1e9]  # fmt: skip
+PIECES = [b"\0" * 8, b"\xff" * 8, b"-1", b"99999999999", b"nan", b"1e999", b"\n", b"list uchar", b"{", b'"', b" "]
+
+
+def change_bytes(rng: random.Random, data: bytes) -> bytes:
+    """Some pieces overwritten, removed, put in, or taken from elsewhere; sometimes the end is missing."""
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        start = rng.randint(0, len(out))
+        elsewhere = rng.randint(0, max(len(data) - 1, 0))
+        piece = rng.choice([rng.randbytes(rng.randint(0, 16)), rng.choice(PIECES), data[elsewhere : elsewhere + 24]])
+        out[start : start + rng.choice([0, len(piece), rng.randint(0, 24)])] = piece
+    return bytes(out[: rng.randint(0, len(out))] if rng.random() < 0.15 else out)
+
+
+def change_words(rng: random.Random, data: bytes) -> bytes:
+    """Some little-endian words of binary data become extreme numbers."""
+    out = bytearray(data)
+    for _ in range(rng.choice([1, 1, 3, 50])):
+        if len(out) < 8:
+            break
+        value = rng.choice([
+            struct.pack("<f", rng.choice([float("nan"), float("inf"), -float("inf"), 3e38, -3e38, 1e-40, 0.0])),
+            struct.pack("<I", rng.choice([0, 1, 2**31 - 1, 2**31, 2**32 - 1])),
+            struct.pack("<Q", rng.choice([0, 2**32, 2**40, 2**63, 2**64 - 1])),
+        ])  # fmt: skip
+        start = rng.randint(0, len(out) - len(value)) // 4 * 4
+        out[start : start + len(value)] = value
+    return bytes(out)
+
+
+def change_text(rng: random.Random, data: bytes) -> bytes:
+    """Some words of a text become others, or lines are lost, repeated or exchanged."""
+    lines = data.split(b"\n")
+    for _ in range(rng.randint(1, 3)):
+        at = rng.randrange(len(lines))
+        action = rng.choice(["word", "word", "word", "lose", "repeat", "exchange"])
+        if action == "word":
+            words = lines[at].split(b" ")
+            value = rng.choice(WORDS)
+            words[rng.randrange(len(words))] = str(value).encode("utf-8", "replace")
+            lines[at] = b" ".join(words)
+        elif action == "lose" and len(lines) > 1:
+            del lines[at]
+        elif action == "repeat":
+            lines.insert(at, lines[at])
+        else:
+            other = rng.randrange(len(lines))
+            lines[at], lines[other] = lines[other], lines[at]
+    return b"\n".join(lines)
+
+
+def change_head(size: int) -> Mutate:
+    """Words of the first bytes, which hold a header of text."""
+    return lambda rng, data: change_text(rng, data[:size]) + data[size:]
+
+
+def change_ply_head(rng: random.Random, data: bytes) -> bytes:
+    return change_head(data.index(b"end_header"))(rng, data)
+
+
+def change_json(rng: random.Random, data: bytes) -> bytes:
+    """Some entries of a document become others, or are lost or repeated."""
+    document = json.loads(data)
+    for _ in range(rng.randint(1, 3)):
+        places = list(_places(document))
+        if not places:
+            break
+        holder, key = rng.choice(places)
+        action = rng.choice(["value", "value", "value", "lose", "repeat"])
+        if action == "value":
+            holder[key] = rng.choice(WORDS)
+        elif action == "lose":
+            del holder[key]
+        elif isinstance(holder, list):
+            holder.insert(key, holder[key])
+        else:
+            holder[rng.choice(["", "a", "frames", "w", "h", "K"])] = holder[key]
+    return json.dumps(document).encode()
+
+
+def _places(value: Any) -> list[tuple[Any, Any]]:
+    out = []
+    keys = list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    for key in keys:
+        out += [(value, key), *_places(value[key])]
+    return out
+
+
+def change_lines(rng: random.Random, data: bytes) -> bytes:
+    """Lines that are documents."""
+    lines = data.splitlines()
+    at = rng.randrange(len(lines))
+    lines[at] = rng.choice([change_json, change_bytes])(rng, lines[at])
+    return b"\n".join(lines) + rng.choice([b"\n", b"\n", b""])
+
+
+def inside_gzip(change: Mutate) -> Mutate:
+    return lambda rng, data: gzip.compress(change(rng, gzip.decompress(data)), 1)
+
+
+def inside_zip(change: Callable[[str], Mutate]) -> Mutate:
+    """One member of an archive is changed, sometimes lost."""
+
+    def mutate(rng: random.Random, data: bytes) -> bytes:
+        out = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as source, zipfile.ZipFile(out, "w") as target:
+            chosen, lost = rng.choice(source.namelist()), rng.random() < 0.05
+            for name in source.namelist():
+                content = source.read(name)
+                if name == chosen and lost:
+                    continue
+                target.writestr(name, change(name)(rng, content) if name == chosen else content)
+        return out.getvalue()
+
+    return mutate
+
+
+def in_safetensors(rng: random.Random, data: bytes) -> bytes:
+    """Header or arrays of a safetensors file."""
+    size = int.from_bytes(data[:8], "little")
+    head, body = data[8 : 8 + size], data[8 + size :]
+    part = rng.random()
+    if part < 0.4:
+        head = change_json(rng, head)
+    elif part < 0.6:  # the document in its metadata
+        document = json.loads(head)
+        texts = {key: text for key, text in document.get("__metadata__", {}).items() if text.startswith("{")}
+        for key, text in texts.items():
+            document["__metadata__"][key] = change_json(rng, text.encode()).decode()
+        head = json.dumps(document).encode()
+    else:
+        body = change_words(rng, body)
+    return len(head).to_bytes(8, "little") + head + body
+
+
+def another_picture(rng: random.Random, data: bytes) -> bytes:
+    """A sound picture of another size, depth or kind."""
+    size = rng.choice([(1, 1), (2, 3), (3000, 1), (31, 47), (2000, 3000)])
+    shape = (*size, rng.choice([1, 3, 4]))
+    values = np.random.default_rng(rng.randrange(99)).integers(0, 256, shape)
+    if rng.random() < 0.3:
+        return cv2.imencode(".png", values.astype(np.uint16) * 257)[1].tobytes()
+    return cv2.imencode(rng.choice([".png", ".jpg", ".bmp", ".tiff", ".webp"]), values.astype(np.uint8))[1].tobytes()
+
+
+def member(name: str) -> Mutate:
+    """How a member of an archive is changed."""
+    return any_of(change_json, change_bytes) if name.endswith(".json") else any_of(
+        change_bytes, change_words, *([another_picture] if name.endswith(".webp") else [])
+    )  # fmt: skip
+
+
+def any_of(*changes: Mutate) -> Mutate:
+    return lambda rng, data: rng.choice(changes)(rng, data)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file, where the sound one is, and what reads it."""
+
+    share: int  # of the inputs
+    files: tuple[str, ...]  # below the folder; one of them is changed
+    change: Mutate
+    words: Callable[[Path, Path], list[str]]  # of the folder with the input and of the output folder
+    outputs: tuple[str, ...] = ("a.ply",)  # that a run that ends well leaves
+
+
+def compact(scene: str = "scene.ply", *more: str) -> Callable[[Path, Path], list[str]]:
+    return lambda folder, out: ["compact", str(folder / scene), "-o", str(out / "a.ply"), *FAST, *more]
+
+
+def compact_with(cameras: str) -> Callable[[Path, Path], list[str]]:
+    return lambda folder, out: compact("scene.ply", "--cameras", str(folder / cameras))(folder, out)
+
+
+KINDS = {
+    "ply": Kind(120, ("scene.ply",), any_of(change_bytes, change_words, change_ply_head), compact()),
+    "ply, ascii": Kind(80, ("ascii.ply",), any_of(change_bytes, change_text, change_ply_head), compact("ascii.ply")),
+    "compressed.ply": Kind(50, ("a.compressed.ply",), any_of(change_bytes, change_words, change_ply_head),
+                           compact("a.compressed.ply")),
+    "spz": Kind(80, ("a.spz",), any_of(change_bytes, inside_gzip(any_of(change_bytes, change_words))),
+                compact("a.spz")),
+    "splat": Kind(40, ("a.splat",), any_of(change_bytes, change_words), compact("a.splat")),
+    "sog": Kind(90, ("a.sog",), any_of(change_bytes, inside_zip(member), inside_zip(member)), compact("a.sog")),
+    "gsm, encoded": Kind(70, ("a.gsm",), any_of(change_bytes, in_safetensors, in_safetensors),
+                         lambda folder, out: ["decode", str(folder / "a.gsm"), "-o", str(out / "a.ply"),
+                                              "--threads", "1"]),
+    "gsm, state": Kind(50, ("state.gsm",), any_of(change_bytes, in_safetensors, in_safetensors),
+                       lambda folder, out: ["decode", str(folder / "state.gsm"), "-o", str(out / "a.ply"),
+                                            "--fit-steps", "4", "--threads", "1"]),
+    "views.npz": Kind(70, ("cameras/views.npz",), any_of(change_bytes, inside_zip(member)),
+                      compact_with("cameras/views.npz")),
+    "transforms.json": Kind(80, ("transforms.json",), any_of(change_json, change_json, change_bytes), compact()),
+    "cameras.json": Kind(60, ("cameras/cameras.json",), any_of(change_json, change_json, change_bytes),
+                         compact_with("cameras/cameras.json")),
+    "COLMAP, text": Kind(50, ("cameras/text/cameras.txt", "cameras/text/images.txt"),
+                         any_of(change_text, change_bytes), compact_with("cameras/text")),
+    "COLMAP, binary": Kind(50, ("cameras/binary/cameras.bin", "cameras/binary/images.bin"),
+                           any_of(change_words, change_bytes), compact_with("cameras/binary")),
+    "images": Kind(50, tuple(f"images/view_00{i}.png" for i in range(3)), any_of(change_bytes, another_picture),
+                   compact()),
+    "batch.jsonl": Kind(20, ("batch/batch.jsonl",), change_lines,
+                        lambda folder, out: ["batch", str(folder / "scene.ply"), "-o", str(out), "--jobs", "1",
+                                             "--overwrite", *FAST], ("scene.ply", "batch.jsonl", "summary.csv")),
+    "runs.jsonl": Kind(20, ("charts/runs.jsonl",), change_lines,
+                       lambda folder, out: ["chart", "--draw-only", "-o", str(out)], ("index.html",)),
+    "checkpoint": Kind(20, ("checkpoint.safetensors",), any_of(change_bytes, in_safetensors, in_safetensors),
+                       lambda folder, out: [*compact()(folder, out)[:-1], str(folder / "checkpoint.safetensors")]),
+}  # fmt: skip
+STARTED_FROM = {"batch.jsonl": "batch", "runs.jsonl": "charts"}  # kinds that are in the output folder themselves
+
+
+def make_inputs(folder: Path) -> Path:
+    """A sound file of every kind."""
+    sys.path.insert(0, str(ROOT / "examples"))
+    importlib.import_module("01_make_scene").make_scene(folder, num_views=3, width=24, height=16, seed=0)
+    shutil.rmtree(folder / "targets")
+    gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
+    for name in ("a.spz", "a.splat", "a.sog", "a.compressed.ply"):
+        gsmerge.write_gaussians(folder / name, gaussians)
+    _write_ascii(folder)
+    _write_cameras(folder)
+    quick = ["--effort", "draft", "--threads", "1", "--quiet"]
+    for words in (
+        ["encode", folder / "scene.ply", "-o", folder / "a.gsm", "--checkpoint", "none", *quick],
+        ["extend", folder / "state.gsm", folder / "scene.ply", "--checkpoint", "none", *quick],
+        ["batch", folder / "scene.ply", "-o", folder / "batch", "--jobs", "1", *FAST, "--quiet"],
+        ["chart", folder / "scene.ply", "-o", folder / "charts", "--fit", "none", "--methods", "gsmerge,input",
+         "--budgets", "2%,5%", "--quiet"],
+    ):  # fmt: skip
+        if command([str(word) for word in words]):
+            raise SystemExit(f"failed: {words}")
+    shutil.copy(ROOT / "gsmerge" / "networks" / "shipped.safetensors", folder / "checkpoint.safetensors")
+    return folder
+
+
+def _write_ascii(folder: Path) -> None:
+    head, body = (folder / "scene.ply").read_bytes().split(b"end_header\n", 1)
+    rows = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property"))
+    text = "".join(" ".join(f"{value:.6g}" for value in row) + "\n" for row in rows)
+    head = head.replace(b"binary_little_endian", b"ascii")
+    (folder / "ascii.ply").write_bytes(head + b"end_header\n" + text.encode())
+
+
+def _write_cameras(folder: Path) -> None:
+    (folder / "cameras").mkdir()
+    data = json.loads((folder / "transforms.json").read_text())
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    c2w = np.array([frame["transform_matrix"] for frame in data["frames"]]) @ flip
+    focal, centre, size = (data["fl_x"], data["fl_y"]), (data["cx"], data["cy"]), (data["w"], data["h"])
+    K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
+    names = [Path(frame["file_path"]).name for frame in data["frames"]]
+    images = np.stack([cv2.imread(str(folder / "images" / name))[..., ::-1] for name in names])
+    np.savez(folder / "cameras" / "views.npz", c2w=c2w, K=np.tile(K, (3, 1, 1)), images=images)
+    cameras = [
+        {"id": i, "img_name": names[i], "width": size[0], "height": size[1], "position": pose[:3, 3].tolist(),
+         "rotation": pose[:3, :3].tolist(), "fx": focal[0], "fy": focal[1]}
+        for i, pose in enumerate(c2w)
+    ]  # fmt: skip
+    (folder / "cameras" / "cameras.json").write_text(json.dumps(cameras))
+    text, binary = [], struct.pack("<Q", len(names))
+    for i, pose in enumerate(np.linalg.inv(c2w), 1):
+        quat, shift = _quaternion(pose[:3, :3]), pose[:3, 3]
+        numbers = " ".join(repr(float(value)) for value in (*quat, *shift))
+        text += [f"{i} {numbers} 1 {names[i - 1]}", ""]
+        binary += struct.pack("<i7di", i, *quat, *shift, 1) + names[i - 1].encode() + b"\0" + struct.pack("<Q", 0)
+    for name in ("text", "binary"):
+        (folder / "cameras" / name).mkdir()
+    line = f"1 PINHOLE {size[0]} {size[1]} {focal[0]} {focal[1]} {centre[0]} {centre[1]}\n"
+    (folder / "cameras" / "text" / "cameras.txt").write_text(line)
+    (folder / "cameras" / "text" / "images.txt").write_text("\n".join(text) + "\n")
+    camera = struct.pack("<QiiQQ4d", 1, 1, 1, *size, *focal, *centre)
+    (folder / "cameras" / "binary" / "cameras.bin").write_bytes(camera)
+    (folder / "cameras" / "binary" / "images.bin").write_bytes(binary)
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """wxyz of a rotation that is not by half a turn."""
+    w = np.sqrt(max(1 + np.trace(rotation), 1e-12)) / 2
+    r = rotation
+    return np.array([w, *(np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / (4 * w))])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a process did."""
+
+    code: int  # exit code, or minus the signal that ended it
+    err: str
+    peak: int  # bytes beyond those of the process that it was forked from
+    seconds: float
+
+
+def run_forked(words: list[str], place: Path) -> Outcome:
+    """The command in a child of this process, in limits."""
+    start, base = time.perf_counter(), _memory()[1]
+    pid = os.fork()
+    if pid == 0:
+        code = 99
+        try:
+            _limit(place)
+            code = command(words)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    _, status, usage = os.wait4(pid, 0)
+    err = (place / "err").read_text(errors="backslashreplace")
+    peak = (usage.ru_maxrss << 10) - base
+    return Outcome(os.waitstatus_to_exitcode(status), err, peak, time.perf_counter() - start)
+
+
+def _limit(place: Path) -> None:
+    for number, name in ((1, "out"), (2, "err")):
+        descriptor = os.open(place / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666)
+        os.dup2(descriptor, number)
+    resource.setrlimit(resource.RLIMIT_AS, (_memory()[0] + MEMORY,) * 2)
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    from gsmerge.io import atomic
+
+    atomic._clean.clear()
+
+
+def _memory() -> list[int]:
+    """Address space and resident memory of this process, bytes."""
+    return [int(pages) * resource.getpagesize() for pages in Path("/proc/self/statm").read_text().split()[:2]]
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def try_kind(name: str, inputs: Path, place: Path, rng: random.Random | None) -> tuple[Outcome, list[str], int]:
+    """A file of a kind, changed or sound, through its command: outcome, faults, and bytes of the input."""
+    kind, folder, out = KINDS[name], place / "in", place / "made"
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(inputs, folder)
+    if rng is not None:
+        path = folder / rng.choice(kind.files)
+        path.write_bytes(kind.change(rng, path.read_bytes()))
+    out.mkdir()
+    if name in STARTED_FROM:
+        shutil.copytree(folder / STARTED_FROM[name], out, dirs_exist_ok=True)
+    before, earlier = contents(folder), contents(out)
+    outcome = run_forked(kind.words(folder, out), place)
+    faults = _check_end(outcome)
+    if contents(folder) != before:
+        faults.append("the input has changed")
+    faults += _check_outputs(name, outcome.code, out, earlier)
+    return outcome, faults, sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _check_end(outcome: Outcome) -> list[str]:
+    """What is wrong with exit code and errors."""
+    lines = [line for line in outcome.err.splitlines() if line.startswith("gsmerge: error: ")]
+    faults = []
+    if outcome.code not in CODES:
+        faults.append(f"exit code {outcome.code}")
+    if "Traceback" in outcome.err or re.search("unexpected error|gsmerge: warning|Warning:", outcome.err):
+        faults.append("traceback, unexpected error or warning")
+    if (outcome.code != 0) != (len(lines) == 1) or not all(line.isprintable() for line in outcome.err.splitlines()):
+        faults.append(f"{len(lines)} lines of error")
+    if outcome.code and outcome.err.splitlines()[-1:] != lines[-1:]:
+        faults.append("the error is not the last line")
+    return faults
+
+
+def _check_outputs(name: str, code: int, out: Path, earlier: dict[str, str]) -> list[str]:
+    """What is wrong with the output folder."""
+    after, outputs = contents(out), KINDS[name].outputs
+    hidden = [path for path in after if Path(path).name.startswith(".") and path not in earlier]
+    faults = [f"left {hidden}"] if hidden else []
+    if code in (2, 3) and set(after) - set(earlier):
+        faults.append(f"exit code {code}, and wrote {sorted(set(after) - set(earlier))}")
+    if code == 0:
+        faults += [f"{path} is missing" for path in outputs if path not in after]
+        for path in out.glob("*.ply"):
+            try:
+                found = gsmerge.read_ply(path)
+                if found.info.num_nonfinite or not len(found.gaussians):
+                    faults.append(f"{path.name}: {found.info.num_nonfinite} rows are not finite")
+            except Exception as error:
+                faults.append(f"{path.name} cannot be read: {error}")
+    return faults
+
+
+def warm(inputs: Path, place: Path) -> dict[str, int]:
+    """Import everything and load kernels here, and the peak of each kind's sound run, bytes."""
+    (place / "warm").mkdir(parents=True)
+    for name in ("ply", "spz", "gsm, state"):
+        if command([*KINDS[name].words(inputs, place / "warm"), "--quiet", "--overwrite"]):
+            raise SystemExit(f"the sound file of {name} failed")
+    for module in ("safetensors.numpy", "torch", "gsmerge.networks.apply", "PIL.Image", "matplotlib", "jinja2"):
+        importlib.import_module(module)
+    peaks = {}
+    for name in KINDS:
+        outcome, faults, _ = try_kind(name, inputs, place / "sound", None)
+        if faults or outcome.code:
+            raise SystemExit(f"the sound file of {name} failed: {faults} {outcome}")
+        peaks[name] = outcome.peak
+    return peaks
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--count", type=int, default=COUNT, help="inputs over all kinds")
+    parser.add_argument("--only", nargs="*", choices=list(KINDS), default=list(KINDS), metavar="KIND")
+    parser.add_argument("--case", type=int, help="this one of each kind alone")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="folder for the files of the last input")
+    args = parser.parse_args()
+    bad = 0
+    with tempfile.TemporaryDirectory() as folder:
+        inputs, place = make_inputs(Path(folder) / "inputs"), args.keep or Path(folder) / "place"
+        peaks, shares = warm(inputs, Path(folder) / "warm"), sum(KINDS[name].share for name in args.only)
+        for name in args.only:
+            count = max(1, round(args.count * KINDS[name].share / shares))
+            codes, most, slowest = Counter[int](), 0, 0.0
+            faulty: defaultdict[str, list[int]] = defaultdict(list)
+            for case in range(count) if args.case is None else [args.case]:
+                outcome, faults, size = try_kind(name, inputs, place, random.Random(f"{args.seed} {name} {case}"))
+                beyond = outcome.peak - peaks[name]
+                if beyond > TIMES_INPUT * size + SLACK:
+                    faults.append(f"{beyond >> 20} MiB beyond the sound run")
+                codes[outcome.code] += 1
+                most, slowest = max(most, beyond), max(slowest, outcome.seconds)
+                for fault in faults:
+                    faulty[fault].append(case)
+                if faults or args.case is not None:
+                    print(f"  {name} {case}: {faults}: {outcome.err.strip()[-300:]!r}", flush=True)
+            bad += sum(len(cases) for cases in faulty.values())
+            said = ", ".join(f"{code}: {times}" for code, times in sorted(codes.items()))
+            print(
+                f"| {name} | {sum(codes.values())} | {said} | {most >> 20} MiB | {slowest:.1f} s |"
+                f" {sum(len(cases) for cases in faulty.values())} |", flush=True,
+            )  # fmt: skip
+    sys.exit(1 if bad else 0)
+
+
+if __name__ == "__main__":
+    main()

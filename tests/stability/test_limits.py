@@ -1,0 +1,103 @@
+"""At the ends of what may be asked for: budgets of nearly nothing and of everything, views of hardly any pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import PixelScene, UnalignedScene, compact
+from gsmerge.errors import UsageError
+
+VIEWS = 4
+PLAIN = {"fit": "none", "robust": False, "checkpoint": "none"}
+
+
+@pytest.fixture(scope="module")
+def room() -> PixelScene:
+    return scenes.make_scene(scenes.room(), scenes.arc(VIEWS, 32, 24), noise=0.005)
+
+
+def unaligned(scene: PixelScene) -> UnalignedScene:
+    return UnalignedScene(scene.gaussians, scene.cameras, scene.images, scene.names)
+
+
+@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}], ids=str)
+def test_the_smallest_budget(room: PixelScene, settings: dict[str, Any]) -> None:
+    """One Gaussian for each view: met, visible, in the colours of the scene; and one fewer is refused."""
+    result = scenes.compacted(room, superpixels="auto", budget=VIEWS, **settings)
+    assert len(result.gaussians) == VIEWS
+    image, alpha = scenes.images_of(result.gaussians, room.cameras)
+    assert alpha.mean() > 0.3
+    assert room.images is not None
+    shown = (image * alpha[..., None]).sum((0, 1, 2)) / alpha.sum()
+    assert np.abs(shown - room.images.mean((0, 1, 2))).max() < 0.25
+    with pytest.raises(UsageError, match="budget"):
+        compact(room, budget=VIEWS - 1, **settings)
+
+
+@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
+def test_a_budget_of_everything(room: PixelScene, settings: dict[str, Any]) -> None:
+    """Every pixel its own: as many as the input, and as good."""
+    result = scenes.compacted(room, superpixels="auto", budget="100%", match="none", **settings)
+    assert len(result.gaussians) == room.num_gaussians
+    assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
+
+
+def test_a_budget_of_every_unaligned_gaussian_changes_none(room: PixelScene) -> None:
+    result = compact(unaligned(room), budget="100%", **PLAIN)
+    assert scenes.identical(result.gaussians, compact(unaligned(room), budget=room.num_gaussians, **PLAIN).gaussians)
+    np.testing.assert_allclose(result.gaussians.means, room.gaussians.means, atol=1e-6)
+    np.testing.assert_array_equal(result.gaussians.sh0, room.gaussians.sh0)
+
+
+@pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
+@pytest.mark.parametrize("budget", [5, 97, 500, 1501])
+@pytest.mark.parametrize("settings", [{}, PLAIN, {"k": 2}, {"k": 8, **PLAIN}, {"segmentation": "grid"}], ids=str)
+def test_budgets_without_a_fit_are_met(room: PixelScene, budget: int, settings: dict[str, Any], aligned: bool) -> None:
+    scene = room if aligned else unaligned(room)
+    result = compact(scene, budget=budget, **{"fit": "none", **settings})
+    assert len(result.gaussians) == result.report.num_output == budget
+    scenes.assert_invariants(result.gaussians, room)
+
+
+@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
+def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(400, 8, 6))
+    result = scenes.compacted(scene, **settings)
+    assert 400 * 8 * 6 * 0.001 < len(result.gaussians) < 400 * 8 * 6 * 0.2
+    few = scenes.take_views(scene, range(0, 400, 40))
+    assert scenes.psnr_of(result.gaussians, few) > scenes.psnr_of(scene.gaussians, few) - 1
+
+
+@pytest.mark.parametrize("size", [(4096, 16), (16, 4096), (4096, 1)])
+@pytest.mark.parametrize("settings", [PLAIN, {"fit_steps": 10}], ids=str)
+def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
+    """Superpixels follow the long side: neither end is lost."""
+    width, height = size
+    cameras = scenes.arc(2, *size)
+    if height > width:
+        Ks = cameras.Ks.copy()
+        Ks[:, [0, 1], [0, 1]] = height
+        cameras = replace(cameras, Ks=Ks)
+    scene = scenes.make_scene(scenes.wall(), cameras)
+    result = scenes.compacted(scene, superpixels="2%", **settings)
+    assert len(result.gaussians) <= 0.04 * scene.num_gaussians
+    assert scene.images is not None
+    _, alpha = scenes.images_of(result.gaussians, scene.cameras)
+    along = alpha.mean((0, 1)) if width > height else alpha.mean((0, 2))
+    assert along[: len(along) // 16].mean() > 0.5
+    assert along[-(len(along) // 16) :].mean() > 0.5
+
+
+@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
+def test_eight_of_a_single_pixel(settings: dict[str, Any]) -> None:
+    """A group of one member gives one Gaussian, however many are asked for."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 16))
+    one, eight = (scenes.compacted(scene, superpixels=24 * 16, match="none", k=k, **settings).gaussians for k in (1, 8))
+    assert len(one) == len(eight) == scene.num_gaussians
+    assert scenes.identical(one, eight)
+    assert scenes.psnr_of(eight, scene) > scenes.psnr_of(scene.gaussians, scene) - 0.1
