@@ -327,7 +327,8 @@ _TABLE = (
                wording="default"),
         option("device", ("cpu", "cuda", "auto"), "Where the stages run; cuda needs gsmerge[cuda]. auto: a GPU "
                "where there is one and the scene is large enough.", wording="cpu"),
-        option("fit_steps", int, "Steps of the full fit.", wording="by effort", rare=True, min=1),
+        option("fit_steps", int, "Steps of the full fit. By default more Gaussians get more.", wording="by effort",
+               rare=True, min=1),
         option("photo_scale", str, "Fit to photos that are larger than the views at up to so many times the views' "
                "size, for sharper results up close; auto: up to 2.", wording="auto", rare=True,
                parser=parse_photo_scale, metavar="NUMBER|auto"),

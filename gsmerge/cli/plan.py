@@ -39,13 +39,14 @@ def plan_document(
     from gsmerge.runtime.estimate import estimate_run, fit_of, is_robust
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.fit.photos import photo_scale
-    from gsmerge.stages.group import budget_count, largest_count, superpixels_per_view
+    from gsmerge.stages.group import budget_count, default_count, largest_count, superpixels_per_view
 
     photos, grid = scene.images is not None, (len(scene), scene.cameras.height, scene.cameras.width)
     options, budget = settings.resolved(photos=photos), budget_count(scene, settings)
     pixels = max(len(scene) * scene.pixels_per_view, scene.num_gaussians)
     num_gaussians = scene.num_gaussians or pixels
     max_count = largest_count(scene, settings) if budget is None else budget
+    share = (budget or default_count(scene, settings)) / max(1, pixels)
     if settings.method.startswith("unmerged"):
         max_count = pixels
     per_view = None  # a budget distributes them by what it needs
@@ -64,7 +65,7 @@ def plan_document(
         "fit": fit_of(options, photos=photos),
         "estimate": estimate_run(
             grid, options, pixels, photos=photos, threads=settings.threads or available_threads(),
-            fit_steps=settings.fit.steps, num_rest=3 * scene.gaussians.shN.shape[1],
+            fit_steps=settings.fit.with_steps_for(share).steps, num_rest=3 * scene.gaussians.shN.shape[1],
             photo_scale=photo_scale(scene, settings.fit)[0],
         ),
         "options": to_schema(options),

@@ -107,7 +107,7 @@ def declared(path: Path) -> int:
 
 def test_options_are_declared_once(root: Path) -> None:
     """366 before there was a table of them."""
-    assert sum(map(declared, (root / "gsmerge" / "cli").glob("*.py"))) <= 128
+    assert sum(map(declared, (root / "gsmerge" / "cli").glob("*.py"))) <= 130
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))

@@ -179,7 +179,7 @@ def test_every_option_of_compact_is_there() -> None:
     commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     options = {name: {o: p for p in commands[name].params for o in p.opts} for name in ("compact", "batch")}
     assert options["compact"].keys() - options["batch"].keys() == {
-        "scene", "--report", "--no-viewer-cameras", "--no-normals",
+        "scene", "--report", "--no-viewer-cameras", "--save-cameras", "--no-normals", "--spz-version",
     }  # fmt: skip
     own = {"--cameras", "--images", "-o", "--output", "--threads", "--overwrite", "--json"}  # of many scenes in batch
     for name in options["compact"].keys() & options["batch"].keys() - own:

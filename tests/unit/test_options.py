@@ -26,10 +26,11 @@ def test_a_shared_name_reaches_every_stage_that_has_it() -> None:
     assert options.with_settings({"fit_steps": 77}).fit.steps == 77
 
 
-def test_a_draft_merges_no_views_and_takes_few_steps_on_small_photos() -> None:
+def test_a_draft_merges_no_views_and_takes_few_steps() -> None:
     draft = CompactOptions().with_settings({"effort": "draft"})
     assert draft.match.method == "none"
-    assert (draft.fit.steps, draft.fit.half_res_part, draft.fit.grows) == (12, 1.0, False)
+    assert (draft.fit.steps, draft.fit.half_res_part, draft.fit.grows) == (30, 0.7, False)
+    assert draft.with_settings({"fit_steps": 12}).fit.half_res_part == 1  # no time for photos of full size
     assert CompactOptions().match.method == "overlap"
     assert draft.with_settings({"match": "aabb"}).match.method == "aabb"
 

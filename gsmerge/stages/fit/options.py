@@ -133,7 +133,8 @@ class FitOptions:
         """With more steps for more Gaussians, unless steps are given.
 
         Args:
-            share: Gaussians for each pixel of all views. Steps grow with its square root from USUAL_SHARE on.
+            share: Gaussians for each pixel of all views, as superpixels and K or a budget ask for. Steps grow with its
+                square root from USUAL_SHARE on.
         """
         factor = min(math.sqrt(share / USUAL_SHARE), MOST_STEPS)
         if self.fit_steps is not None or factor <= 1:

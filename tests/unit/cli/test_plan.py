@@ -37,6 +37,12 @@ def test_plan_counts() -> None:
     assert plan(budget="auto")["output"]["num_gaussians_at_most"] == 12 * 800
 
 
+def test_plan_knows_that_more_gaussians_take_more_steps() -> None:
+    few, many, asked = (plan(**s)["estimate"] for s in ({}, {"budget": "20%"}, {"budget": "20%", "fit_steps": 240}))
+    assert few == asked
+    assert many["seconds"] > 1.2 * few["seconds"]
+
+
 def test_plan_says_where_adaptive_superpixels_start() -> None:
     adaptive = {"segmentation": "bass-adaptive"}
     assert any("800 per view at the start, 1" in line for line in plan_lines(plan(**adaptive, superpixels="4%")))
