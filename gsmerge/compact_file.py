@@ -96,8 +96,9 @@ def compact_files(
     """
     start, ending = perf_counter(), output_format(out, spz_version)
     with atomic_outputs(overwrite=overwrite) as add:
-        at = {path: add(path) for path in (out, report_path) if path is not None}
+        at = {path: add(path) for path in (out, report_path, saved_cameras) if path is not None}
         given = read_input(files, opacity=opacity, hints=hints)
+        check_saved_cameras(given.scene, saved_cameras)
         read = perf_counter()
         result = compact(given.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
@@ -115,9 +116,7 @@ def compact_files(
         if cameras_path is not None:
             write_viewer_cameras(add(cameras_path), result.cameras, given.scene.names)
         if saved_cameras is not None:
-            if not len(given.scene):
-                raise UsageError(f"--save-cameras {saved_cameras}: expected a scene with cameras, got none")
-            write_transforms(add(saved_cameras), result.cameras, given.scene.names)
+            write_transforms(at[saved_cameras], result.cameras, given.scene.names)
         lost = lost_harmonics(out, result.gaussians.sh_degree, spz_version)
         document = report_document(
             result.report,
@@ -150,6 +149,12 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     del loaded  # its arrays are as large as the scene's
     release_memory()
     return scene_input
+
+
+def check_saved_cameras(scene: PixelScene | UnalignedScene, path: Path | None) -> None:
+    """Refuse a file for the cameras of a scene without any."""
+    if path is not None and len(scene) == 0:
+        raise UsageError(f"--save-cameras {path}: expected a scene with cameras, got none")
 
 
 def compact_notes(loaded: SceneLoad) -> tuple[str, ...]:

@@ -84,7 +84,7 @@ def compact(
         prepared = prepare(scene, options, log)
         own_build, psnr = choose_builder(prepared)
         make, judge = own_build if baseline is None else baseline.build, partial(score, psnr=psnr)
-        if options.clean.asked:
+        if prepared.options.clean.asked:
             prepared, make = clean_up(prepared, make)
         if options.budget.target_psnr is not None:
             result = search_quality(prepared, make, judge, log)

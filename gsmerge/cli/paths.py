@@ -21,12 +21,14 @@ def default_output(ply: Path) -> Path:
 
 
 def check_format(output: Path, spz_version: int, budget: BudgetOptions | None = None) -> None:
-    """Refuse an output whose name says no known format, what that needs and is not installed, or a budget in bytes for
-    a format of unknown size.
+    """Refuse an output whose name says no known format, what that needs and is not installed, a version of ``.spz`` for
+    another format, or a budget in bytes for a format of unknown size.
     """
     from gsmerge.io import output_format
 
     ending = output_format(output, spz_version)
+    if spz_version != 3 and ending != ".spz":
+        raise UsageError(f"--spz-version {spz_version}: expected an output as .spz, got {ending}")
     if budget is not None and budget.in_bytes and ending != ".ply":
         raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 

@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 def print_plan(args: Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
     """Print what would be done, as lines or JSON."""
     from gsmerge.baselines import choose_baseline
-    from gsmerge.compact_file import read_input
+    from gsmerge.compact_file import check_saved_cameras, read_input
     from gsmerge.report import document_head
 
     given = read_input(files, opacity=args.opacity, hints=hints)
+    check_saved_cameras(given.scene, vars(args).get("save_cameras"))
     _, unused = choose_baseline(settings, given.scene)
     refused = os.path.lexists(out) and not args.overwrite
     exists = [f"{out} exists already: --overwrite would replace it"] * refused

@@ -27,7 +27,7 @@ from gsmerge.errors import UsageError
 def view(args: opt.Args) -> None:
     """Compare a scene with its compact versions in the browser: one file with photos, stills, 3D and scores."""
     from gsmerge.report import document_head
-    from gsmerge.stages.segment import SegmentOptions
+    from gsmerge.stages.segment import SegmentOptions, count_for
 
     with opt.usage_errors():
         segmentation = SegmentOptions(**args.given(SegmentOptions.__dataclass_fields__))
@@ -38,6 +38,8 @@ def view(args: opt.Args) -> None:
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
     given = read_before_after(args, files)
+    if given.scene.images is not None:
+        count_for(segmentation, *given.scene.images.shape[1:3])  # refuses more than pixels, before anything is measured
     say_notes(given.notes, quiet=args.silent)
     document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": given.notes}
     if args.dry_run:

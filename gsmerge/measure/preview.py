@@ -16,6 +16,7 @@ from gsmerge.views import pick_views
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
 BAND = 22  # height of the band that carries a tile's label, pixels
 GAP = 4
+BORDER_COLOR = (255, 230, 40)  # of superpixels: seldom in photos
 
 
 def to_picture(image: np.ndarray) -> Picture:
@@ -87,7 +88,7 @@ def _join(pictures: Sequence[Picture], axis: int) -> Picture:
 def draw_borders(image: np.ndarray, labels: np.ndarray) -> Picture:
     """The photo ``[h,w,3]`` (sRGB in [0, 1]) with the borders between superpixels ``[h,w]`` in yellow."""
     picture = to_picture(image)
-    picture[borders(labels)] = (255, 230, 40)
+    picture[borders(labels)] = BORDER_COLOR
     return picture
 
 

@@ -46,7 +46,8 @@ def leave_out_photos(
 ) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
     """The scene without the photos that do not show it, whose place the Gaussians' own colours take.
 
-    Where they are most, there are no photos and no fit. The log gets a note and the choice ``photos_left_out``.
+    Where they are most, there are no photos, no fit, and nothing that is known to be sky. The log gets a note and the
+    choice ``photos_left_out``.
 
     Args:
         scene: Canonical.
@@ -67,11 +68,10 @@ def leave_out_photos(
     problem = f"{len(odd)} of {len(views)} photos do not show what the Gaussians show"
     if 2 * len(odd) > len(views):
         log.notes.append(f"{problem}, so none is used and nothing is fitted: {which}; check their names and order")
-        return (
-            replace(scene, images=None, large_photos=None),
-            replace(options, fit=replace(options.fit, fit="none")),
-            views,
-        )
+        if options.clean.drop_sky:
+            log.notes.append("drop_sky: no photo is used that could say where the sky is, so it stays")
+        fit, clean = replace(options.fit, fit="none"), replace(options.clean, drop_sky=False)
+        return replace(scene, images=None, large_photos=None), replace(options, fit=fit, clean=clean), views
     log.notes.append(f"{problem} and are not used: {which}")
     images = scene.images.copy()
     images[odd] = _own_pictures(scene, odd)

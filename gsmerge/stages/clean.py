@@ -138,19 +138,15 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
     Args:
         gaussians: In the canonical frame.
         options: What is left out.
-        scene: In the same frame; its photos say where the sky is.
+        scene: In the same frame; its photos say where the sky is, and without them ``drop_sky`` cannot be asked for.
         to_world: From that frame to the world's, which a crop is in.
-
-    Raises:
-        UsageError: If sky is to be left out and there are no photos.
     """
     counts = {}
     if options.crop is not None:
         inside = inside_crop(to_world(gaussians).means, options.crop)
         gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
     if options.drop_sky:
-        if scene.images is None:
-            raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
+        assert scene.images is not None, "prepare refuses scenes without photos"
         above = sky(gaussians, scene.cameras, scene.images)
         gaussians, counts["sky"] = gaussians[~above], int(above.sum())
     if options.drop_floaters:
@@ -173,7 +169,7 @@ def make_clean(
         log: Takes seconds, counts and notes.
 
     Raises:
-        UsageError: If the crop holds none of the scene; as of :func:`clean`.
+        UsageError: If the crop holds none of the scene.
     """
     given = scene.gaussians[scene.valid.reshape(-1)] if isinstance(scene, PixelScene) else scene.gaussians
     most, asked = len(given), count

@@ -241,6 +241,8 @@ def prepare(
         settings = replace(settings, contribution=ContributionOptions(), checkpoint="none", require_checkpoint=False)
     if scene.images is None and settings.budget.quality is not None:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
+    if scene.images is None and settings.clean.drop_sky:
+        raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
     with log.stage("prepare"):
         own, options = drop_repeats(scene, settings, log)
         canonical: PixelScene | UnalignedScene

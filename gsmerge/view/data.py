@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmerge.geometry import project
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, Views, evaluate
-from gsmerge.measure.preview import Picture, borders, to_picture
+from gsmerge.measure.preview import BORDER_COLOR, Picture, borders, to_picture
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -24,7 +24,6 @@ from gsmerge.views import even_views
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
-OUTLINE_COLOR = (255, 230, 40)
 DEPTH_SAMPLE = 50_000  # Gaussians that say how far away the middle of a view lies
 
 
@@ -67,7 +66,7 @@ class ViewData:
         num_views: Views that were measured, which may be more.
         reference: What scores compare with, in words.
         notes: Warnings and limits, one sentence each.
-        num_superpixels: Of each photo with outlines; None where there are none.
+        num_superpixels: Least and most of a photo with outlines; None where there are none.
     """
 
     title: str
@@ -76,7 +75,7 @@ class ViewData:
     num_views: int
     reference: str
     notes: tuple[str, ...]
-    num_superpixels: int | None = None
+    num_superpixels: tuple[int, int] | None = None
 
     @property
     def held_out(self) -> bool:
@@ -145,8 +144,8 @@ def collect(
 
 def with_outlines(
     views: Sequence[PageView], photos: np.ndarray | None, options: SegmentOptions
-) -> tuple[tuple[PageView, ...], int | None]:
-    """The views with outlines of the superpixels of the input photos ``[v,h,w,3]``, and how many those are."""
+) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
+    """The views with outlines of the superpixels of the input photos ``[v,h,w,3]``, and least and most of a photo."""
     places = [i for i, view in enumerate(views) if not view.held_out]
     if photos is None or not places:
         return tuple(views), None
@@ -154,7 +153,7 @@ def with_outlines(
     made = list(views)
     for i, labels in zip(places, groups.labels, strict=True):
         made[i] = replace(views[i], outlines=encode_outlines(labels))
-    return tuple(made), groups.counts[0]
+    return tuple(made), (min(groups.counts), max(groups.counts))
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -176,7 +175,7 @@ def encode_outlines(labels: np.ndarray) -> bytes:
     rows = np.pad(np.packbits(lines, axis=1), ((0, 0), (1, 0)))  # a zero begins each: stored as it is
     parts = {
         b"IHDR": struct.pack(">IIBBBBB", lines.shape[1], lines.shape[0], 1, 3, 0, 0, 0),  # one bit, a palette
-        b"PLTE": bytes(3) + bytes(OUTLINE_COLOR),
+        b"PLTE": bytes(3) + bytes(BORDER_COLOR),
         b"tRNS": bytes([0, 255]),
         b"IDAT": zlib.compress(rows.tobytes(), 9),
         b"IEND": b"",

@@ -208,12 +208,19 @@ def test_levels_in_other_formats(made_scene: Path, tmp_path: Path, run: Run) -> 
     [
         (("-o", "a.ksplat"), "expected a name that ends in"),
         (("-o", "a.spz", "--budget", "5MB"), "--budget 5MB: expected an output as .ply, got .spz"),
+        (("-o", "a.sog", "--spz-version", 4), "--spz-version 4: expected an output as .spz, got .sog"),
     ],
 )
 def test_formats_that_cannot_be_written(
-    arguments: tuple[str, ...], words: str, scene_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+    arguments: tuple[object, ...], words: str, scene_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
     monkeypatch.chdir(scene_copy)
     outcome = run("compact", scene_copy, *arguments)
     assert (outcome.code, outcome.err.count("\n")) == (2, 1)
     assert words in outcome.err
+
+
+def test_decode_takes_a_version_of_spz_for_spz_alone(encoded: Path, tmp_path: Path, run: Run) -> None:
+    outcome = run("decode", encoded, "-o", tmp_path / "a.ply", "--spz-version", 4)
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert "--spz-version 4: expected an output as .spz, got .ply" in outcome.err

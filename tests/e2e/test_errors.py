@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -83,6 +84,32 @@ def test_failures_while_writing_leave_nothing(
     assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
     assert "No space left" in outcome.err
     assert listing(scene_copy) == before
+
+
+@pytest.mark.parametrize("more", [(), ("--dry-run",)])
+def test_cameras_that_are_not_there_cannot_be_saved(
+    more: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Told before any work."""
+    monkeypatch.setattr("gsmerge.compact_file.compact", Broken(KeyError("lost")))
+    shutil.copy(made_scene / "scene.ply", tmp_path / "alone.ply")
+    outcome = run(
+        "compact", tmp_path / "alone.ply", "--order", "none", "--save-cameras", tmp_path / "saved.json", *more
+    )
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1), outcome.err
+    assert "saved.json: expected a scene with cameras, got none" in outcome.err
+    assert list(listing(tmp_path)) == ["alone.ply"]
+
+
+def test_more_superpixels_than_pixels_are_refused_before_the_page_is_made(
+    scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.view.data.evaluate", Broken(KeyError("lost")))
+    call = ("view", scene_copy, scene_copy / "scene.ply", "-o", tmp_path / "a.html", "--superpixels", 999_999)
+    for more in ((), ("--dry-run",)):
+        outcome = run(*call, *more)
+        assert (outcome.code, outcome.err.count("\n")) == (2, 1), outcome.err
+        assert "superpixels: expected at most 6144, one per pixel of 96 x 64, got 999999" in outcome.err
 
 
 def test_a_gpu_that_is_not_there_is_wrong_usage(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,6 +177,17 @@ def test_unaligned_gaussians_without_a_fit(room: PixelScene) -> None:
     assert novel_psnr(result.gaussians) > 20
 
 
+@pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
+def test_sky_stays_where_most_are_wrong(room: PixelScene, aligned: bool) -> None:
+    scene = with_photos(room, all_black, aligned=aligned)
+    whole, same = (compact(scene, **FIT, drop_sky=drop_sky) for drop_sky in (False, True))
+    assert scenes.identical(whole.gaussians, same.gaussians)
+    assert set(same.report.notes) - set(whole.report.notes) == {
+        "drop_sky: no photo is used that could say where the sky is, so it stays"
+    }
+    assert "clean" not in same.report.choices
+
+
 def test_an_unaligned_scene_does_without_one(room: PixelScene) -> None:
     right, wrong = (
         compact(with_photos(room, change, aligned=False), **FIT) for change in (lambda photos: photos, one_black)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import loose
 import numpy as np
 import pytest
 import scenes
 
 from gsmerge import CompactOptions, PixelScene, compact, render
 from gsmerge.errors import UsageError
-from gsmerge.stages.clean import CleanOptions, clean
 from gsmerge.stages.sky import sky, sky_region, sky_regions
 from gsmerge.types import SH_C0
 
@@ -118,9 +118,11 @@ def test_views_that_show_it_are_counted() -> None:
 
 
 def test_what_cannot_be() -> None:
-    scene, _ = painted(ZENITH, HAZE)
-    with pytest.raises(UsageError, match="drop_sky: expected photos"):
-        clean(scene.gaussians, CleanOptions(drop_sky=True), replace(scene, images=None), lambda g: g)
+    scene, stages = replace(painted(ZENITH, HAZE)[0], images=None), []
+    for one in (scene, loose.loosened(scene)):
+        with pytest.raises(UsageError, match="drop_sky: expected photos"):
+            compact(one, **QUICK, drop_sky=True, progress=lambda stage, *_: stages.append(stage))
+    assert stages == []  # before any work
     with pytest.raises(ValueError, match="drop_sky: expected a budget or superpixels, got quality 30dB"):
         CompactOptions().with_settings({"drop_sky": True, "quality": "30dB"})
     assert CompactOptions().with_settings({"drop_sky": True}).whole_only == ["drop_sky"]

@@ -155,7 +155,7 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
 
 def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: PixelScene) -> None:
     """Of the input photos alone, as compact cuts them."""
-    assert actual.num_superpixels == int(0.044 * 160 * 120)
+    assert actual.num_superpixels == (int(0.044 * 160 * 120),) * 2
     assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
     assert scene.images is not None
     view = next(view for view in actual.views if view.place == 1)
@@ -174,7 +174,7 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: PixelS
 
 def test_superpixels_as_asked_for(scene: PixelScene, half: Gaussians) -> None:
     asked = collect("room", scene, {"half": half}, (2, 1), segmentation=SegmentOptions(superpixels=50))
-    assert asked.num_superpixels == 50
+    assert asked.num_superpixels == (50, 50)
     none = collect("room", replace(scene, images=None), {"half": half}, (2, 1))
     assert none.num_superpixels is None
     assert {view.outlines for view in none.views} == {None}

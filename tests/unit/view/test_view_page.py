@@ -101,6 +101,11 @@ def test_without_superpixels(data: ViewData, page: str) -> None:
         assert words not in bare
 
 
+@pytest.mark.parametrize(("counts", "words"), [((1234, 1234), "1,234 of each"), ((900, 1234), "900 to 1,234 of each")])
+def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int], words: str) -> None:
+    assert f"Superpixels: {words} input photo" in view_page(replace(data, num_superpixels=counts))
+
+
 def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
     assert "odd?" in view_page(replace(data, title="odd\udcff"))
 
