@@ -9,7 +9,7 @@ from typing import Literal
 Device = Literal["cpu", "cuda", "auto"]
 Fit = Literal["none", "color", "full"]
 Poses = Literal["auto", "fixed", "free"]
-STEPS = {"draft": 30, "fast": 50, "default": 240, "best": 1000}  # of the full fit, by effort
+STEPS = {"draft": 30, "fast": 55, "default": 240, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
 EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
