@@ -6,13 +6,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import motions
 import numpy as np
 import pytest
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge import PixelScene, compact_tensors
 from gsmerge.errors import SceneError
-from gsmerge.geometry import motion_matrices, pose_changes
+from gsmerge.geometry import pose_changes
 from gsmerge.io import load_scene
 from gsmerge.io.alignment.move_cameras import max_pixels, move_cameras
 from gsmerge.io.alignment.score import sample_pixels
@@ -35,9 +36,7 @@ def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
 
 def off(tiny: Tiny, degrees: float, shift: float) -> np.ndarray:
     """The tiny scene's viewmats, each turned and moved in its own frame."""
-    rng = np.random.default_rng(1)
-    parts = [vectors / np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in rng.normal(size=(2, 3, 3))]
-    return motion_matrices(np.concatenate([np.deg2rad(degrees) * parts[0], shift * parts[1]], 1)) @ tiny.w2c
+    return np.asarray(motions.random_motions(3, degrees, shift) @ tiny.w2c)
 
 
 def test_a_known_motion_is_found(large: Tiny) -> None:

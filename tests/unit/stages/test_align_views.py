@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import motions
 import numpy as np
 import pytest
 import scenes
@@ -12,7 +13,7 @@ from gsmerge import PixelScene, compact
 from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
 from gsmerge.geometry import without_common_motion as without_common
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.align_views import align_views, move_views
+from gsmerge.stages.align_views import align_views
 
 VIEWS = range(5)
 
@@ -24,15 +25,6 @@ def scene() -> PixelScene:
     return scenes.move(made, np.eye(3), 0.5, np.array([0, 0, 0.5 * back]))
 
 
-def perturbed(scene: PixelScene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> PixelScene:
-    """Views moved with their Gaussians."""
-    vectors = np.random.default_rng(2).normal(size=(2, 5, 3))
-    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True)
-    motions = np.zeros((5, 6))
-    motions[views] = np.concatenate([np.deg2rad(degrees) * vectors[0], shift * vectors[1]], 1)[views]
-    return move_views(scene, motion_matrices(motions) @ scene.cameras.viewmats)
-
-
 def worst_error(scene: PixelScene, truth: PixelScene) -> tuple[float, float]:
     """Degrees and distances between relative poses."""
     relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
@@ -41,7 +33,7 @@ def worst_error(scene: PixelScene, truth: PixelScene) -> tuple[float, float]:
 
 
 def test_moved_gaussians_stay_at_their_pixels(scene: PixelScene) -> None:
-    moved = perturbed(scene)
+    moved = motions.disagreeing(scene)
     for view in VIEWS:
         rows = slice(view * scene.pixels_per_view, (view + 1) * scene.pixels_per_view)
         (before,), _ = project(scene.gaussians.means[rows], scene.cameras[[view]])
@@ -59,7 +51,7 @@ def test_views_that_agree_are_left_alone(scene: PixelScene) -> None:
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
 def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) -> None:
-    wrong = perturbed(scene, views=views)
+    wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
     found = align_views(wrong, VIEWS)
     assert found is not None
@@ -71,7 +63,7 @@ def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) ->
 
 
 def test_the_same_with_one_thread(scene: PixelScene) -> None:
-    wrong, found = perturbed(scene), []
+    wrong, found = motions.disagreeing(scene), []
     for threads in (1, 2):
         with use_threads(threads):
             found.append(align_views(wrong, VIEWS))
@@ -98,7 +90,7 @@ def test_no_motion_in_common() -> None:
 
 
 def test_compacting_says_how_far_views_were_moved(scene: PixelScene) -> None:
-    wrong, settings = perturbed(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
+    wrong, settings = motions.disagreeing(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
     fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
     assert "poses" not in fixed.report.choices
     np.testing.assert_array_equal(fixed.cameras.viewmats, wrong.cameras.viewmats)
