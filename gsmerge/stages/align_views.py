@@ -103,7 +103,9 @@ def align_views(scene: PixelScene, views: Sequence[int], *, always: bool = False
         given = first if side == sides[0] else parallel_map(partial(_compare, level, start), pairs)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, given, last, end=side == sides[-1])):
             return None
-    return move_views(scene, without_common_motion(start, viewmats, np.median))
+    placed = sorted({view for pair in pairs for view in pair})  # the others stay where they are
+    viewmats[placed] = without_common_motion(start[placed], viewmats[placed], np.median)
+    return move_views(scene, viewmats)
 
 
 def move_views(scene: PixelScene, viewmats: np.ndarray) -> PixelScene:
