@@ -35,8 +35,8 @@ def encode_scene(
 ) -> Encoded:
     """All of :func:`gsmerge.compact` up to decoding, stored: superpixels, merging, matching, networks; never a fit.
 
-    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", **settings)``, bit for bit; so is
-    any other ``k`` at decoding, unless a budget or the size of the input limits the number of
+    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", poses="fixed", **settings)``, bit
+    for bit; so is any other ``k`` at decoding, unless a budget or the size of the input limits the number of
     superpixels of either, or Gaussians that no view sees are kept: these are merged for one K.
 
     Args:
