@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from gsmerge.cli.options import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
 
@@ -79,6 +77,8 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 
 def own_cameras(paths: Sequence[Path], scene: PixelScene | UnalignedScene) -> tuple[dict[str, Cameras], list[str]]:
     """The cameras that ``compact`` wrote beside results where it had moved them, by name of the result; and notes."""
+    import numpy as np
+
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.io.cameras.moves import describe_moves, list_moves
     from gsmerge.io.cameras.read import read_cameras

@@ -116,7 +116,7 @@ def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:
 def test_a_plain_file_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files in which the rows as they are leave a doubt are."""
     tiny, searched = smooth_scene(48, 36), []
-    monkeypatch.setattr(recovery, "_exact", lambda inputs: searched.append(inputs) or [])
+    monkeypatch.setattr(recovery, "exact_layouts_of", lambda inputs: searched.append(inputs) or [])
     plain = clues_of(tiny, tiny.images)
     actual = recover(plain)
     assert isinstance(actual, Recovery)
