@@ -81,6 +81,16 @@ def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: flo
         move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
 
 
+def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tmp_path: Path) -> None:
+    cameras = cameras_of(large)
+    cameras.Ks[:, 0, 2] += 4
+    large.save(tmp_path)
+    write_transforms(tmp_path / "transforms.json", cameras, large.names)
+    with pytest.raises(SceneError, match=r"transforms.json: expected intrinsics .* add -4.0") as error:
+        load_scene(tmp_path)
+    assert "\n" not in str(error.value)
+
+
 def test_far_off_is_too_far(large: Tiny) -> None:
     wrong = cameras_of(large, off(large, 8.0, 0.02))
     assert move_cameras(sample_pixels(large.gaussians, wrong, np.ones(84000, bool)), wrong, NAMES) is None
