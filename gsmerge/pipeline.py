@@ -90,10 +90,10 @@ def compact(
             result = search_quality(prepared, make, judge, log)
         else:
             result = judge(make(prepared, choose_count(prepared, own_build, log), log), prepared, log)
-        coarser = []
+        coarser, placed = [], prepared.with_cameras(log.viewmats)  # the cameras that are written are the finest level's
         for count in level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count):
             own = RunLog(progress)
-            coarser.append(judge(make(prepared, count, own), prepared, own))
+            coarser.append(judge(make(placed, count, own), placed, own))
         result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress), psnr)
     if progress:
         progress("done", len(STAGES), len(STAGES))
@@ -237,7 +237,8 @@ def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr
     """
     if prepared.hidden is not None:
         gaussians = Gaussians.concat([gaussians, prepared.hidden])
-    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras(log.viewmats)
+    prepared = prepared.with_cameras(log.viewmats)
+    gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
     after = None
     if cameras is not prepared.given.cameras:
         note_moves(prepared, cameras, log)

@@ -74,15 +74,17 @@ def search_quality(prepared: PreparedScene, build: Build, score: Score, log: Run
     target, limits = prepared.options.budget.target_psnr, prepared.limits
     assert target is not None
     results: dict[int, CompactResult] = {}
+    poses: dict[int, np.ndarray | None] = {}
 
     def run(count: int) -> float:
         own = RunLog(log.progress)
         results[count] = score(build(prepared, count, own), prepared, own)
+        poses[count] = own.viewmats
         return results[count].report.psnr_after or 0.0
 
     max_count = min(limits.max_count, MAX_FACTOR * limits.default)
     search = search_count(run, target, min(limits.default, max_count), limits.min_count, max_count)
-    result = results[search.count]
+    result, log.viewmats = results[search.count], poses[search.count]
     seconds = dict(log.seconds)
     for one in results.values():
         for name, value in one.report.seconds.items():

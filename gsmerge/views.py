@@ -62,15 +62,21 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
     return chosen
 
 
-def distinct_views(scene: PixelScene | UnalignedScene) -> list[int]:
-    """The views without those that repeat an earlier one: the same camera, the same photo, the same Gaussians."""
+def distinct_views(scene: PixelScene | UnalignedScene) -> tuple[list[int], list[int]]:
+    """The views without those that repeat an earlier one: the same camera, the same photo, the same Gaussians.
+
+    Returns:
+        Their numbers, and of every view the place of what it repeats among them, or its own.
+    """
     cameras = np.concatenate([scene.cameras.viewmats.reshape(-1, 16), scene.cameras.Ks.reshape(-1, 9)], 1)
     _, firsts = np.unique(cameras, axis=0, return_inverse=True)
-    kept: list[int] = []
+    kept, places = list[int](), list[int]()
     for view, kind in enumerate(firsts.reshape(-1)):
-        if not any(firsts.reshape(-1)[one] == kind and _equal_views(scene, one, view) for one in kept):
+        equal = (i for i, one in enumerate(kept) if firsts.reshape(-1)[one] == kind and _equal_views(scene, one, view))
+        places.append(next(equal, len(kept)))
+        if places[-1] == len(kept):
             kept.append(view)
-    return kept
+    return kept, places
 
 
 def _equal_views(scene: PixelScene | UnalignedScene, one: int, other: int) -> bool:

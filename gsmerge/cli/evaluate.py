@@ -9,7 +9,7 @@ import typer
 
 from gsmerge.cli import options as opt
 from gsmerge.cli.console import announce_compilation, print_document, say_notes, stage_progress
-from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks, require_views
+from gsmerge.cli.held_out import file_names, held_out_views, lpips_networks, own_cameras, require_views
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
 
@@ -76,13 +76,14 @@ def evaluate(args: opt.Args) -> None:
     require_views(load)
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, args.views)
     plys = {name: read_gaussians(path) for name, path in zip(file_names(paths), paths, strict=True)}
-    notes = [*load.notes, *adapted, *missing]
+    cameras, moved = own_cameras(paths, scene)
+    notes = [*load.notes, *adapted, *missing, *moved]
     if len(scene) < len(load.scene):
         notes += [_more_views(name, ply, scene.cameras) for name, ply in plys.items()]
     say_notes(notes, quiet=args.silent)
     gaussians = {name: ply.gaussians for name, ply in plys.items()}
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
-        evaluation = evaluate_scene(scene, gaussians, held_out, options, progress=progress)
+        evaluation = evaluate_scene(scene, gaussians, held_out, options, cameras=cameras, progress=progress)
     facts = {"input": _file(load.ply), **{name: _file(ply.info) for name, ply in plys.items()}}
     document = evaluation_document(evaluation, facts, notes)
     texts = {args.report: to_json(document), args.csv: evaluation_csv(document)}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,9 @@ from gsmerge.errors import SceneError, UsageError
 if TYPE_CHECKING:
     from gsmerge.io import PlyScene, SceneFiles, SceneLoad
     from gsmerge.measure.evaluate import Views
-    from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+    from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
+
+SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
 
 
 def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
@@ -39,6 +42,7 @@ class BeforeAfter:
         scene: The same with views: placed ones where it has none.
         held_out: Views that were no input.
         plys: The compact versions by name.
+        cameras: Those of the input views, by name of a version that was made with others than the scene's.
         notes: What was adapted, one sentence each.
     """
 
@@ -46,6 +50,7 @@ class BeforeAfter:
     scene: PixelScene | UnalignedScene
     held_out: Views | None
     plys: dict[str, PlyScene]
+    cameras: dict[str, Cameras]
     notes: list[str]
 
     @property
@@ -66,7 +71,32 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     if isinstance(scene, UnalignedScene):
         scene = add_views(scene, log)
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
-    return BeforeAfter(load, scene, held_out, plys, [*load.notes, *adapted, *log.notes])
+    cameras, moved = own_cameras(args.after, scene)
+    return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *log.notes, *moved])
+
+
+def own_cameras(paths: Sequence[Path], scene: PixelScene | UnalignedScene) -> tuple[dict[str, Cameras], list[str]]:
+    """The cameras that ``compact`` wrote beside results where it had moved them, by name of the result; and notes."""
+    import numpy as np
+
+    from gsmerge.io.cameras.json_files import viewer_cameras_path
+    from gsmerge.io.cameras.moves import describe_moves, list_moves
+    from gsmerge.io.cameras.read import read_cameras
+    from gsmerge.stages.prepare import scene_depth
+
+    found: dict[str, Cameras] = {}
+    notes, start = list[str](), scene.cameras.viewmats
+    for name, path in zip(file_names(paths), paths, strict=True):
+        beside, read = viewer_cameras_path(path), None
+        if scene.images is not None and beside.is_file():
+            with suppress(SceneError):  # whose ever it is, results can be measured without it
+                read = read_cameras(beside)
+        if read is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
+            continue
+        found[name] = replace(scene.cameras, viewmats=read.viewmats)
+        moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))
+        notes.append(f"{name}: its input views are seen from the cameras in {beside.name}, moved by {moves}")
+    return found, notes
 
 
 def require_views(load: SceneLoad) -> None:

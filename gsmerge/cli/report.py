@@ -69,7 +69,8 @@ def report(args: opt.Args) -> None:
     with announce_compilation(quiet=args.silent):
         comparison = compare(
             given.scene, given.gaussians, storage, given.held_out, EvaluateOptions(nets, threads=args.threads),
-            long_sides=args.sizes, merge_seconds=dict(zip(given.plys, seconds, strict=False)),
+            cameras=given.cameras, long_sides=args.sizes,
+            merge_seconds=dict(zip(given.plys, seconds, strict=False)),
         )  # fmt: skip
     document = comparison_document(comparison, notes)
     for path in outputs:

@@ -52,8 +52,8 @@ def view(args: opt.Args) -> None:
     with announce_compilation(quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(
-            title, given.scene, given.gaussians, sizes, given.held_out, segmentation=segmentation,
-            threads=args.threads, progress=progress,
+            title, given.scene, given.gaussians, sizes, given.held_out, cameras=given.cameras,
+            segmentation=segmentation, threads=args.threads, progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, overwrite=args.overwrite)

@@ -12,7 +12,7 @@ from gsmerge.encoded.divide import divide_all
 from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions, to_schema
-from gsmerge.pipeline import build, merge_views, note_moves
+from gsmerge.pipeline import build, merge_views
 from gsmerge.runtime.run_log import Progress, RunLog
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
@@ -35,8 +35,8 @@ def encode_scene(
 ) -> Encoded:
     """All of :func:`gsmerge.compact` up to decoding, stored: superpixels, merging, matching, networks; never a fit.
 
-    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", **settings)``, bit for bit; so is
-    any other ``k`` at decoding, unless a budget or the size of the input limits the number of
+    ``decode_scene(encode_scene(scene, **settings))`` is ``compact(scene, fit="none", poses="fixed", **settings)``, bit
+    for bit; so is any other ``k`` at decoding, unless a budget or the size of the input limits the number of
     superpixels of either, or Gaussians that no view sees are kept: these are merged for one K.
 
     Args:
@@ -58,8 +58,6 @@ def encode_scene(
     log = RunLog(progress)
     with use_threads(options.threads):
         prepared = prepare(scene.numpy(), options, log)
-        if prepared.moved:
-            note_moves(prepared, prepared.final_cameras(None), log)
         require_children("max k", max_k or 1, prepared.checkpoint)
         count = choose_count(prepared, build, log)
         if prepared.keeps_all(count):
@@ -70,11 +68,11 @@ def encode_scene(
 
 
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
-    """The options without a fit."""
+    """The options without a fit, and with poses as given: batches may be added, which have to fit."""
     fit = [f"fit {options.fit.fit}"] if settings.get("fit", "none") != "none" else []
     for name in (*fit, *options.whole_only):
         raise UsageError(f"{name}: cannot be encoded, as nothing is fitted or searched for; use compact")
-    return replace(options, fit=replace(options.fit, fit="none"))
+    return replace(options, fit=replace(options.fit, fit="none", poses="fixed"))
 
 
 def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, log: RunLog) -> Encoded:

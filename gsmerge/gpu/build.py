@@ -133,7 +133,7 @@ class DeviceScene:
         """Every arrow after the preparation; arguments and result as of :func:`gsmerge.pipeline.build`."""
         scene, options = prepared.scene, prepared.options
         reasons: dict[str, str] = {}
-        assert scene is self.prepared.scene
+        assert scene.gaussians is self.prepared.scene.gaussians  # its cameras may have moved
         other, keeps_all = None, prepared.keeps_all(count)
         problem = "nothing is merged" if keeps_all else merge_problem(prepared)
         if problem is None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.geometry import pose_changes
 from gsmerge.measure.zoom import resize_mask
 from gsmerge.render import Splats, ViewPlan, composite, plan_view
 from gsmerge.render.blend import mean_depths
@@ -149,7 +150,9 @@ def refine_pose(
         viewmat = ends[1].viewmat
     if ends and ends[1].squares.sum(dtype=np.float64) >= ends[0].squares.sum(dtype=np.float64):
         viewmat = start
-    return Cameras(viewmat[None], camera.Ks, camera.width, camera.height), _pose_change(start, viewmat, unit)
+    degrees, distances = pose_changes(start[None], viewmat[None])
+    change = PoseChange(float(degrees[0]), float(distances[0]) / unit if unit else 0.0)
+    return Cameras(viewmat[None], camera.Ks, camera.width, camera.height), change
 
 
 def _descend(target: _Target, best: _Trial, unit: float, doubt: float) -> _Trial:
@@ -222,11 +225,3 @@ def _moved(viewmat: np.ndarray, step: np.ndarray, target: _Target, unit: float) 
     moved[:3, :3] = turn @ viewmat[:3, :3]
     moved[:3, 3] = turn @ (viewmat[:3, 3] - centre) + centre + unit * step[3:]
     return moved
-
-
-def _pose_change(start: np.ndarray, end: np.ndarray, unit: float) -> PoseChange:
-    """Between two view matrices; ``unit`` is the median depth, world units."""
-    chord = float(np.linalg.norm(end[:3, :3] - start[:3, :3])) / np.sqrt(8)
-    before, after = (-one[:3, :3].T @ one[:3, 3] for one in (start, end))
-    distance = float(np.linalg.norm(after - before))
-    return PoseChange(float(np.degrees(2 * np.arcsin(min(chord, 1.0)))), distance / unit if unit else 0.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from gsmerge.errors import UsageError
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Views, evaluate, near_plane
 from gsmerge.measure.speed import Speed, measure_speeds, overdraw
-from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.types import Cameras, Gaussians, PixelScene, UnalignedScene
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ def compare(
     targets: Views | None = None,
     options: EvaluateOptions | None = None,
     *,
+    cameras: Mapping[str, Cameras] | None = None,
     long_sides: tuple[int, ...] | None = None,
     merge_seconds: Mapping[str, float] | None = None,
 ) -> Comparison:
@@ -68,13 +69,13 @@ def compare(
 
     ``storage`` has what their files hold, by name, the scene's under "input"; ``merge_seconds`` the time that making
     them took, where it is known. ``long_sides`` are pixels along the longer side to render at, by default the views'
-    own, and twice that. A UsageError if one is not positive, or as :func:`gsmerge.evaluate`.
+    own, and twice that; ``cameras`` as of :func:`gsmerge.evaluate`. A UsageError if a size is not positive, or as that.
     """
     own = max(scene.cameras.width, scene.cameras.height)
     sides = (own, 2 * own) if long_sides is None else long_sides
     if not sides or min(sides) < 1:
         raise UsageError(f"long_sides: expected sizes of at least 1 pixel, got {sides}")
-    quality = evaluate(scene, results, targets, options)
+    quality = evaluate(scene, results, targets, options, cameras=cameras)
     near = near_plane(scene)
     gaussians_of = {INPUT: scene.file_gaussians, **results}
     threads = None if options is None else options.threads

@@ -170,9 +170,7 @@ class ResultScores:
     def mean_pose_change(self, split: str) -> PoseChange | None:
         """Mean over the views of a split; None where no camera was aligned."""
         moves = [score.pose_change for score in self.scores if score.split == split and score.pose_change]
-        if not moves:
-            return None
-        return PoseChange(float(np.mean([m.degrees for m in moves])), float(np.mean([m.shift for m in moves])))
+        return PoseChange(*np.mean([(m.degrees, m.shift) for m in moves], axis=0).tolist()) if moves else None
 
 
 @dataclass(frozen=True)
@@ -203,6 +201,11 @@ class _Split:
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
     drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
 
+    def under(self, cameras: Cameras | None) -> _Split:
+        """The same from where a result's own cameras stand; renders of the input are shown from the given ones."""
+        own = self.views.cameras if cameras is None or self.drawn is not None else cameras.numpy()
+        return replace(self, views=replace(self.views, cameras=own))
+
 
 @dataclass(frozen=True, eq=False)
 class _Look:
@@ -224,13 +227,15 @@ def evaluate(
     targets: Views | None = None,
     options: EvaluateOptions | None = None,
     *,
+    cameras: Mapping[str, Cameras] | None = None,
     progress: Progress | None = None,
     on_image: OnImage = lambda *_: None,
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out ones.
 
     ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
-    ``targets`` are held-out views in that world, see :func:`gsmerge.io.read_held_out`; ``progress`` is called with
+    ``targets`` are held-out views in that world, see :func:`gsmerge.io.read_held_out`; ``cameras`` those of the input
+    views by name of a result that was made with other poses, as ``CompactResult.cameras``; ``progress`` is called with
     ("evaluate", done, total) after each result, ``on_image`` with (result, split, number of the view in it, render
     ``[h,w,3]`` in [0, 1]) for each picture that is scored.
 
@@ -238,7 +243,7 @@ def evaluate(
         UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
         GsmergeError: If LPIPS is asked for and its weights are not installed.
     """
-    options = options or EvaluateOptions()
+    options, cameras = options or EvaluateOptions(), cameras or {}
     if INPUT in results:
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
@@ -255,7 +260,8 @@ def evaluate(
         named = {INPUT: own, **results} if options.own else results
         look.image(own[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for i, (name, gaussians) in enumerate(named.items()):
-            scores.append(_score_result(name, gaussians, len(own), splits, options, look, on_image))
+            mine = {kind: one.under(cameras.get(name)) if kind == "context" else one for kind, one in splits.items()}
+            scores.append(_score_result(name, gaussians, len(own), mine, options, look, on_image))
             if progress:
                 progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
@@ -322,7 +328,8 @@ def _score_result(
             seen, nets = split.visible[i], options.lpips if i in perceptual else ()
             both = _both(image, views.images[i], seen, nets)
             zooms = () if options.zoom == (1,) else tuple(
-                _score_zoom(gaussians, split, i, zoom, look) if zoom != 1 else _without_lpips(*both)
+                _score_zoom(gaussians, split, i, zoom, look) if zoom != 1
+                else ZoomScore(1, *(replace(one, lpips_vgg=None, lpips_alex=None) for one in both))
                 for zoom in options.zoom
             )  # fmt: skip
             score = ViewScore(kind, view, float(seen.mean()), *both, zooms)
@@ -334,14 +341,11 @@ def _score_result(
 
 
 def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, look: _Look) -> ZoomScore:
-    cameras = zoom_cameras(split.views.cameras, zoom)
+    (cameras, drawn), photo = (zoom_cameras(split.views.cameras, zoom), split.drawn), split.views.images[view]
     size = cameras.width, cameras.height
-    image = look.image(gaussians, cameras, view)
-    if split.drawn is None:
-        photo = resize_photo(split.views.images[view], *size)
-    else:
-        photo = look.image(split.drawn, cameras, view)
-    return ZoomScore(zoom, *_both(image, photo, resize_mask(split.visible[view], *size), ()))
+    photo = resize_photo(photo, *size) if drawn is None else look.image(drawn, cameras, view)
+    image, seen = look.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
+    return ZoomScore(zoom, *_both(image, photo, seen, ()))
 
 
 def _align_score(
@@ -368,10 +372,6 @@ def _align_score(
         pictures |= {after[name]: fit_colors(picture, photo, seen) for name, picture in pictures.items()}
     aligned = (AlignedScore(name, *_both(pictures[name], photo, seen, nets)) for name in options.alignments)
     return replace(score, aligned=tuple(aligned), pose_change=change)
-
-
-def _without_lpips(full: Quality, masked: Quality) -> ZoomScore:
-    return ZoomScore(1, *(replace(one, lpips_vgg=None, lpips_alex=None) for one in (full, masked)))
 
 
 def _both(

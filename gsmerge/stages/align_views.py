@@ -33,6 +33,7 @@ MIN_SIDE = 24  # pixels of the shorter side at the first size, below which photo
 OVERLAP_SAMPLES = 400  # pixels of a view by which its neighbours are chosen
 BORDER = 2  # pixels that no lookup goes near
 SAMPLES = 1500  # pixels of a view that are looked up, those where the photo changes most
+FIRST_SAMPLES, FIRST_STEPS = 600, 2  # the same, and the most steps, at the first size, which right poses pay for
 NEIGHBOURS = 4  # views that a view is looked up in
 MIN_OVERLAP = 0.2  # share of a view's pixels that a neighbour must see
 MIN_SEEN = 50  # pixels that a pair of views must share
@@ -98,12 +99,15 @@ def align_views(scene: PixelScene, views: Sequence[int], *, always: bool = False
         return None
     viewmats = start
     for side in sides:
-        level = _level_of(scene, pairs, largest / side)
-        viewmats, first, last = _descend(level, viewmats, check=side == sides[0] and not always)
+        check = side == sides[0] != sides[-1] and not always
+        level = _level_of(scene, pairs, largest / side, FIRST_SAMPLES if check else SAMPLES)
+        viewmats, first, last = _descend(level, viewmats, check=check)
         given = first if side == sides[0] else parallel_map(partial(_compare, level, start), pairs)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, given, last, end=side == sides[-1])):
             return None
-    return move_views(scene, without_common_motion(start, viewmats, np.median))
+    placed = sorted({view for pair in pairs for view in pair})  # the others stay where they are
+    viewmats[placed] = without_common_motion(start[placed], viewmats[placed], np.median)
+    return move_views(scene, viewmats)
 
 
 def move_views(scene: PixelScene, viewmats: np.ndarray) -> PixelScene:
@@ -142,8 +146,8 @@ def _choose_pairs(scene: PixelScene, views: Sequence[int]) -> list[tuple[int, in
     return sorted(pairs)
 
 
-def _level_of(scene: PixelScene, pairs: list[tuple[int, int]], level: float) -> _Level:
-    """The photos with their sides divided by ``level``, and the pixels where each changes most."""
+def _level_of(scene: PixelScene, pairs: list[tuple[int, int]], level: float, samples: int) -> _Level:
+    """The photos with their sides divided by ``level``, and ``samples`` pixels of each where it changes most."""
     assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
@@ -160,7 +164,7 @@ def _level_of(scene: PixelScene, pairs: list[tuple[int, int]], level: float) -> 
         depth = means[view][near] @ axis[:3] + axis[3]
         depth = np.where(scene.valid[view][near] & (depth > NEAR), depth, np.nan)
         score = np.where(np.isfinite(depth), np.hypot(right, down) * spread, 0).ravel()
-        chosen = np.argsort(-score, kind="stable")[:SAMPLES]
+        chosen = np.argsort(-score, kind="stable")[:samples]
         chosen = chosen[score[chosen] > 0]
         y, x = np.divmod(chosen, photos.width)
         pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
@@ -175,14 +179,15 @@ def _level_of(scene: PixelScene, pairs: list[tuple[int, int]], level: float) -> 
 def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, list[_Pair], list[_Pair]]:
     """Poses after Gauss-Newton steps at one size, and what the pairs of views say before and after.
 
-    With ``check`` the steps end after the first one if it moves no view far.
+    With ``check`` there are few steps, and they end after the first one if it moves no view far.
     """
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     first: list[_Pair] = []
-    for step in range(STEPS + 1):
+    most = FIRST_STEPS if check else STEPS
+    for step in range(most + 1):
         found = parallel_map(partial(_compare, level, viewmats), level.pairs)
         first = first or found
-        if step == STEPS or (check and step == 1 and _flows(level, found).max() < EARLY_PX):
+        if step == most or (check and step == 1 and _flows(level, found).max() < EARLY_PX):
             break
         curvature, slope = np.diag(prior), prior * motion_vectors(level.start, viewmats).ravel()
         for (a, b), one in zip(level.pairs, found, strict=True):

@@ -195,6 +195,7 @@ def make_clean(
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
     log.choices |= own.choices | {"clean": counts}
+    log.viewmats = own.viewmats
     log.notes += [*own.notes, *_clean_notes(counts, len(gaussians), count)]
     return gaussians
 

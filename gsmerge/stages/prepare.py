@@ -162,7 +162,8 @@ class PreparedScene:
         tree: All ways to cut the scene into fewer superpixels, where a count is asked for; None elsewhere.
         hidden: Gaussians in place of those that no view sees, canonical; None without any.
         photo_views: Views whose photos a fit may use, see :mod:`gsmerge.stages.check_photos`.
-        moved: Whether views were moved to where their photos agree.
+        moved: Whether views were moved to where their photos agree, before a fit or by it.
+        repeated: Of every given view its place in the scene, or that of the view that it repeats.
     """
 
     given: PixelScene | UnalignedScene
@@ -178,6 +179,7 @@ class PreparedScene:
     hidden: Gaussians | None
     photo_views: tuple[int, ...]
     moved: bool
+    repeated: tuple[int, ...]
 
     def scored_views(self) -> list[int]:
         """The given views that input and result are scored on: some of those whose photos show the scene.
@@ -185,27 +187,31 @@ class PreparedScene:
         More of them where a quality was asked for, which depends on the scores.
         """
         candidates: Sequence[int] = range(len(self.given))
-        if len(self.given) == len(self.scene) and self.photo_views:  # else repeated ones were left out: numbers differ
-            candidates = self.photo_views
+        if self.photo_views:  # numbers of the scene without repeated views
+            candidates = [view for view, place in enumerate(self.repeated) if place in self.photo_views]
         choose = report_views if self.options.budget.target_psnr is None else scored_views
         return [candidates[i] for i in choose(len(candidates))]
 
-    def final_cameras(self, viewmats: np.ndarray | None) -> Cameras:
-        """The given views' cameras as the result was made from them, in the world.
+    def with_cameras(self, viewmats: np.ndarray | None) -> PreparedScene:
+        """The same with cameras where a fit moved them, which stay there.
 
         Args:
-            viewmats: Canonical poses of the photos that a fit used, where it moved them.
+            viewmats: Canonical poses of the photos that the fit used; None: it moved none.
         """
-        given, cameras = self.given.cameras, self.scene.cameras
-        if viewmats is None and not self.moved:
+        if viewmats is None:
+            return self
+        cameras, fixed = self.scene.cameras, replace(self.options.fit, poses="fixed")
+        poses = cameras.viewmats.astype(np.float64)
+        poses[list(self.photo_views)] = viewmats
+        scene = replace(self.scene, cameras=replace(cameras, viewmats=poses))
+        return replace(self, scene=scene, options=replace(self.options, fit=fixed), moved=True)
+
+    def final_cameras(self) -> Cameras:
+        """The given views' cameras as the result was made from them, in the world."""
+        given = self.given.cameras
+        if not self.moved:
             return given
-        if viewmats is not None:
-            poses = cameras.viewmats.astype(np.float64)
-            poses[list(self.photo_views)] = viewmats
-            cameras = replace(cameras, viewmats=poses)
-        views = distinct_views(self.given)
-        same = (given.viewmats[:, None] == given.viewmats[views]).all((2, 3))  # repeated views move with their first
-        return replace(given, viewmats=self.frame.leave_cameras(cameras).viewmats[same.argmax(1)])
+        return replace(given, viewmats=self.frame.leave_cameras(self.scene.cameras).viewmats[list(self.repeated)])
 
     def candidates(self, members: Members) -> list[NetworkContext | None]:
         """What corrects the analytic stages: networks, None for nothing, or both in turn where they compete."""
@@ -244,7 +250,9 @@ def prepare(
     if scene.images is None and settings.clean.drop_sky:
         raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
     with log.stage("prepare"):
-        own, options = drop_repeats(scene, settings, log)
+        own, options, repeated = drop_repeats(scene, settings, log)
+        if scene.images is None:  # nothing says where cameras belong
+            options = replace(options, fit=replace(options.fit, poses="fixed"))
         canonical: PixelScene | UnalignedScene
         members, hidden, moved = None, None, False
         if isinstance(own, PixelScene):
@@ -266,8 +274,9 @@ def prepare(
         pixels = max(1, len(canonical) * canonical.pixels_per_view)
         options = replace(options, fit=options.fit.with_steps_for((limits.count or limits.default) / pixels))
     prepared = PreparedScene(
-        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown, moved
-    )
+        scene, canonical, pictures, frame, settings, options, limits, members, checkpoint, None, hidden, shown, moved,
+        repeated,
+    )  # fmt: skip
     if settings.method != "gsmerge" or not (options.needs_tree or limits.count is not None):
         return prepared
     with log.stage("segment"):
@@ -333,14 +342,14 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
 
 def drop_repeats(
     scene: PixelScene | UnalignedScene, options: CompactOptions, log: RunLog
-) -> tuple[PixelScene | UnalignedScene, CompactOptions]:
-    """The scene with every view once, and the options with budgets that stay shares of the whole."""
-    views = distinct_views(scene)
+) -> tuple[PixelScene | UnalignedScene, CompactOptions, tuple[int, ...]]:
+    """The scene with every view once, the options with budgets that stay shares of the whole, and places of views."""
+    views, places = distinct_views(scene)
     if len(views) == len(scene):
-        return scene, options
+        return scene, options, tuple(places)
     few = subset(scene, views)
     count = exact_count(options.budget, scene.num_gaussians, scene.gaussians.sh_degree)
     if count is not None:
         options = replace(options, budget=replace(options.budget, budget=min(count, few.num_gaussians)))
     log.notes.append(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
-    return few, options
+    return few, options, tuple(places)

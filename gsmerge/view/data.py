@@ -90,6 +90,7 @@ def collect(
     file_bytes: Sequence[int],
     held_out: Views | None = None,
     *,
+    cameras: Mapping[str, Cameras] | None = None,
     segmentation: SegmentOptions | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -102,6 +103,7 @@ def collect(
         results: Gaussians by name, in the scene's world.
         file_bytes: Sizes of the scene's file and of those of the results.
         held_out: Views that were no input.
+        cameras: As of :func:`gsmerge.evaluate`; stills and scores are from there, 3D from the scene's own.
         segmentation: How the input photos are cut into superpixels; None: as by default.
         threads: Threads to use; None: all processors.
         progress: As of :func:`gsmerge.evaluate`.
@@ -114,7 +116,7 @@ def collect(
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((), threads=threads)
-    evaluation = evaluate(scene, results, held_out, options, progress=progress, on_image=keep)
+    evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=keep)
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: some.numpy() for name, some in results.items()}}
     sides = [
@@ -123,9 +125,9 @@ def collect(
     ]
     means = frame.enter(named[evaluation.results[1].name]).means
     views: list[PageView] = []
-    for split, (cameras, photos, names) in splits.items():
+    for split, (places, photos, names) in splits.items():
         for i, name in enumerate(short_names(names)):
-            camera = frame.enter_cameras(cameras[[i]])
+            camera = frame.enter_cameras(places[[i]])
             views.append(PageView(
                 name=name,
                 place=len(views),

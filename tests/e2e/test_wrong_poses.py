@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import motions
 import numpy as np
 import pytest
 
+from gsmerge import PixelScene
 from gsmerge.geometry import pose_changes
-from gsmerge.io import load_scene
+from gsmerge.io import load_scene, write_gaussians
+from gsmerge.io.cameras.json_files import write_transforms
 from gsmerge.io.cameras.read import read_cameras
 
 from .conftest import Run
@@ -73,6 +76,27 @@ def test_the_cameras_as_used_are_written(exact: Path, wrong: Path, tmp_path: Pat
     shutil.copy(saved, wrong / "transforms.json")  # in the place of the wrong ones
     assert load_scene(wrong).moves == ()
     assert run("compact", wrong, *FAST, "-o", tmp_path / "b.ply", "--save-cameras", saved).code == 2  # it exists
+
+
+def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: Path, run: Run) -> None:
+    """Views that do not agree with each other: ``compact`` moves them, and writes the cameras beside the result."""
+    scene = load_scene(exact).scene
+    assert isinstance(scene, PixelScene)
+    wrong = motions.disagreeing(scene, 0.8, 0.01)
+    folder = Path(shutil.copytree(exact, tmp_path / "wrong"))
+    write_gaussians(folder / "scene.ply", wrong.gaussians, overwrite=True)
+    write_transforms(folder / "transforms.json", wrong.cameras, wrong.names)
+    out, other = tmp_path / "auto.ply", tmp_path / "other.ply"
+    document = json.loads(run("compact", folder, *FAST, "-o", out).out)
+    assert document["choices"]["poses"]
+    shutil.copy(out, other)  # without its cameras
+    outcome = run("evaluate", folder, out, other, "--lpips", "none", "--json")
+    assert outcome.code == 0, outcome.err
+    found = json.loads(outcome.out)
+    _, own, given = (one["mean"]["context"]["psnr"] for one in found["results"])
+    assert own == pytest.approx(document["psnr_input_views"]["after"], abs=0.6)  # of a quarter of each photo
+    assert own > given + 2
+    assert sum("its input views are seen from the cameras in auto.cameras.json" in n for n in found["notes"]) == 1
 
 
 def test_cameras_that_are_far_off(exact: Path, tmp_path: Path, run: Run) -> None:

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.errors import SceneError
+from gsmerge.geometry import project_points
 from gsmerge.io.alignment.layouts import subsample
 from gsmerge.io.alignment.poses import other_conventions
 from gsmerge.io.alignment.recover import Recovery, exact_layouts_of, recover
@@ -24,6 +26,8 @@ from gsmerge.types import Cameras
 
 MAX_PX, MAX_SHARE = 12.0, 0.05  # pixels, and share of a small image's side, that cameras may be off
 NEAR_PX = 0.5  # cameras that are nearer stay where they are
+AS_GOOD, AS_GOOD_PX = 1.3, 0.25  # times and pixels more than moved cameras leave, up to which other intrinsics fit
+ROUNDS = 4  # of reweighted least squares
 SAMPLES = 2000  # Gaussians of a view that its pose is solved from
 
 
@@ -49,8 +53,13 @@ def max_pixels(width: int, height: int) -> float:
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
-def move_cameras(pairs: Correspondences, cameras: Cameras, names: tuple[str, ...]) -> MovedCameras | None:
-    """The cameras under which the Gaussians of a sample project into their pixels; None where some are too far off."""
+def move_cameras(
+    pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks"
+) -> MovedCameras | None:
+    """The cameras under which the Gaussians of a sample project into their pixels; None where some are too far off.
+
+    SceneError, which names ``source``, where not the poses are wrong but the intrinsics.
+    """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
         return None
@@ -62,18 +71,50 @@ def move_cameras(pairs: Correspondences, cameras: Cameras, names: tuple[str, ...
                 return None
             viewmats[view] = pose
     moved = replace(cameras, viewmats=viewmats)
-    if not check_pairs(pairs, moved).ok:
+    after = check_pairs(pairs, moved)
+    if not after.ok:
         return None
+    _check_intrinsics(pairs, cameras, before.worst_px, after.worst_px, source)
     axes = viewmats[pairs.views, 2]
     depth = float(np.median((axes[:, :3] * pairs.points).sum(1) + axes[:, 3]))
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth))
+
+
+def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float, moved_px: float, source: str) -> None:
+    """Refuse cameras whose Gaussians lie as near to their pixels under one change of all Ks as under moved poses."""
+    if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
+        return
+    factors, shifts = np.ones(2), np.zeros(2)
+    with np.errstate(all="ignore"):
+        found, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
+    good = (depth[:, 0] > 0) & np.isfinite(found[:, 0]).all(1)
+    for axis in range(2):
+        before, wanted = found[good, 0, axis], pairs.pixels[good, axis]
+        weights = np.ones(len(before))
+        for _ in range(ROUNDS):
+            factors[axis], shifts[axis] = np.polyfit(before, wanted, 1, w=weights)
+            error = np.abs(factors[axis] * before + shifts[axis] - wanted)
+            weights = 1 / np.hypot(1, error / (3 * np.median(error) + 1e-9))
+    Ks = cameras.Ks * np.array([*factors, 1])[:, None]
+    Ks[:, :2, 2] += shifts
+    other = check_pairs(pairs, replace(cameras, Ks=Ks))
+    if not (other.ok and other.worst_px <= max(AS_GOOD * moved_px, moved_px + AS_GOOD_PX)):
+        return
+    x, y = (Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
+    raise SceneError(
+        source,
+        f"expected intrinsics that fit the Gaussians, found others, under which they lie {before_px:.1f} px off their"
+        " pixels in every view alike",
+        f"multiply fx by {factors[0]:.4g} and fy by {factors[1]:.4g}, and add {x:.2f} to cx and {y:.2f} to cy"
+        f" (pixels of {cameras.width} x {cameras.height})",
+    )
 
 
 def recover_moved(inputs: AlignmentInput, camera_file: CameraFile) -> tuple[MovedCameras, Recovery] | None:
     """The reading of a file without missing pixels under cameras that are moved a little; None where there is none.
 
     None, too, where the poses fit in another convention, or the photos' colours speak against it: views in the wrong
-    order look like cameras that are off.
+    order look like cameras that are off. SceneError as of :func:`move_cameras`.
     """
     if inputs.scale is not None:
         return None
@@ -90,6 +131,6 @@ def recover_moved(inputs: AlignmentInput, camera_file: CameraFile) -> tuple[Move
         if score_layout(other, best.layout, IDENTITY).ok:
             return None
     pairs = find_correspondences(inputs.gaussians.means, inputs.valid, subsample(best.layout, SAMPLES))
-    moved = move_cameras(pairs, inputs.cameras, camera_file.names)
+    moved = move_cameras(pairs, inputs.cameras, camera_file.names, str(camera_file.path))
     recovery = None if moved is None else recover(replace(inputs, cameras=moved.cameras), exact_frames=True)
     return None if moved is None or recovery is None or recovery.confirmed is False else (moved, recovery)

@@ -15,6 +15,7 @@ import numpy as np
 
 from gsmerge.io.cameras.camera_file import CONVENTIONS
 from gsmerge.measure.evaluate import Views
+from gsmerge.stages.align_views import move_views
 from gsmerge.stages.prepare import scene_frame
 from gsmerge.types import SH_C0, Cameras, PixelScene, UnalignedScene
 from gsmerge.views import even_views, subset
@@ -92,18 +93,8 @@ def perturb_poses(given: StressScene, degrees: float) -> StressScene:
     """Every view, with its Gaussians, rotated about its camera centre by a random axis."""
     scene = given.scene
     assert isinstance(scene, PixelScene)
-    rng = np.random.default_rng(SEED)
-    means = scene.gaussians.means.astype(np.float64).reshape(len(scene), -1, 3)
-    viewmats = scene.cameras.viewmats.astype(np.float64)
-    for view in range(len(scene)):
-        axis = rng.normal(size=3)
-        turn = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0]
-        old = viewmats[view].copy()
-        viewmats[view, :3] = turn @ old[:3]
-        camera = means[view] @ old[:3, :3].T + old[:3, 3]
-        means[view] = (camera - viewmats[view, :3, 3]) @ viewmats[view, :3, :3]
-    gaussians = replace(scene.gaussians, means=means.reshape(-1, 3))
-    return replace(given, scene=replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats)))
+    viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
+    return replace(given, scene=move_views(scene, viewmats))
 
 
 def move_view(given: StressScene, share: float) -> StressScene:
@@ -113,10 +104,7 @@ def move_view(given: StressScene, share: float) -> StressScene:
     view, viewmats = len(scene) // 2, scene.cameras.viewmats.astype(np.float64)
     step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
     viewmats[view, :3, 3] -= viewmats[view, :3, :3] @ step
-    means = scene.gaussians.means.astype(np.float64)
-    means[view * scene.pixels_per_view : (view + 1) * scene.pixels_per_view] += step
-    gaussians = replace(scene.gaussians, means=means)
-    return replace(given, scene=replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats)))
+    return replace(given, scene=move_views(scene, viewmats))
 
 
 def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:

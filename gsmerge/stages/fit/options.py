@@ -93,7 +93,8 @@ class FitOptions:
             lie in are left out.
         poses: ``"free"``: views of one Gaussian per pixel are moved to where their photos agree before anything is
             merged, and the full fit moves the cameras on (on the CPU); ``"fixed"``: cameras stay where they are;
-            ``"auto"``: free where the photos show that some view is more than 1.5 pixels off, fixed elsewhere.
+            ``"auto"``: free where some view is more than 1.5 pixels off and its photo and the others agree clearly
+            better elsewhere (:mod:`gsmerge.stages.align_views` says by how much); fixed elsewhere, and without photos.
         device: Where the fit runs, and in :func:`gsmerge.compact` all stages that can: ``"cpu"``; ``"cuda"``, which
             draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits; ``"auto"``: CUDA
             where it can be used and the scene is large enough that it pays.

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import motions
 import pytest
 import scenes
 from learned import noisy, written
@@ -42,6 +43,13 @@ def encoded_bare(bare: PixelScene) -> Encoded:
 
 def unfitted(scene: Scene, **settings: Any) -> Gaussians:
     return compact(scene, **{"superpixels": SHARE, "fit": "none", **settings}).gaussians
+
+
+def test_views_that_disagree_stay_where_batches_will_be() -> None:
+    wrong = motions.disagreeing(scenes.make_scene(scenes.room(), scenes.arc(5, 160, 120)))
+    found = decode_scene(encode_scene(wrong, superpixels="2%"))
+    assert scenes.identical(found, unfitted(wrong, superpixels="2%", poses="fixed"))
+    assert not scenes.identical(found, unfitted(wrong, superpixels="2%"))
 
 
 def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
+import motions
 import numpy as np
 import pytest
 import scenes
@@ -135,9 +136,12 @@ def test_scores_are_the_pipelines(scene: PixelScene) -> None:
     for given in (scene, replace(scene, missing=missing), repeated):
         prepared = prepared_scene(given)
         on_device = DeviceScene(prepared, CPU, begin)
+        moved = prepared.with_cameras(motions.random_motions(3, 1.0, 0.1) @ prepared.scene.cameras.viewmats)
+        moved = replace(moved, given=replace(given, cameras=moved.final_cameras()))  # as results are scored
         for gaussians in (given.file_gaussians, given.gaussians[::7]):
-            expected = input_psnr(gaussians, prepared)
-            assert on_device.input_psnr(gaussians, prepared) == pytest.approx(expected, abs=1e-3)
+            for one in (prepared, moved):
+                expected = input_psnr(gaussians, one)
+                assert on_device.input_psnr(gaussians, one) == pytest.approx(expected, abs=1e-3)
 
 
 def test_compact_builds_and_scores_on_the_device(scene: PixelScene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,13 +6,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import motions
 import numpy as np
 import pytest
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge import PixelScene, compact_tensors
 from gsmerge.errors import SceneError
-from gsmerge.geometry import motion_matrices, pose_changes
+from gsmerge.geometry import pose_changes
 from gsmerge.io import load_scene
 from gsmerge.io.alignment.move_cameras import max_pixels, move_cameras
 from gsmerge.io.alignment.score import sample_pixels
@@ -35,9 +36,7 @@ def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
 
 def off(tiny: Tiny, degrees: float, shift: float) -> np.ndarray:
     """The tiny scene's viewmats, each turned and moved in its own frame."""
-    rng = np.random.default_rng(1)
-    parts = [vectors / np.linalg.norm(vectors, axis=1, keepdims=True) for vectors in rng.normal(size=(2, 3, 3))]
-    return motion_matrices(np.concatenate([np.deg2rad(degrees) * parts[0], shift * parts[1]], 1)) @ tiny.w2c
+    return np.asarray(motions.random_motions(3, degrees, shift) @ tiny.w2c)
 
 
 def test_a_known_motion_is_found(large: Tiny) -> None:
@@ -62,6 +61,34 @@ def test_cameras_that_fit_stay_bit_for_bit(large: Tiny) -> None:
     assert moved is not None
     np.testing.assert_array_equal(moved.cameras.viewmats[[0, 2]], viewmats[[0, 2]])
     assert [move["degrees"] > 0 for move in moved.moves] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("factor", "shift", "words"),
+    [
+        (1, 4, "multiply fx by 1 and fy by 1, and add -4.0"),
+        (1, 8, "multiply fx by 1 and fy by 1, and add -8.0"),
+        (1.05, 0, "multiply fx by 0.952"),
+        (0.92, 0, "multiply fx by 1.087"),
+    ],
+)
+def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: float, words: str, large: Tiny) -> None:
+    pairs = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
+    cameras = cameras_of(large)
+    Ks = cameras.Ks * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    Ks[:, 0, 2] += shift
+    with pytest.raises(SceneError, match=words):
+        move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
+
+
+def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tmp_path: Path) -> None:
+    cameras = cameras_of(large)
+    cameras.Ks[:, 0, 2] += 4
+    large.save(tmp_path)
+    write_transforms(tmp_path / "transforms.json", cameras, large.names)
+    with pytest.raises(SceneError, match=r"transforms.json: expected intrinsics .* add -4.0") as error:
+        load_scene(tmp_path)
+    assert "\n" not in str(error.value)
 
 
 def test_far_off_is_too_far(large: Tiny) -> None:

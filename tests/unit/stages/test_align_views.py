@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import motions
 import numpy as np
 import pytest
 import scenes
 
-from gsmerge import PixelScene, compact
+from gsmerge import CompactOptions, Gaussians, PixelScene, UnalignedScene, compact
 from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
 from gsmerge.geometry import without_common_motion as without_common
+from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.align_views import align_views, move_views
+from gsmerge.stages.align_views import align_views
+from gsmerge.stages.clean import CleanOptions, make_clean
+from gsmerge.stages.prepare import prepare
 
 VIEWS = range(5)
 
@@ -24,15 +28,6 @@ def scene() -> PixelScene:
     return scenes.move(made, np.eye(3), 0.5, np.array([0, 0, 0.5 * back]))
 
 
-def perturbed(scene: PixelScene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> PixelScene:
-    """Views moved with their Gaussians."""
-    vectors = np.random.default_rng(2).normal(size=(2, 5, 3))
-    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True)
-    motions = np.zeros((5, 6))
-    motions[views] = np.concatenate([np.deg2rad(degrees) * vectors[0], shift * vectors[1]], 1)[views]
-    return move_views(scene, motion_matrices(motions) @ scene.cameras.viewmats)
-
-
 def worst_error(scene: PixelScene, truth: PixelScene) -> tuple[float, float]:
     """Degrees and distances between relative poses."""
     relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
@@ -41,7 +36,7 @@ def worst_error(scene: PixelScene, truth: PixelScene) -> tuple[float, float]:
 
 
 def test_moved_gaussians_stay_at_their_pixels(scene: PixelScene) -> None:
-    moved = perturbed(scene)
+    moved = motions.disagreeing(scene)
     for view in VIEWS:
         rows = slice(view * scene.pixels_per_view, (view + 1) * scene.pixels_per_view)
         (before,), _ = project(scene.gaussians.means[rows], scene.cameras[[view]])
@@ -59,7 +54,7 @@ def test_views_that_agree_are_left_alone(scene: PixelScene) -> None:
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
 def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) -> None:
-    wrong = perturbed(scene, views=views)
+    wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
     found = align_views(wrong, VIEWS)
     assert found is not None
@@ -70,8 +65,57 @@ def test_views_are_moved_to_where_they_agree(views: slice, scene: PixelScene) ->
     np.testing.assert_allclose(np.median(common, 0), 0, atol=2e-3)
 
 
+def test_views_that_are_left_out_stay(scene: PixelScene) -> None:
+    wrong = motions.disagreeing(scene)
+    found = align_views(wrong, range(4))
+    assert found is not None
+    last = slice(4 * scene.pixels_per_view, None)
+    np.testing.assert_allclose(found.cameras.viewmats[4], wrong.cameras.viewmats[4], atol=1e-12)
+    np.testing.assert_allclose(found.gaussians.means[last], wrong.gaussians.means[last], atol=1e-6)
+    common = motion_vectors(wrong.cameras.viewmats, found.cameras.viewmats)
+    np.testing.assert_allclose(np.median(common[:4], 0), 0, atol=2e-3)
+
+
+def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: PixelScene) -> None:
+    viewmats = scene.cameras.viewmats.copy()
+    viewmats[1] = viewmats[0]  # of other Gaussians and another photo
+    shared = scenes.take_views(replace(scene, cameras=replace(scene.cameras, viewmats=viewmats)), [0, 1, 0, 2])
+    prepared = prepare(shared, CompactOptions().with_settings({"fit": "none", "poses": "fixed"}), RunLog())
+    assert prepared.repeated == (0, 1, 0, 2)
+    assert prepared.final_cameras() is shared.cameras
+    placed = motions.random_motions(3, 1.0, 0.1) @ prepared.scene.cameras.viewmats
+    found = prepared.with_cameras(placed).final_cameras()
+    np.testing.assert_allclose(prepared.frame.enter_cameras(found).viewmats, placed[[0, 1, 0, 2]], atol=1e-9)
+    assert replace(prepared, photo_views=(0, 2)).scored_views() == [0, 2, 3]
+
+
+@pytest.mark.parametrize("cameras", [True, False])
+def test_nothing_is_moved_without_photos(cameras: bool, scene: PixelScene) -> None:
+    places, names = (scene.cameras, scene.names) if cameras else (scene.cameras[[]], ())
+    loose = UnalignedScene(scene.gaussians[::8], places, None, names)
+    result = compact(loose, poses="free", budget=200, fit_steps=4)
+    assert "poses" not in result.report.choices
+    np.testing.assert_array_equal(result.cameras.viewmats, places.viewmats)
+
+
+def test_all_levels_have_the_cameras_of_the_finest(scene: PixelScene) -> None:
+    result = compact(scene, poses="free", fit_steps=12, superpixels="2%", levels=2)
+    assert np.abs(result.cameras.viewmats - scene.cameras.viewmats).max() > 0
+    np.testing.assert_array_equal(result.coarser[0].cameras.viewmats, result.cameras.viewmats)
+
+
+def test_clean_up_keeps_the_poses_of_the_fit(scene: PixelScene) -> None:
+    def make(count: int | None, log: RunLog) -> Gaussians:
+        log.viewmats = scene.cameras.viewmats
+        return scene.gaussians
+
+    log = RunLog()
+    make_clean(make, None, CleanOptions(drop_floaters=True), scene, lambda gaussians: gaussians, log)
+    assert log.viewmats is scene.cameras.viewmats
+
+
 def test_the_same_with_one_thread(scene: PixelScene) -> None:
-    wrong, found = perturbed(scene), []
+    wrong, found = motions.disagreeing(scene), []
     for threads in (1, 2):
         with use_threads(threads):
             found.append(align_views(wrong, VIEWS))
@@ -98,7 +142,7 @@ def test_no_motion_in_common() -> None:
 
 
 def test_compacting_says_how_far_views_were_moved(scene: PixelScene) -> None:
-    wrong, settings = perturbed(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
+    wrong, settings = motions.disagreeing(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
     fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))
     assert "poses" not in fixed.report.choices
     np.testing.assert_array_equal(fixed.cameras.viewmats, wrong.cameras.viewmats)

@@ -6,8 +6,10 @@ import gzip
 import struct
 import zlib
 from dataclasses import replace
+from operator import attrgetter
 
 import cv2
+import motions
 import numpy as np
 import pytest
 import scenes
@@ -221,3 +223,12 @@ def test_a_still_keeps_red_red() -> None:
     red = np.zeros((16, 16, 3), np.float32)
     red[..., 0] = 1
     assert psnr(decoded(encode_still(to_picture(red))), red) > 30
+
+
+def test_stills_of_a_result_are_from_its_own_cameras(scene: PixelScene, half: Gaussians) -> None:
+    own = replace(scene.cameras, viewmats=motions.random_motions(len(scene), 2.0, 0.1) @ scene.cameras.viewmats)
+    given, moved = (collect("room", scene, {"half": half}, (2, 1), cameras=one) for one in (None, {"half": own}))
+    for before, after in zip(*(sorted(one.views, key=attrgetter("place")) for one in (given, moved)), strict=True):
+        assert before.stills[0] == after.stills[0]
+        assert before.stills[1] != after.stills[1]
+        np.testing.assert_array_equal(before.camera.viewmats, after.camera.viewmats)

@@ -1,0 +1,23 @@
+"""Cameras that are wrong: random motions of the views."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge import PixelScene
+from gsmerge.geometry import motion_matrices
+from gsmerge.stages.align_views import move_views
+
+
+def random_motions(count: int, degrees: float, shift: float) -> np.ndarray:
+    """``[count,4,4]`` motions that all turn and shift by as much, each in a direction of its own."""
+    parts = np.random.default_rng(2).normal(size=(2, count, 3))
+    parts /= np.linalg.norm(parts, axis=2, keepdims=True)
+    return motion_matrices(np.concatenate([np.deg2rad(degrees) * parts[0], shift * parts[1]], 1))
+
+
+def disagreeing(scene: PixelScene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> PixelScene:
+    """The scene with some views moved, each camera with its Gaussians."""
+    viewmats = scene.cameras.viewmats.astype(np.float64)
+    viewmats[views] = (random_motions(len(scene), degrees, shift) @ viewmats)[views]
+    return move_views(scene, viewmats)
