@@ -50,6 +50,7 @@ class Part:
 
 
 PLAIN = ("--fixed", "robust=false", "--fixed", "checkpoint=none")
+GRID = ("--segmentations", "grid")
 SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
 VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", *NO_PROXIES)
 PARTS = (
@@ -63,7 +64,7 @@ PARTS = (
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
             ("--budgets", "0.5%,4.4%,20%", "--fit", "none", *PLAIN, *NO_PROXIES),
             ("--superpixels", "0.5%,1%,2%,4.4%,20%", "--efforts", "draft", *NO_PROXIES),
-            ("--densities", "0.044,0.2", "--fit", "none", "--efforts", "draft", "--segmentations", "grid", *NO_PROXIES),
+            ("--superpixels", "4.4%,20%", "--fit", "none", "--efforts", "draft", *GRID, *NO_PROXIES),
             ("--methods", "unmerged-color,unmerged-fit", "--efforts", "fast", *NO_PROXIES),
             ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", *NO_PROXIES),
         ),
