@@ -52,8 +52,7 @@ Everything here is measured by `{COMMAND}`, which is resumable; `--only PART` me
 Figures are means over the scenes, of held-out views midway between the input views and over the pixels that the input
 views have seen (the paper's supplement A), unless a section says otherwise. LPIPS is that of VGG, on two views of each
 scene. Seconds are the wall time of the merge alone, without reading, writing and scoring. Intervals are 95 % t
-intervals over the scenes. Settings have their names in Python: `density 0.02` is `--superpixels 2%` on the command
-line, `robust False` is `--no-robust`.
+intervals over the scenes. Settings have their names in Python: `robust False` is `--no-robust`.
 
 Machine: {machine}."""
 
