@@ -164,11 +164,11 @@ def nerfstudio(model: Any, cameras: Any = None, images: Array | None = None) -> 
 
 
 def _field(owner: str, value: Any, name: str) -> Any:
-    found = getattr(value, name, None)
-    if found is None:
+    content = getattr(value, name, None)
+    if content is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
         raise SceneError(owner, f"expected a field {name}, found none", remedy)
-    return found
+    return content
 
 
 def _item(owner: str, values: Mapping[str, Array], name: str) -> Array:

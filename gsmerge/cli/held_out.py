@@ -84,7 +84,7 @@ def own_cameras(paths: Sequence[Path], scene: PixelScene | UnalignedScene) -> tu
     from gsmerge.io.cameras.read import read_cameras
     from gsmerge.stages.prepare import scene_depth
 
-    found: dict[str, Cameras] = {}
+    own: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
         beside, read = viewer_cameras_path(path), None
@@ -93,10 +93,10 @@ def own_cameras(paths: Sequence[Path], scene: PixelScene | UnalignedScene) -> tu
                 read = read_cameras(beside)
         if read is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
             continue
-        found[name] = replace(scene.cameras, viewmats=read.viewmats)
+        own[name] = replace(scene.cameras, viewmats=read.viewmats)
         moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))
         notes.append(f"{name}: its input views are seen from the cameras in {beside.name}, moved by {moves}")
-    return found, notes
+    return own, notes
 
 
 def require_views(load: SceneLoad) -> None:

@@ -185,12 +185,12 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
     first: list[_Pair] = []
     most = FIRST_STEPS if check else STEPS
     for step in range(most + 1):
-        found = parallel_map(partial(_compare, level, viewmats), level.pairs)
-        first = first or found
-        if step == most or (check and step == 1 and _flows(level, found).max() < EARLY_PX):
+        now = parallel_map(partial(_compare, level, viewmats), level.pairs)
+        first = first or now
+        if step == most or (check and step == 1 and _flows(level, now).max() < EARLY_PX):
             break
         curvature, slope = np.diag(prior), prior * motion_vectors(level.start, viewmats).ravel()
-        for (a, b), one in zip(level.pairs, found, strict=True):
+        for (a, b), one in zip(level.pairs, now, strict=True):
             rows, columns = slice(6 * a, 6 * a + 6), slice(6 * b, 6 * b + 6)
             for some, other, sign in ((rows, rows, 1), (columns, columns, 1), (rows, columns, -1), (columns, rows, -1)):
                 curvature[some, other] += sign * one.curvature
@@ -201,7 +201,7 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
         viewmats = viewmats @ motion_matrices(change)
         if np.abs(change).max() < ENOUGH:
             break
-    return viewmats, first, found
+    return viewmats, first, now
 
 
 def _compare(level: _Level, viewmats: np.ndarray, pair: tuple[int, int]) -> _Pair:
@@ -238,9 +238,9 @@ def _look_up(level: _Level, viewmats: np.ndarray, a: int, b: int) -> tuple[np.nd
     return x / z, y / z, z, K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2], world
 
 
-def _flows(level: _Level, found: list[_Pair]) -> np.ndarray:
+def _flows(level: _Level, pairs: list[_Pair]) -> np.ndarray:
     """``[v]`` how far the pixels of each view moved, pixels: the median over its pairs."""
-    both = list(zip(level.pairs, found, strict=True))
+    both = list(zip(level.pairs, pairs, strict=True))
     flows = [[one.flow for pair, one in both if view in pair] for view in range(len(level.start))]
     return np.array([np.median(some) if some else 0.0 for some in flows])
 
@@ -249,8 +249,8 @@ def _any_wrong(level: _Level, given: list[_Pair], last: list[_Pair], *, end: boo
     """Whether some view moved far, and its photo and the others disagree less for it, in the ``end`` much less."""
     far = _flows(level, last) > LIMIT_PX
     costs = np.zeros((2, len(far)))  # of each view, given and last
-    for i, found in enumerate((given, last)):
-        for pair, one in zip(level.pairs, found, strict=True):
+    for i, pairs in enumerate((given, last)):
+        for pair, one in zip(level.pairs, pairs, strict=True):
             costs[i, list(pair)] += one.cost
     gains = 1 - costs[1] / np.maximum(costs[0], 1e-9)
     all_gain = 1 - costs[1].sum() / max(costs[0].sum(), 1e-9)

@@ -27,7 +27,7 @@ PALER, PALER_RANGE = -0.12, 0.08  # correlation of saturation with the row, at m
 FAR = 3.0  # times the depth of the rest
 LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # views that show sky, and their share of all: fewer may be mistaken
 AGREEMENT = 0.7  # least share of a Gaussian's blending weights that lies in the sky
-LAYERS, LAST_LAYER = 6, 0.02  # most rounds; share of what was found in a round that is the last
+LAYERS, LAST_LAYER = 6, 0.02  # most rounds; share of all sky so far that a round which is the last adds
 MAX_SAMPLES = 200_000  # Gaussians that depths are taken from
 
 
@@ -39,16 +39,16 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
         cameras: v views.
         photos: ``[v,h,w,3]`` sRGB in [0, 1], of the cameras' size.
     """
-    regions, found = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
+    regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
     if not regions:
-        return found
+        return mask
     for _ in range(LAYERS):  # what the sky in front has hidden comes next
-        rows = np.flatnonzero(~found)
+        rows = np.flatnonzero(~mask)
         above = _mostly_inside(gaussians[rows], cameras, regions)
-        found[rows[above]] = True
-        if above.sum() < LAST_LAYER * found.sum():
+        mask[rows[above]] = True
+        if above.sum() < LAST_LAYER * mask.sum():
             break
-    return found
+    return mask
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:

@@ -75,9 +75,9 @@ def fit_cameras(
     inputs, notes = _make_input(source, camera_file, plain), list(plain.notes)
     recovery = recover(inputs)
     if recovery is None and order not in MAY_BE_UNALIGNED:
-        found = recover_moved(inputs, camera_file)
-        if found is not None:
-            moved, recovery = found
+        reading = recover_moved(inputs, camera_file)
+        if reading is not None:
+            moved, recovery = reading
             inputs, notes = replace(inputs, cameras=moved.cameras), [*notes, moved.note]
             return CameraFit(inputs, recovery, camera_file, notes, plain.transform, moved)
     if recovery is None and not searched:

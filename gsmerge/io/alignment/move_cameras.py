@@ -86,10 +86,10 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
         return
     factors, shifts = np.ones(2), np.zeros(2)
     with np.errstate(all="ignore"):
-        found, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
-    good = (depth[:, 0] > 0) & np.isfinite(found[:, 0]).all(1)
+        places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
+    good = (depth[:, 0] > 0) & np.isfinite(places[:, 0]).all(1)
     for axis in range(2):
-        before, wanted = found[good, 0, axis], pairs.pixels[good, axis]
+        before, wanted = places[good, 0, axis], pairs.pixels[good, axis]
         weights = np.ones(len(before))
         for _ in range(ROUNDS):
             factors[axis], shifts[axis] = np.polyfit(before, wanted, 1, w=weights)
