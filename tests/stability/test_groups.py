@@ -227,7 +227,8 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     scene = scenes.make_scene(sky, scenes.arc(3))
     actual = scenes.compacted(scene, **settings).gaussians
     depths = project(actual.means, scene.cameras)[1][0]
-    assert ((depths < 3) | (depths > 4e5)).all()
+    sky_from = 7e5 if settings.get("fit") == "none" else 1e5  # a fit moves what is so far away and so large
+    assert ((depths < 3) | (depths > sky_from)).all()
     assert scene.images is not None
     far = scenes.trace(sky, scene.cameras)[1].reshape(scene.valid.shape) > 1e5
 
