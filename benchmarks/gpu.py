@@ -21,9 +21,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import torch
+from gsmerge.gpu.build import DeviceScene
 
 from gsmerge import CompactOptions, read_scene
-from gsmerge.gpu.build import DeviceScene
 from gsmerge.pipeline import begin, build, input_psnr, score, score_input
 from gsmerge.report import CompactReport
 from gsmerge.runtime.run_log import RunLog

@@ -2,8 +2,7 @@
 
     python benchmarks/segmentation.py [--density 5000] [--repeats 3] [--method rdseg] [--scenes desk,beercan]
 
-``device`` is ``rdseg`` as a GPU does it, here by torch on one processor, whose time says nothing about a GPU. With
-``--scenes`` four photos of each of these captures stand in for the six.
+With ``--scenes`` four photos of each of these captures stand in for the six.
 
 ``ms`` is process CPU time for 476 x 476 pixels, best of the repeats, kernels warm. ``/bass-st`` is that time over
 the one of ``bass-st``. With the folder of reference material next to the repository (``GSMERGE_SHARED`` or
@@ -30,8 +29,7 @@ import torch  # noqa: E402
 from segmentation_scores import DENSITIES, SIDE, count_at, photos, proxy_psnr, shrink, splat_psnr  # noqa: E402
 from shared_scenes import scene_folders  # noqa: E402
 
-from gsmerge.gpu.segment import segment  # noqa: E402
-from gsmerge.stages.segment import SegmentOptions, superpixels  # noqa: E402
+from gsmerge.stages.segment import superpixels  # noqa: E402
 
 RUNS = [
     ("bass-st", "default"),
@@ -40,7 +38,6 @@ RUNS = [
     ("rdseg", "fast"),
     ("rdseg", "default"),
     ("rdseg", "best"),
-    ("device", "default"),
 ]
 PHOTOS_EACH = 4  # of a capture, evenly spread
 
@@ -98,9 +95,6 @@ def captures(names: str) -> dict[str, np.ndarray]:
 
 
 def ours(name: str, effort: str) -> Method:
-    if name == "device":
-        options = SegmentOptions(effort=effort)
-        return lambda image, count: segment(torch.from_numpy(image / np.float32(255))[None], options, count)[0].numpy()
     return lambda image, count: superpixels(image, count, name, effort=effort)
 
 

@@ -1,16 +1,14 @@
 """The story of a run: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted.
 
 :func:`compact` prepares the scene, chooses how many Gaussians, builds, and scores; :func:`build` is every arrow by its
-name, whose first half, :func:`merge_views`, encoding and views in batches share. A baseline, or the same arrows on a
-GPU, take the place of the arrows alone: preparing, scores and report stay the same.
+name, whose first half, :func:`merge_views`, encoding and views in batches share. A baseline takes the place of the
+arrows alone: preparing, scores and report stay the same.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.baselines import choose_baseline
@@ -18,7 +16,7 @@ from gsmerge.io import load_scene
 from gsmerge.io.cameras.moves import describe_moves, list_moves
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.options import CompactOptions
-from gsmerge.render.photos import NEAR, photo_psnr, scene_photos
+from gsmerge.render.photos import NEAR, photo_psnr, photos_of, scene_photos
 from gsmerge.report import CompactReport, CompactResult
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.run_log import STAGES, Progress, RunLog
@@ -41,8 +39,6 @@ from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PixelScene, Segm
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
-
-Psnr = Callable[[Gaussians, PreparedScene], float]
 
 
 def compact(
@@ -82,33 +78,21 @@ def compact(
         baseline, notes = choose_baseline(options, scene)
         log.notes[:] = [*read_notes, *notes]
         prepared = prepare(scene, options, log)
-        own_build, psnr = choose_builder(prepared)
-        make, judge = own_build if baseline is None else baseline.build, partial(score, psnr=psnr)
+        make: Build = build if baseline is None else baseline.build
         if prepared.options.clean.asked:
             prepared, make = clean_up(prepared, make)
         if options.budget.target_psnr is not None:
-            result = search_quality(prepared, make, judge, log)
+            result = search_quality(prepared, make, score, log)
         else:
-            result = judge(make(prepared, choose_count(prepared, own_build, log), log), prepared, log)
+            result = score(make(prepared, choose_count(prepared, build, log), log), prepared, log)
         coarser, placed = [], prepared.with_cameras(log.viewmats)  # the cameras that are written are the finest level's
         for count in level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count):
             own = RunLog(progress)
-            coarser.append(judge(make(placed, count, own), placed, own))
-        result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress), psnr)
+            coarser.append(score(make(placed, count, own), placed, own))
+        result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress))
     if progress:
         progress("done", len(STAGES), len(STAGES))
     return result if device is None else result.to(device)
-
-
-def choose_builder(prepared: PreparedScene) -> tuple[Build, Psnr]:
-    """What makes the Gaussians of a prepared scene and what scores them: :func:`build`, or the same on a GPU."""
-    device = prepared.options.fit.device
-    if device == "cpu":
-        return build, input_psnr
-    from gsmerge.gpu.build import DeviceScene  # torch; loaded where it is used alone
-
-    on_device = DeviceScene(prepared, device, begin)
-    return on_device.build, on_device.input_psnr
 
 
 def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
@@ -126,6 +110,8 @@ def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
     with log.stage("fit"):
         photos = fit_photos(scene, options.fit, log, prepared.photo_views)
         log.choices["begun_with"] = len(gaussians)
+        if options.fit.device != "cpu":
+            log.choices["device"] = options.fit.device if len(photos) == 2 else "cpu"  # larger photos: the CPU alone
         gaussians, report = fit(
             gaussians, photos, options.fit, count, options.seed, log.fit_progress, analytic, exact=exact
         )
@@ -230,11 +216,8 @@ def merge_with(
     return closed.features, choices | closed.choices
 
 
-def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr | None = None) -> CompactResult:
-    """Canonical Gaussians as a result in the world frame, with its report, scored on the input views.
-
-    By ``psnr``, or :func:`input_psnr`.
-    """
+def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog) -> CompactResult:
+    """Canonical Gaussians as a result in the world frame, with its report, scored on the input views."""
     if prepared.hidden is not None:
         gaussians = Gaussians.concat([gaussians, prepared.hidden])
     prepared = prepared.with_cameras(log.viewmats)
@@ -245,7 +228,7 @@ def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog, psnr: Psnr
         prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
     if prepared.given.images is not None:
         with log.stage("score"):
-            after = (psnr or input_psnr)(gaussians, prepared)
+            after = input_psnr(gaussians, prepared)
         log.choices["scored_views"] = len(prepared.scored_views())
     settings = prepared.settings.to_dict() | {"fit_steps": prepared.options.fit.steps}
     counts = prepared.given.num_gaussians, len(gaussians)
@@ -266,7 +249,7 @@ def note_moves(prepared: PreparedScene, cameras: Cameras, log: RunLog) -> None:
     log.notes.append(f"{cause}: cameras were moved by {describe_moves(log.choices['poses'])}")
 
 
-def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog, psnr: Psnr) -> CompactResult:
+def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog) -> CompactResult:
     """The result and its further levels, with the PSNR of the input beside their own.
 
     It comes last, when the kernels are compiled and memory is free again.
@@ -274,7 +257,7 @@ def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog, psn
     if prepared.given.images is None:
         return result
     with log.stage("input"):
-        before = psnr(prepared.given.file_gaussians, prepared)
+        before = input_psnr(prepared.given.file_gaussians, prepared)
 
     def with_input(one: CompactResult, seconds: dict[str, float]) -> CompactResult:
         report = replace(one.report, psnr_before=before, seconds=one.report.seconds | seconds)
@@ -290,4 +273,10 @@ def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:
     """
     photos, exact = scene_photos(prepared.given), prepared.options.budget.target_psnr is not None
     views, near = prepared.scored_views(), NEAR * prepared.frame.unit
-    return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)
+    if prepared.options.fit.device == "cpu":
+        return photo_psnr(gaussians, photos, views, quarter=not exact, near=near)
+    from gsmerge.gpu.score import score_photos  # torch; loaded where it is used alone
+
+    frame, device = prepared.frame, prepared.options.fit.device
+    photos = photos_of(photos.images, frame.enter_cameras(prepared.given.cameras))  # float32 wants small numbers
+    return score_photos(frame.enter(gaussians), photos, views, device, quarter=not exact)

@@ -1,5 +1,5 @@
-"""The pipeline on a GPU: plain functions on tensors of any device, one file for each arrow.
+"""The fit, its growth, colours and scores on a GPU: plain functions on tensors of any device.
 
-Nothing here is imported before ``--device`` resolves to CUDA. On the torch CPU device every function gives what the
-stage of the same name gives, which is how it is tested. How it works and what differs: docs/internals/gpu.md.
+Merging stays on the CPU. Nothing here is imported before ``--device`` resolves to CUDA. On the torch CPU device every
+function gives what the kernels give, which is how it is tested; docs/internals/gpu.md says what differs on a GPU.
 """

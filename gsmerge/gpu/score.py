@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from gsmerge.gpu.raster import draw_gaussians
-from gsmerge.gpu.scene import DevicePhotos
+from gsmerge.gpu.scene import DevicePhotos, upload_gaussians, upload_photos
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.render.photos import scored_tiles
+from gsmerge.render.photos import Photos, scored_tiles
 from gsmerge.types import Gaussians
 
 
@@ -23,21 +23,27 @@ def photo_error(gaussians: Gaussians, photos: DevicePhotos) -> float:
     return float(torch.stack(errors).mean())
 
 
-def photo_psnr(
-    gaussians: Gaussians, photos: DevicePhotos, views: Sequence[int], *, near: float, quarter: bool
+def score_photos(
+    gaussians: Gaussians, photos: Photos, views: Sequence[int], device: torch.device | str, *, quarter: bool
 ) -> float:
-    """Mean over some views of the PSNR (dB) of their photos.
+    """Return the mean over some views of the PSNR (dB) of their photos; :func:`gsmerge.render.photos.photo_psnr`.
 
     Args:
-        gaussians: Gaussians in the photos' frame.
-        photos: Of full size.
+        gaussians: Canonical Gaussians.
+        photos: Of full size, in the same frame.
         views: Of the photos.
-        near: Near plane.
+        device: Where to draw.
         quarter: Score the tiles of :func:`gsmerge.render.photos.scored_tiles` alone.
     """
+    uploaded = upload_photos(photos, torch.device(device))
+    return photo_psnr(upload_gaussians(gaussians, torch.device(device)), uploaded, views, quarter=quarter)
+
+
+def photo_psnr(gaussians: Gaussians, photos: DevicePhotos, views: Sequence[int], *, quarter: bool) -> float:
+    """The same of Gaussians and photos that are on the device."""
     values = []
     for view in views:
-        image = draw_gaussians(gaussians, photos, view, near=near).clamp(0, 1)
+        image = draw_gaussians(gaussians, photos, view).clamp(0, 1)
         squares = (image - photos.images[view]).double().square()
         mask = scored_pixels(photos, view) if quarter else None
         error = squares.mean() if mask is None else (squares * mask[..., None]).sum() / (3 * mask.sum())

@@ -27,7 +27,7 @@ from gsmerge.gpu.scene import upload_gaussians, upload_photos
 from gsmerge.gpu.score import photo_error, photo_psnr
 from gsmerge.kernels.gaussians import optimise
 from gsmerge.render import photos as render_photos
-from gsmerge.render.photos import NEAR, Photos
+from gsmerge.render.photos import Photos
 from gsmerge.stages.fit import FitOptions, fit, stage
 from gsmerge.stages.fit import full as stage_full
 from gsmerge.stages.fit import grow as stage_grow
@@ -282,10 +282,10 @@ def test_scores_are_the_renderers(start: Gaussians, scene: PixelScene, monkeypat
     full = render_photos.scene_photos(wide)
     tensors, resident = upload_gaussians(start, CPU), upload_photos(full, CPU)
     assert render_photos.scored_tiles(0, 72, 66) is not None
-    assert photo_psnr(tensors, resident, [0, 1], near=NEAR, quarter=True) == pytest.approx(
+    assert photo_psnr(tensors, resident, [0, 1], quarter=True) == pytest.approx(
         render_photos.photo_psnr(start, full, [0, 1], quarter=True), abs=1e-4
     )
-    assert photo_psnr(tensors, resident, [1], near=NEAR, quarter=False) == pytest.approx(
+    assert photo_psnr(tensors, resident, [1], quarter=False) == pytest.approx(
         render_photos.photo_psnr(start, full, [1]), abs=1e-4
     )
     assert photo_error(tensors, resident) == pytest.approx(stage.photo_error(start, full), rel=1e-4)

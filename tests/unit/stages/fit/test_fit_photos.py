@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import CompactOptions, Gaussians, PixelScene, compact
+from gsmerge import Gaussians, PixelScene, compact
 from gsmerge.geometry import project
-from gsmerge.pipeline import build
 from gsmerge.render.photos import EPS2D, photo_psnr
 from gsmerge.runtime.run_log import RunLog
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.fit import FitOptions, fit, fit_photos
 from gsmerge.stages.fit.full import affordable_steps, fit_full, plan_run
 from gsmerge.stages.fit.photos import large_photos, largest_scale, photo_scale
-from gsmerge.stages.prepare import prepare
 from gsmerge.types import LargePhotos
 from gsmerge.views import subset
 
@@ -193,16 +191,3 @@ def test_a_run_says_at_what_scale_it_looked(scene: PixelScene) -> None:
     report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30, photo_scale=1).report
     assert "photo_scale" not in report.choices
     assert report.notes == []
-
-
-def test_a_device_leaves_larger_photos_to_the_cpu(scene: PixelScene) -> None:
-    from gsmerge.gpu.build import DeviceScene
-    from gsmerge.pipeline import begin
-
-    options = CompactOptions().with_settings({"superpixels": "10%", "fit_steps": 30, "checkpoint": "none"})
-    prepared, log, other = prepare(with_large(scene, 2), options, RunLog()), RunLog(), RunLog()
-    assert len(DeviceScene(prepared, "cpu", begin).build(prepared, None, log)) > 0
-    build(prepared, None, other)
-    assert log.choices["on_cpu"]["fit"] == "photo_scale 2"
-    assert log.choices["photo_scale"] == other.choices["photo_scale"] == 2
-    assert log.choices["fit"]["method"] == "full"
