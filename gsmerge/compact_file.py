@@ -28,7 +28,7 @@ from gsmerge.options import CompactOptions
 from gsmerge.pipeline import compact
 from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.run_log import Progress
+from gsmerge.runtime.record import Progress
 from gsmerge.types import PixelScene, UnalignedScene
 
 NO_PHOTOS = "no photos found, so nothing is fitted and no PSNR measured; name their folder with --images"

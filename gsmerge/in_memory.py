@@ -14,7 +14,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras_path, write_viewer_came
 from gsmerge.io.tensors import TensorInput, read_tensors
 from gsmerge.pipeline import compact
 from gsmerge.report import CompactReport
-from gsmerge.runtime.run_log import Progress
+from gsmerge.runtime.record import Progress
 from gsmerge.types import Array, Cameras, Gaussians, as_array, like
 
 

@@ -11,6 +11,8 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsmerge.baselines import choose_baseline
 from gsmerge.io import load_scene
 from gsmerge.io.cameras.moves import describe_moves, list_moves
@@ -19,7 +21,17 @@ from gsmerge.options import CompactOptions
 from gsmerge.render.photos import NEAR, photo_psnr, photos_of, scene_photos
 from gsmerge.report import CompactReport, CompactResult
 from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.run_log import STAGES, Progress, RunLog
+from gsmerge.runtime.record import (
+    STAGES,
+    Progress,
+    choose,
+    current_record,
+    note,
+    record_part,
+    record_run,
+    report_progress,
+    stage,
+)
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import Build, choose_count, level_counts, search_quality
 from gsmerge.stages.agreement import weaken_contradicted
@@ -29,7 +41,7 @@ from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
 from gsmerge.stages.clean import clean, make_clean
 from gsmerge.stages.decode import MIXED, decode_merged
 from gsmerge.stages.encode import encode
-from gsmerge.stages.fit import fit, fit_photos
+from gsmerge.stages.fit import Fitted, fit, fit_photos, record_fit, report_steps
 from gsmerge.stages.group import segment_scene
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
@@ -72,51 +84,56 @@ def compact(
         scene, read_notes = load.scene, load.notes
     options = (options or CompactOptions()).with_settings(settings).with_auto_steps()
     options = options.with_chosen_device(scene.num_gaussians)
-    log, device = RunLog(progress), scene.gaussians.device
+    device = scene.gaussians.device
     scene = scene.numpy()
-    with use_threads(options.threads):
+    with use_threads(options.threads), record_run(progress):
         baseline, notes = choose_baseline(options, scene)
-        log.notes[:] = [*read_notes, *notes]
-        prepared = prepare(scene, options, log)
+        for text in (*read_notes, *notes):
+            note(text)
+        prepared = prepare(scene, options)
         make: Build = build if baseline is None else baseline.build
         if prepared.options.clean.asked:
             prepared, make = clean_up(prepared, make)
         if options.budget.target_psnr is not None:
-            result = search_quality(prepared, make, score, log)
+            result, cameras = search_quality(prepared, make, score)
         else:
-            result = score(make(prepared, choose_count(prepared, build, log), log), prepared, log)
-        coarser, placed = [], prepared.with_cameras(log.viewmats)  # the cameras that are written are the finest level's
+            fitted = make(prepared, choose_count(prepared, build))
+            result, cameras = score(fitted, prepared), fitted.cameras
+        coarser, placed = [], prepared.with_cameras(cameras)  # the cameras that are written are the finest level's
         for count in level_counts(len(result.gaussians), options.budget.levels, prepared.limits.min_count):
-            own = RunLog(progress)
-            coarser.append(score(make(placed, count, own), placed, own))
-        result = score_input(replace(result, coarser=tuple(coarser)), prepared, RunLog(progress))
-    if progress:
-        progress("done", len(STAGES), len(STAGES))
+            with record_part():
+                coarser.append(score(make(placed, count), placed))
+        result = score_input(replace(result, coarser=tuple(coarser)), prepared)
+        report_progress("done", len(STAGES), len(STAGES))
     return result if device is None else result.to(device)
 
 
-def build(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
+def build(prepared: PreparedScene, count: int | None) -> Fitted:
     """Every arrow after the preparation: superpixels to fitted Gaussians, in the canonical frame.
 
     Args:
         prepared: The scene.
         count: Gaussians in the result; None: as many as ``superpixels`` and K give.
-        log: Takes seconds, choices and notes.
     """
     scene, options = prepared.scene, prepared.options
-    gaussians, count, exact, analytic = begin(prepared, count, log)
+    gaussians, count, exact, analytic = begin(prepared, count)
     if scene.images is None or not options.fit.needs_photos:
-        return gaussians
-    with log.stage("fit"):
-        photos = fit_photos(scene, options.fit, log, prepared.photo_views)
-        log.choices["begun_with"] = len(gaussians)
+        return Fitted(gaussians, scene.cameras, None)
+    with stage("fit"):
+        photos = fit_photos(scene, options.fit, prepared.photo_views)
+        choose(begun_with=len(gaussians))
         if options.fit.device != "cpu":
-            log.choices["device"] = options.fit.device if len(photos) == 2 else "cpu"  # larger photos: the CPU alone
+            choose(device=options.fit.device if len(photos) == 2 else "cpu")  # larger photos: the CPU alone
         gaussians, report = fit(
-            gaussians, photos, options.fit, count, options.seed, log.fit_progress, analytic, exact=exact
+            gaussians, photos, options.fit, count, options.seed, report_steps, analytic, exact=exact
         )
-    log.add_fit(report)
-    return gaussians
+    record_fit(report)
+    cameras = scene.cameras
+    if report is not None and report.viewmats is not None:
+        poses = cameras.viewmats.astype(np.float64)
+        poses[list(prepared.photo_views)] = report.viewmats
+        cameras = replace(cameras, viewmats=poses)
+    return Fitted(gaussians, cameras, report)
 
 
 def clean_up(prepared: PreparedScene, make: Build) -> tuple[PreparedScene, Build]:
@@ -127,15 +144,14 @@ def clean_up(prepared: PreparedScene, make: Build) -> tuple[PreparedScene, Build
         lost = len(prepared.hidden) - len(kept)
         prepared = replace(prepared, hidden=kept)
 
-    def build_clean(prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
+    def build_clean(prepared: PreparedScene, count: int | None) -> Fitted:
         wanted = None if count is None else count + lost
-        leave = prepared.frame.leave
-        return make_clean(lambda asked, own: make(prepared, asked, own), wanted, options, scene, leave, log)
+        return make_clean(lambda asked: make(prepared, asked), wanted, options, scene, prepared.frame.leave)
 
     return prepared, build_clean
 
 
-def begin(prepared: PreparedScene, count: int | None, log: RunLog) -> tuple[Gaussians, int, bool, Gaussians | None]:
+def begin(prepared: PreparedScene, count: int | None) -> tuple[Gaussians, int, bool, Gaussians | None]:
     """The arrows up to decoding; arguments as of :func:`build`.
 
     Returns:
@@ -145,8 +161,8 @@ def begin(prepared: PreparedScene, count: int | None, log: RunLog) -> tuple[Gaus
     scene, options = prepared.scene, prepared.options
     if prepared.keeps_all(count):  # merging some and splitting others would only blur
         return scene.gaussians, len(scene.gaussians), True, None
-    merged = merge_views(prepared, count, log)
-    with log.stage("decode"):
+    merged = merge_views(prepared, count)
+    with stage("decode"):
         gaussians = decode_merged(merged, options.decode, options.encode.rule, grows=options.fit.grows)
     analytic = None
     if merged.networks is not None and options.fit.fit == "full" and scene.images is not None:
@@ -155,35 +171,35 @@ def begin(prepared: PreparedScene, count: int | None, log: RunLog) -> tuple[Gaus
     return gaussians, merged.segmentation.count, merged.segmentation.exact, analytic
 
 
-def merge_views(prepared: PreparedScene, count: int | None, log: RunLog) -> MergedViews:
+def merge_views(prepared: PreparedScene, count: int | None) -> MergedViews:
     """The arrows from superpixels to Feature Gaussians that are merged across views and refined.
 
     Where networks compete with the analytic stages (``checkpoint="auto"``) both run, and the better start is kept.
     """
     scene, options = prepared.scene, prepared.options
-    with log.stage("segment"):
+    with stage("segment"):
         segmentation = segment_scene(prepared, count)
     members = prepared.members
     if members is None:
-        with log.stage("members"):
+        with stage("members"):
             members = assign_members(scene, segmentation.groups, options.contribution)
     saliency = scene_saliency(prepared.pictures) if options.decode.k == MIXED else None
     starts = []
     for networks in prepared.candidates(members):
-        features, choices = merge_with(networks, prepared, members, segmentation, log)
+        features, choices = merge_with(networks, prepared, members, segmentation)
         starts.append(MergedViews(features, members, segmentation, networks, choices, saliency=saliency))
     start = starts[0]
     if len(starts) > 1:
-        with log.stage("choose"):
+        with stage("choose"):
             start = choose_start(starts, scene, options.decode, options.encode.rule)
-    log.choices |= start.choices
+    choose(**start.choices)
     if start.networks is not None and prepared.checkpoint is not None:
-        log.choices["networks"] = prepared.checkpoint.facts()
+        choose(networks=prepared.checkpoint.facts())
     return start
 
 
 def merge_with(
-    networks: NetworkContext | None, prepared: PreparedScene, members: Members, segmentation: Segmentation, log: RunLog
+    networks: NetworkContext | None, prepared: PreparedScene, members: Members, segmentation: Segmentation
 ) -> tuple[FeatureGaussians, dict[str, Any]]:
     """Feature Gaussians of superpixels, merged and refined with these networks or with none; what the stages decided.
 
@@ -191,79 +207,81 @@ def merge_with(
     """
     scene, options = prepared.scene, prepared.options
     robust = None
-    with log.stage("encode"):
+    with stage("encode"):
         features = encode(scene, members, segmentation.groups, options.encode, networks)
     if prepared.limits.robust and (networks is None or options.robust.robust):  # networks stand in for the choice
-        with log.stage("robust"):
+        with stage("robust"):
             coarse = encode_backing(scene, members, segmentation.coarse, options.backing, features)
             photos, aligned = scene_photos(scene, 2), isinstance(scene, PixelScene)
             robust = choose_merge(features, coarse, photos, options.robust, leave_out=aligned)
             features = robust.features
     elif networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
         features = weaken_contradicted(features, members, scene.cameras)
-    with log.stage("match"):
+    with stage("match"):
         matches = match(features, options.match, networks)
         merged = merge(features, matches, networks)
     choices: dict[str, Any] = {"groups": len(features), "clusters": matches.count}
     del features, matches
     if networks is not None:
-        with log.stage("refine"):
+        with stage("refine"):
             merged = refine(merged, networks)
     if robust is None:
         return merged, choices
-    with log.stage("close"):
+    with stage("close"):
         closed = close_holes(merged, replace(robust, features=merged), options.robust)
     return closed.features, choices | closed.choices
 
 
-def score(gaussians: Gaussians, prepared: PreparedScene, log: RunLog) -> CompactResult:
+def score(fitted: Fitted, prepared: PreparedScene) -> CompactResult:
     """Canonical Gaussians as a result in the world frame, with its report, scored on the input views."""
+    gaussians, record = fitted.gaussians, current_record()
     if prepared.hidden is not None:
         gaussians = Gaussians.concat([gaussians, prepared.hidden])
-    prepared = prepared.with_cameras(log.viewmats)
+    prepared = prepared.with_cameras(fitted.cameras)
     gaussians, cameras = prepared.frame.leave(gaussians), prepared.final_cameras()
     after = None
     if cameras is not prepared.given.cameras:
-        note_moves(prepared, cameras, log)
+        note_moves(prepared, cameras)
         prepared = replace(prepared, given=replace(prepared.given, cameras=cameras))
     if prepared.given.images is not None:
-        with log.stage("score"):
+        with stage("score"):
             after = input_psnr(gaussians, prepared)
-        log.choices["scored_views"] = len(prepared.scored_views())
+        choose(scored_views=len(prepared.scored_views()))
     settings = prepared.settings.to_dict() | {"fit_steps": prepared.options.fit.steps}
     counts = prepared.given.num_gaussians, len(gaussians)
     return CompactResult(
         gaussians,
-        CompactReport(*counts, log.seconds, None, after, log.choices, log.notes, settings, peak_memory()),
+        CompactReport(*counts, record.seconds, None, after, record.choices, record.notes, settings, peak_memory()),
         cameras,
     )
 
 
-def note_moves(prepared: PreparedScene, cameras: Cameras, log: RunLog) -> None:
+def note_moves(prepared: PreparedScene, cameras: Cameras) -> None:
     """Tell how far each camera was moved."""
     given, cause = prepared.given, "poses are free"
     if prepared.settings.fit.poses == "auto":
         cause = "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit
-    log.choices["poses"] = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
-    log.notes.append(f"{cause}: cameras were moved by {describe_moves(log.choices['poses'])}")
+    moves = list_moves(given.names, given.cameras.viewmats, cameras.viewmats, depth)
+    choose(poses=moves)
+    note(f"{cause}: cameras were moved by {describe_moves(moves)}")
 
 
-def score_input(result: CompactResult, prepared: PreparedScene, log: RunLog) -> CompactResult:
+def score_input(result: CompactResult, prepared: PreparedScene) -> CompactResult:
     """The result and its further levels, with the PSNR of the input beside their own.
 
     It comes last, when the kernels are compiled and memory is free again.
     """
     if prepared.given.images is None:
         return result
-    with log.stage("input"):
+    with record_part() as own, stage("input"):
         before = input_psnr(prepared.given.file_gaussians, prepared)
 
     def with_input(one: CompactResult, seconds: dict[str, float]) -> CompactResult:
         report = replace(one.report, psnr_before=before, seconds=one.report.seconds | seconds)
         return replace(one, report=replace(report, peak_memory_bytes=peak_memory()))
 
-    return replace(with_input(result, log.seconds), coarser=tuple(with_input(one, {}) for one in result.coarser))
+    return replace(with_input(result, own.seconds), coarser=tuple(with_input(one, {}) for one in result.coarser))
 
 
 def input_psnr(gaussians: Gaussians, prepared: PreparedScene) -> float:

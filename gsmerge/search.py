@@ -15,16 +15,16 @@ import numpy as np
 from gsmerge.render.metrics import WINDOW, ssim
 from gsmerge.render.photos import Photos, render_photos, scene_photos
 from gsmerge.report import CompactResult
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import choose, current_record, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.stages.fit import FitOptions
+from gsmerge.stages.fit import FitOptions, Fitted
 from gsmerge.stages.fit.holdout import holdout_psnr, training_weights
 from gsmerge.stages.group import knee_count
 from gsmerge.stages.prepare import PreparedScene
-from gsmerge.types import Gaussians
+from gsmerge.types import Cameras, Gaussians
 
-Build = Callable[[PreparedScene, int | None, RunLog], Gaussians]
-Score = Callable[[Gaussians, PreparedScene, RunLog], CompactResult]
+Build = Callable[[PreparedScene, int | None], Fitted]
+Score = Callable[[Fitted, PreparedScene], CompactResult]
 
 SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' blocks
@@ -51,7 +51,7 @@ class CurvePoint:
     lpips: float | None = None  # LPIPS (AlexNet), None where its weights are not installed
 
 
-def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | None:
+def choose_count(prepared: PreparedScene, build: Build) -> int | None:
     """The number of Gaussians, as the options and the scene's own curve have it; None: as ``superpixels`` and K say."""
     limits, options = prepared.limits, prepared.options
     drop = options.budget.max_drop
@@ -59,33 +59,33 @@ def choose_count(prepared: PreparedScene, build: Build, log: RunLog) -> int | No
         return limits.count
     if prepared.given.images is None or prepared.scene.images is None:
         return knee_count(prepared)
-    with log.stage("curve"):
+    with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
-        points = measure_curve(prepared, build, SHORT if drop is None else LONG, counts, log)
-    log.choices["curve"] = [asdict(point) for point in points]
+        points = measure_curve(prepared, build, SHORT if drop is None else LONG, counts)
+    choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 
-def search_quality(prepared: PreparedScene, build: Build, score: Score, log: RunLog) -> CompactResult:
+def search_quality(prepared: PreparedScene, build: Build, score: Score) -> tuple[CompactResult, Cameras]:
     """The fewest Gaussians that render the input photos at the PSNR among the options; the best result where none do.
 
-    The seconds and notes of ``log``, of what came before, enter the report.
+    The seconds and notes of what came before enter the report. The second result are the canonical cameras.
     """
     target, limits = prepared.options.budget.target_psnr, prepared.limits
     assert target is not None
     results: dict[int, CompactResult] = {}
-    poses: dict[int, np.ndarray | None] = {}
+    cameras: dict[int, Cameras] = {}
+    before = current_record()
 
     def run(count: int) -> float:
-        own = RunLog(log.progress)
-        results[count] = score(build(prepared, count, own), prepared, own)
-        poses[count] = own.viewmats
+        with record_part():
+            fitted = build(prepared, count)
+            results[count], cameras[count] = score(fitted, prepared), fitted.cameras
         return results[count].report.psnr_after or 0.0
 
     max_count = min(limits.max_count, MAX_FACTOR * limits.default)
     search = search_count(run, target, min(limits.default, max_count), limits.min_count, max_count)
-    result, log.viewmats = results[search.count], poses[search.count]
-    seconds = dict(log.seconds)
+    result, seconds = results[search.count], dict(before.seconds)
     for one in results.values():
         for name, value in one.report.seconds.items():
             seconds[name] = seconds.get(name, 0.0) + value
@@ -95,14 +95,13 @@ def search_quality(prepared: PreparedScene, build: Build, score: Score, log: Run
             f"quality: {target:g} dB was asked for, the input views reach {search.psnr:.2f} dB"
             f" with {len(result.gaussians)} Gaussians"
         )
-    choices = log.choices | result.report.choices | {"search": asdict(search)}
-    notes = [*log.notes, *result.report.notes]
-    return replace(result, report=replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet))
+    choices = before.choices | result.report.choices | {"search": asdict(search)}
+    notes = [*before.notes, *result.report.notes]
+    report = replace(result.report, choices=choices, seconds=seconds, notes=notes, unmet=unmet)
+    return replace(result, report=report), cameras[search.count]
 
 
-def measure_curve(
-    prepared: PreparedScene, build: Build, steps: int, counts: Sequence[int], log: RunLog
-) -> list[CurvePoint]:
+def measure_curve(prepared: PreparedScene, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
     """PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of the photos at some counts.
 
     The fits take ``steps``, whatever the options say. PSNR and SSIM are those of blocks that the fits leave out, at
@@ -116,9 +115,9 @@ def measure_curve(
     weights = training_weights(photos, HOLDOUT, options.seed)
     points: list[CurvePoint] = []
     for count in counts:
-        if log.progress:
-            log.progress("curve: what each count brings", len(points), len(counts))
-        points.append(_point(count, build(quick, count, RunLog()), photos, weights, short.min_gain))
+        report_progress("curve: what each count brings", len(points), len(counts))
+        with record_part(silent=True):
+            points.append(_point(count, build(quick, count).gaussians, photos, weights, short.min_gain))
     return points
 
 

@@ -8,15 +8,16 @@ from typing import Literal
 
 import numpy as np
 
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import stage
 from gsmerge.stages.assign import assign_members
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.encode import EncodeOptions, encode
+from gsmerge.stages.fit import Fitted
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians, Groups, PixelScene, UnalignedScene
 
 Need = Literal["photos", "pixels", "node"]
-Run = Callable[[PreparedScene, int, RunLog], Gaussians]
+Run = Callable[[PreparedScene, int], Gaussians]
 
 COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
 
@@ -26,16 +27,17 @@ class Baseline:
     """One other method."""
 
     name: str  # as on the command line
-    # prepared scene, number of Gaussians, log -> canonical Gaussians, at most that many unless the method keeps the
-    # input's. It times itself, by stages of the log.
+    # prepared scene, number of Gaussians -> canonical Gaussians, at most that many unless the method keeps the
+    # input's. It times itself, by stages of the record.
     run: Run
     # ``"photos"``; ``"pixels"``: one Gaussian per pixel; ``"node"``: a program that runs in Node.js
     needs: tuple[Need, ...] = ()
     uses: tuple[str, ...] = COUNTS  # settings that it uses, by flat name, besides those that all methods use
 
-    def build(self, prepared: PreparedScene, count: int | None, log: RunLog) -> Gaussians:
+    def build(self, prepared: PreparedScene, count: int | None) -> Fitted:
         """Canonical Gaussians: ``count``, or None for as many as ``superpixels`` and K give."""
-        return self.run(prepared, prepared.limits.default if count is None else count, log)
+        gaussians = self.run(prepared, prepared.limits.default if count is None else count)
+        return Fitted(gaussians, prepared.scene.cameras, None)
 
 
 def own_gaussians(scene: PixelScene | UnalignedScene) -> Gaussians:
@@ -61,12 +63,10 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
     return np.sort(order[:count])
 
 
-def merge_groups(
-    prepared: PreparedScene, groups: Groups, log: RunLog, rule: Literal["depth", "paper"] = "depth"
-) -> Gaussians:
+def merge_groups(prepared: PreparedScene, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
     """One Gaussian for each group, without matching across views; groups that hold nothing are left out."""
-    with log.stage("encode"):
+    with stage("encode"):
         members = prepared.members or assign_members(prepared.scene, groups, prepared.options.contribution)
         features = encode(prepared.scene, members, groups, EncodeOptions(rule=rule))
-    with log.stage("decode"):
+    with stage("decode"):
         return decode(features, members, DecodeOptions(min_opacity=0.0), rule=rule)

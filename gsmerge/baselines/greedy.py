@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.geometry import covariances
 from gsmerge.moments import MAX_OPACITY, principal_axes
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
@@ -181,10 +181,10 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     return cloud
 
 
-def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int) -> Gaussians:
     """Exactly ``count``; the input itself where it has no more."""
     gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians
-    with log.stage("reduce"):
+    with stage("reduce"):
         return gaussians_of(reduce_to(cloud_of(gaussians), count))

@@ -15,7 +15,7 @@ from pathlib import Path
 from gsmerge.baselines.baseline import own_gaussians
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.io import read_ply, write_ply
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import stage
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
@@ -35,7 +35,7 @@ def find_program() -> str:
     return program
 
 
-def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int) -> Gaussians:
     """Exactly as many as the program makes of ``-d COUNT``; the input itself where it has no more than that."""
     gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:
@@ -44,7 +44,7 @@ def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
         before, after = Path(folder) / "in.ply", Path(folder) / "out.ply"
         write_ply(before, gaussians)
         command = [program, "-w", "-g", "cpu", str(before), "-d", str(count), str(after)]
-        with log.stage("reduce"):
+        with stage("reduce"):
             done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
         if done.returncode != 0 or not after.exists():
             output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]

@@ -13,7 +13,7 @@ from dataclasses import fields
 import numpy as np
 
 from gsmerge.baselines.baseline import own_gaussians
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import choose, stage
 from gsmerge.stages.prepare import PreparedScene
 from gsmerge.types import Gaussians
 
@@ -78,11 +78,11 @@ def fuse(gaussians: Gaussians, keys: np.ndarray) -> Gaussians:
     return Gaussians(*(array.astype(np.float32) for array in arrays))
 
 
-def run(prepared: PreparedScene, count: int, log: RunLog) -> Gaussians:
+def run(prepared: PreparedScene, count: int) -> Gaussians:
     """At most ``count`` voxels, and hardly fewer."""
     gaussians = own_gaussians(prepared.scene)
-    with log.stage("reduce"):
+    with stage("reduce"):
         means = gaussians.means.astype(np.float64)
         size = voxel_size(means, count)
-        log.choices["voxel_size"] = size
+        choose(voxel_size=size)
         return fuse(gaussians, voxel_keys(means, size))

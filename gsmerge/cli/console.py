@@ -137,7 +137,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     A stage is done when the next one begins. ``FORCE_COLOR`` in the environment makes anything a terminal.
 
     Yields:
-        ``(stage, done, total) -> None``; a stage of :data:`gsmerge.runtime.run_log.STAGES` without a detail counts no
+        ``(stage, done, total) -> None``; a stage of :data:`gsmerge.runtime.record.STAGES` without a detail counts no
         steps of its own.
     """
     console = _terminal(quiet=quiet)
@@ -146,7 +146,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
         return
     from rich import progress as rich
 
-    from gsmerge.runtime.run_log import STAGES
+    from gsmerge.runtime.record import STAGES
 
     columns = (
         rich.TextColumn("{task.description:>12}"), rich.BarColumn(16), rich.TimeElapsedColumn(),

@@ -62,17 +62,19 @@ class BeforeAfter:
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     """What the arguments BEFORE, whose files are given, and AFTER name, and the views of ``--targets``."""
     from gsmerge.io import read_gaussians
-    from gsmerge.runtime.run_log import RunLog
+    from gsmerge.runtime.record import record_run
     from gsmerge.stages.place_cameras import add_views
     from gsmerge.types import UnalignedScene
 
-    load, log = args.load(files), RunLog()
+    load, notes = args.load(files), list[str]()
     scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
     if isinstance(scene, UnalignedScene):
-        scene = add_views(scene, log)
+        with record_run() as record:
+            scene = add_views(scene)
+        notes = record.notes
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     cameras, moved = own_cameras(args.after, scene)
-    return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *log.notes, *moved])
+    return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])
 
 
 def own_cameras(paths: Sequence[Path], scene: PixelScene | UnalignedScene) -> tuple[dict[str, Cameras], list[str]]:

@@ -13,7 +13,7 @@ from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, withou
 from gsmerge.errors import UsageError
 from gsmerge.options import CompactOptions, to_schema
 from gsmerge.pipeline import build, merge_views
-from gsmerge.runtime.run_log import Progress, RunLog
+from gsmerge.runtime.record import Progress, current_record, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
 from gsmerge.stages.decode import MAX_CHILDREN, merged_count
@@ -55,16 +55,15 @@ def encode_scene(
         raise UsageError(f"max k: expected 1 to {MAX_CHILDREN}, got {max_k}")
     if max_k is not None and max_k < options.decode.max_k:
         raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
-    log = RunLog(progress)
-    with use_threads(options.threads):
-        prepared = prepare(scene.numpy(), options, log)
+    with use_threads(options.threads), record_run(progress):
+        prepared = prepare(scene.numpy(), options)
         require_children("max k", max_k or 1, prepared.checkpoint)
-        count = choose_count(prepared, build, log)
+        count = choose_count(prepared, build)
         if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
-        merged = merge_views(prepared, count, log)
-        with log.stage("decode"):
-            return _to_encoded(prepared, merged, max_k, log)
+        merged = merge_views(prepared, count)
+        with stage("decode"):
+            return _to_encoded(prepared, merged, max_k)
 
 
 def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOptions:
@@ -75,7 +74,7 @@ def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOp
     return replace(options, fit=replace(options.fit, fit="none", poses="fixed"))
 
 
-def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None, log: RunLog) -> Encoded:
+def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None) -> Encoded:
     """Everything that decoding needs of the merged Feature Gaussians."""
     features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
     options, scene = prepared.options, prepared.scene
@@ -106,13 +105,14 @@ def _to_encoded(prepared: PreparedScene, merged: MergedViews, max_k: int | None,
         cameras=scene.cameras,
         settings=settings,
         heads=heads,
-        about=_about(prepared.settings, log),
+        about=_about(prepared.settings),
     )
 
 
-def _about(options: CompactOptions, log: RunLog) -> dict[str, Any]:
+def _about(options: CompactOptions) -> dict[str, Any]:
     """Version, options, choices and notes; nothing that depends on the machine."""
     settings = to_schema(options.to_dict()) | {"checkpoint": Path(options.checkpoint).name}
     del settings["threads"]
-    choices = {name: value for name, value in log.choices.items() if name != "networks"}
-    return {"gsmerge": __version__, "options": settings, "choices": choices, "notes": list(log.notes)}
+    record = current_record()
+    choices = {name: value for name, value in record.choices.items() if name != "networks"}
+    return {"gsmerge": __version__, "options": settings, "choices": choices, "notes": list(record.notes)}

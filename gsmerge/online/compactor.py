@@ -11,7 +11,7 @@ from gsmerge.online.extend import BatchReport, extend
 from gsmerge.online.file import load_state, save_state
 from gsmerge.online.options import merge_settings
 from gsmerge.online.state import OnlineState
-from gsmerge.runtime.run_log import Progress
+from gsmerge.runtime.record import Progress
 from gsmerge.stages.fit import FitOptions
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 

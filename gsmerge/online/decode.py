@@ -11,9 +11,9 @@ from gsmerge.encoded.encoded import Encoded
 from gsmerge.errors import UsageError
 from gsmerge.online.photos import BatchPhotos
 from gsmerge.online.state import OnlineState, to_encoded
-from gsmerge.runtime.run_log import Progress, RunLog
+from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
-from gsmerge.stages.fit import FitOptions, FitReport, fit, start_share
+from gsmerge.stages.fit import FitOptions, FitReport, fit, report_steps, start_share
 from gsmerge.stages.prepare import Frame
 from gsmerge.types import Gaussians
 
@@ -74,20 +74,19 @@ def decode_stored(
     if options.fit == "none":
         return DecodeResult(decode_scene(encoded, k=k, budget=budget, threads=threads), None, plan.notes)
     assert isinstance(stored, OnlineState)
-    log = RunLog(progress)
     notes = plan.notes
     if options.photo_scale not in ("auto", 1):
         notes = *notes, f"photo_scale {options.photo_scale:g} is 1: a state stores its photos at the size of its views"
     max_count = int(plan.counts.sum())
     start_count = max(len(encoded), int(start_share(options) * max_count)) + encoded.num_kept
     canonical = replace(encoded, frame=Frame(np.zeros(3), 1.0))
-    with use_threads(threads):
+    with use_threads(threads), record_run(progress):
         gaussians = decode_scene(canonical, budget=start_count, threads=threads)
         images = stored.replay.images.astype(np.float32) / np.float32(255)
         replay = BatchPhotos(images, stored.cameras[stored.replay.views])
         photos = replay.photos(), replay.photos(2)
-        with log.stage("fit"):
-            gaussians, report = fit(gaussians, photos, options, max_count, seed, log.fit_progress)
+        with stage("fit"):
+            gaussians, report = fit(gaussians, photos, options, max_count, seed, report_steps)
     if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
         note = "the fit was not accepted: held-out parts of the photos did not get better"
         gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)

@@ -38,7 +38,7 @@ from gsmerge.online.state import (
 from gsmerge.options import CompactOptions, to_schema
 from gsmerge.pipeline import build, merge_views
 from gsmerge.render.photos import scene_pictures
-from gsmerge.runtime.run_log import Progress, RunLog
+from gsmerge.runtime.record import Progress, choose, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.search import choose_count
 from gsmerge.stages.fit import visible_mask
@@ -92,23 +92,22 @@ def extend(
     options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
     max_k = online.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
-    log = RunLog(progress)
-    with use_threads(options.threads):
+    with use_threads(options.threads), record_run(progress) as record:
         fixed = replace(options, fit=replace(options.fit, poses="fixed"))  # batches have to stay where the others are
-        prepared = prepare(scene.numpy(), fixed, log, None if state is None else state.frame)
+        prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
         require_children("max k", max_k, prepared.checkpoint)
         prepared = replace(prepared, limits=replace(prepared.limits, share=1.0))  # nothing grows here
-        count = choose_count(prepared, build, log)
+        count = choose_count(prepared, build)
         if prepared.keeps_all(count):
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
-        merged = merge_views(prepared, count, log)
-        state, counts = _add_batch(state, prepared, merged, online, max_k, log)
+        merged = merge_views(prepared, count)
+        state, counts = _add_batch(state, prepared, merged, online, max_k)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = to_schema(options.to_dict()) | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
     about = {"gsmerge": __version__, "options": stored, "batches": [*state.about.get("batches", []), numbers]}
     report = BatchReport(
-        **numbers, seconds=log.seconds, choices=log.choices, notes=tuple(log.notes), options=settings
+        **numbers, seconds=record.seconds, choices=record.choices, notes=tuple(record.notes), options=settings
     )  # fmt: skip
     return replace(state, about=about), report
 
@@ -119,7 +118,6 @@ def _add_batch(
     merged: MergedViews,
     online: OnlineOptions,
     max_k: int,
-    log: RunLog,
 ) -> tuple[OnlineState, dict[str, int]]:
     """The state with a batch in it, and what became of the batch's groups by key of the report."""
     scene, options = prepared.scene, prepared.options
@@ -128,16 +126,16 @@ def _add_batch(
     counts = {"num_new": len(merged.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
     features, rows = merged.features, np.zeros(0, np.int64)
     if state is not None:
-        with log.stage("cover"):
+        with stage("cover"):
             rows = rows_in_view(state.groups.features, photos.cameras)
             there = feature_to_gaussians(with_fitted_colors(select_groups(state.groups, rows)).features)
             novel = novel_rows(there, features, merged.members, photos.photos(2), scene.cameras, online)
             counts["num_covered"] = len(features) - len(novel)
             features = take(features, novel)
-    with log.stage("decode"):
+    with stage("decode"):
         new = bake(features, merged.members, merged.networks, max_k, options.encode.rule)
     ids = np.arange(len(photos)) if state is None else view_ids(state.cameras, photos.cameras)
-    with log.stage("join"):
+    with stage("join"):
         if state is None:
             state = _first_state(new, prepared, max_k)
         else:
@@ -148,9 +146,9 @@ def _add_batch(
         return state, counts
     groups = state.groups
     if options.fit.fit == "color":
-        with log.stage("fit"):
+        with stage("fit"):
             groups, report = fit_batch_colors(groups, photos, options.fit, options.seed)
-            log.choices["fit"] = asdict(report)
+            choose(fit=asdict(report))
     replay = update_replay(state.replay, photos, ids, len(state.cameras), online.replay)
     return replace(state, groups=groups, replay=replay), counts
 

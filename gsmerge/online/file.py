@@ -23,7 +23,7 @@ from gsmerge.online.options import merge_settings
 from gsmerge.online.state import GroupSet, OnlineState, Replay, from_encoded, with_child_rows
 from gsmerge.report import document_head, seconds_document
 from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.run_log import Progress
+from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.moments import Members
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import choose, note
 from gsmerge.stages.segment import AUTO_SHARE, SHARE
 from gsmerge.types import Cameras, FeatureGaussians, PixelScene, UnalignedScene
 
@@ -26,7 +26,7 @@ MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
 
 
 def choose_superpixels(
-    scene: PixelScene | UnalignedScene, members: Members | None, options: CompactOptions, log: RunLog
+    scene: PixelScene | UnalignedScene, members: Members | None, options: CompactOptions
 ) -> CompactOptions:
     """The options with a share of superpixels where they leave it to the scene.
 
@@ -34,7 +34,6 @@ def choose_superpixels(
         scene: The canonical scene.
         members: Its Gaussians, one per pixel; None for an unaligned scene, which gets the usual share.
         options: Of all stages.
-        log: Takes the choice and a note that says why.
     """
     if options.segment.superpixels != AUTO_SHARE:
         return options
@@ -44,8 +43,8 @@ def choose_superpixels(
         wrong = contradicted_share(scene, members)
         share = min(MOST, max(FEWEST, MOST * (1 - wrong / WRONG)))
         text, why = f"{100 * share:.2g}%", f"other views see through {100 * wrong:.0f} % of the pixels"
-        log.choices["superpixels"] = {"share": share, "contradicted": wrong}
-    log.notes.append(f"superpixels: {text} of the pixels, because {why}")
+        choose(superpixels={"share": share, "contradicted": wrong})
+    note(f"superpixels: {text} of the pixels, because {why}")
     return replace(options, segment=replace(options.segment, superpixels=text))
 
 

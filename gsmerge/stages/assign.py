@@ -21,7 +21,7 @@ from gsmerge.kernels.raster.project import TILE
 from gsmerge.moments import Members, pool_members, unaligned_members
 from gsmerge.render import ViewPlan, contributions, plan_view, prepare, render
 from gsmerge.render.plan import MAX_SIZE
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.decode import DecodeOptions, decode
 from gsmerge.stages.encode import from_moments
@@ -77,14 +77,13 @@ def assign_members(scene: PixelScene | UnalignedScene, groups: Groups, options: 
 
 
 def split_unseen(
-    scene: UnalignedScene, options: CompactOptions, log: RunLog
+    scene: UnalignedScene, options: CompactOptions
 ) -> tuple[UnalignedScene, CompactOptions, Gaussians | None]:
     """With ``unseen="keep"``: the scene that some view sees, and the rest merged among neighbours at the same rate.
 
     Args:
         scene: The canonical scene.
         options: All settings.
-        log: Takes a note of it.
 
     Returns:
         The seen scene, the options with the rest of the budget, the merged unseen Gaussians or None.
@@ -94,7 +93,7 @@ def split_unseen(
     weights = seen_weights(scene)
     seen = (weights > 0) & (weights >= options.contribution.min_owner_weight)
     num_unseen = int((~seen).sum())
-    log.notes.append(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
+    note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
     if num_unseen in (0, len(seen)):
         return scene, options, None
     count = exact_count(options.budget, len(seen), scene.gaussians.sh_degree)

@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.render import render
 from gsmerge.render.photos import photo_errors, photos_of, scene_pictures
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.place_cameras import sampled
 from gsmerge.types import PixelScene, UnalignedScene
@@ -41,18 +41,15 @@ CLOSEST = 0.995  # correlation above which photos are equally good
 NAMED = 4  # views that the note names
 
 
-def leave_out_photos(
-    scene: Scene, options: CompactOptions, log: RunLog
-) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
+def leave_out_photos(scene: Scene, options: CompactOptions) -> tuple[Scene, CompactOptions, tuple[int, ...]]:
     """The scene without the photos that do not show it, whose place the Gaussians' own colours take.
 
-    Where they are most, there are no photos, no fit, and nothing that is known to be sky. The log gets a note and the
-    choice ``photos_left_out``.
+    Where they are most, there are no photos, no fit, and nothing that is known to be sky. The record gets a note and
+    the choice ``photos_left_out``.
 
     Args:
         scene: Canonical.
         options: Of all stages.
-        log: Takes the note.
 
     Returns:
         The scene, the options, and the views whose photos a fit may use.
@@ -62,17 +59,17 @@ def leave_out_photos(
     if not odd or scene.images is None:
         return scene, options, views
     names = [scene.names[view] for view in odd]
-    log.choices["photos_left_out"] = names
+    choose(photos_left_out=names)
     more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
     which = ", ".join(names[:NAMED]) + more
     problem = f"{len(odd)} of {len(views)} photos do not show what the Gaussians show"
     if 2 * len(odd) > len(views):
-        log.notes.append(f"{problem}, so none is used and nothing is fitted: {which}; check their names and order")
+        note(f"{problem}, so none is used and nothing is fitted: {which}; check their names and order")
         if options.clean.drop_sky:
-            log.notes.append("drop_sky: no photo is used that could say where the sky is, so it stays")
+            note("drop_sky: no photo is used that could say where the sky is, so it stays")
         fit, clean = replace(options.fit, fit="none"), replace(options.clean, drop_sky=False)
         return replace(scene, images=None, large_photos=None), replace(options, fit=fit, clean=clean), views
-    log.notes.append(f"{problem} and are not used: {which}")
+    note(f"{problem} and are not used: {which}")
     images = scene.images.copy()
     images[odd] = _own_pictures(scene, odd)
     return replace(scene, images=images), options, tuple(view for view in views if view not in odd)

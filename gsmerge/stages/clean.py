@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import Record, add_seconds, adopt, choose, note, record_part
+from gsmerge.stages.fit import Fitted
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, PixelScene, UnalignedScene
 
@@ -29,7 +30,7 @@ MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count; more than it by so much 
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
 SIZES = {"sphere": 4, "box": 6}  # numbers of a crop
 
-Make = Callable[[int | None, RunLog], Gaussians]
+Make = Callable[[int | None], Fitted]
 ToWorld = Callable[[Gaussians], Gaussians]
 Scene = PixelScene | UnalignedScene
 Counts = dict[str, int]
@@ -155,9 +156,7 @@ def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: T
     return gaussians, counts
 
 
-def make_clean(
-    make: Make, count: int | None, options: CleanOptions, scene: Scene, to_world: ToWorld, log: RunLog
-) -> Gaussians:
+def make_clean(make: Make, count: int | None, options: CleanOptions, scene: Scene, to_world: ToWorld) -> Fitted:
     """Gaussians after clean-up: exactly ``count`` of them, unless the whole scene does not hold so many.
 
     Args:
@@ -166,7 +165,6 @@ def make_clean(
         options: What is left out.
         scene: In the canonical frame, as all Gaussians are; its own say how many a crop is likely to leave.
         to_world: From that frame to the world's.
-        log: Takes seconds, counts and notes.
 
     Raises:
         UsageError: If the crop holds none of the scene.
@@ -179,25 +177,27 @@ def make_clean(
         raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
     if count is not None:
         asked = min(most, math.ceil(SURPLUS * count / share))
-    best: tuple[Gaussians, dict[str, int], RunLog] | None = None
+    best: tuple[Fitted, dict[str, int], Record] | None = None
     for _ in range(MAX_BUILDS):
-        own = RunLog(log.progress)
-        gaussians, counts = clean(make(asked, own), options, scene, to_world)
-        for name, value in own.seconds.items():
-            log.seconds[name] = log.seconds.get(name, 0.0) + value
-        if best is None or count is None or len(best[0]) < len(gaussians):
-            best = gaussians, counts, own
+        with record_part() as own:
+            made = make(asked)
+            gaussians, counts = clean(made.gaussians, options, scene, to_world)
+        add_seconds(own.seconds)
+        if best is None or count is None or len(best[0].gaussians) < len(gaussians):
+            best = replace(made, gaussians=gaussians), counts, own
         if count is None or asked is None or len(gaussians) >= count or asked == most:
             break
         asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
     assert best is not None
-    gaussians, counts, own = best
+    fitted, counts, own = best
+    gaussians = fitted.gaussians
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
-    log.choices |= own.choices | {"clean": counts}
-    log.viewmats = own.viewmats
-    log.notes += [*own.notes, *_clean_notes(counts, len(gaussians), count)]
-    return gaussians
+    adopt(own)
+    choose(clean=counts)
+    for text in _clean_notes(counts, len(gaussians), count):
+        note(text)
+    return replace(fitted, gaussians=gaussians)
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.render import contributions, plan_view, prepare, render
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, UnalignedScene
 
@@ -24,8 +24,8 @@ CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 
 
-def add_views(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
-    """The finite Gaussians, and cameras where there are none; ``log.notes`` says what was done.
+def add_views(scene: UnalignedScene) -> UnalignedScene:
+    """The finite Gaussians, and cameras where there are none; a note says what was done.
 
     Raises:
         ValueError: If there is no finite Gaussian.
@@ -38,21 +38,21 @@ def add_views(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
     if count == len(g):
         raise ValueError("expected at least one finite Gaussian, got none")
     if count:
-        log.notes.append(f"{count} Gaussians are not finite and were left out")
+        note(f"{count} Gaussians are not finite and were left out")
         scene = replace(scene, gaussians=g[finite])
     if len(scene) == 0:
         cameras = place_cameras(scene.gaussians)
         names = tuple(f"placed {view}" for view in range(len(cameras)))
         scene = UnalignedScene(scene.gaussians, cameras, None, names)
-        log.notes.append(f"no cameras: {len(cameras)} placed around and inside the scene, where they show most of it")
+        note(f"no cameras: {len(cameras)} placed around and inside the scene, where they show most of it")
     return scene
 
 
-def add_pictures(scene: UnalignedScene, log: RunLog) -> UnalignedScene:
+def add_pictures(scene: UnalignedScene) -> UnalignedScene:
     """The canonical scene with renders of its own in place of photos where it has none."""
     if scene.images is not None:
         return scene
-    log.notes.append("no photos: views rendered from the scene itself stand in for them")
+    note("no photos: views rendered from the scene itself stand in for them")
     return replace(scene, images=render(scene.gaussians, scene.cameras).images.clip(0, 1))
 
 

@@ -19,7 +19,7 @@ from gsmerge.errors import UsageError
 from gsmerge.geometry import lower_median, project
 from gsmerge.moments import Members, scene_members
 from gsmerge.render.photos import scene_pictures
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import note, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.agreement import choose_superpixels
 from gsmerge.stages.align_views import align_views
@@ -192,18 +192,12 @@ class PreparedScene:
         choose = report_views if self.options.budget.target_psnr is None else scored_views
         return [candidates[i] for i in choose(len(candidates))]
 
-    def with_cameras(self, viewmats: np.ndarray | None) -> PreparedScene:
-        """The same with cameras where a fit moved them, which stay there.
-
-        Args:
-            viewmats: Canonical poses of the photos that the fit used; None: it moved none.
-        """
-        if viewmats is None:
+    def with_cameras(self, cameras: Cameras) -> PreparedScene:
+        """Replace the canonical cameras by those of a fit, and keep them fixed; the scene's own change nothing."""
+        if cameras is self.scene.cameras:
             return self
-        cameras, fixed = self.scene.cameras, replace(self.options.fit, poses="fixed")
-        poses = cameras.viewmats.astype(np.float64)
-        poses[list(self.photo_views)] = viewmats
-        scene = replace(self.scene, cameras=replace(cameras, viewmats=poses))
+        fixed = replace(self.options.fit, poses="fixed")
+        scene = replace(self.scene, cameras=cameras)
         return replace(self, scene=scene, options=replace(self.options, fit=fixed), moved=True)
 
     def final_cameras(self) -> Cameras:
@@ -228,15 +222,12 @@ class PreparedScene:
         return count is not None and isinstance(self.scene, UnalignedScene) and count >= len(self.scene.gaussians)
 
 
-def prepare(
-    scene: PixelScene | UnalignedScene, settings: CompactOptions, log: RunLog, frame: Frame | None = None
-) -> PreparedScene:
+def prepare(scene: PixelScene | UnalignedScene, settings: CompactOptions, frame: Frame | None = None) -> PreparedScene:
     """Everything that is known before superpixels are chosen.
 
     Args:
         scene: As given.
         settings: Of all stages.
-        log: Takes the seconds, and notes on what was missing and what stands in for it.
         frame: Canonical frame; None: the scene's own.
 
     Raises:
@@ -249,27 +240,28 @@ def prepare(
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     if scene.images is None and settings.clean.drop_sky:
         raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
-    with log.stage("prepare"):
-        own, options, repeated = drop_repeats(scene, settings, log)
+    with stage("prepare"):
+        own, options, repeated = drop_repeats(scene, settings)
         if scene.images is None:  # nothing says where cameras belong
             options = replace(options, fit=replace(options.fit, poses="fixed"))
         canonical: PixelScene | UnalignedScene
         members, hidden, moved = None, None, False
         if isinstance(own, PixelScene):
             aligned_scene, frame = canonicalise(own, frame)
-            aligned_scene, options, shown = leave_out_photos(aligned_scene, options, log)
+            aligned_scene, options, shown = leave_out_photos(aligned_scene, options)
             canonical, options = move_wrong_views(aligned_scene, options, shown)
             members, moved = scene_members(canonical), canonical is not aligned_scene
         else:
-            unaligned, frame = canonicalise(add_views(own, log), frame)
-            unaligned, options, shown = leave_out_photos(unaligned, options, log)
-            unaligned, options, hidden = split_unseen(unaligned, options, log)
-            canonical = add_pictures(unaligned, log)
+            unaligned, frame = canonicalise(add_views(own), frame)
+            unaligned, options, shown = leave_out_photos(unaligned, options)
+            unaligned, options, hidden = split_unseen(unaligned, options)
+            canonical = add_pictures(unaligned)
         photos, aligned = scene.images is not None, isinstance(scene, PixelScene)
         name = options.networks(photos=photos, aligned=aligned)
         checkpoint, notes = find_networks(name, options)
-        log.notes += notes
-        options = choose_superpixels(canonical, members, options, log)
+        for text in notes:
+            note(text)
+        options = choose_superpixels(canonical, members, options)
         limits, pictures = count_limits(canonical, options), scene_pictures(canonical)
         pixels = max(1, len(canonical) * canonical.pixels_per_view)
         options = replace(options, fit=options.fit.with_steps_for((limits.count or limits.default) / pixels))
@@ -279,7 +271,7 @@ def prepare(
     )  # fmt: skip
     if settings.method != "gsmerge" or not (options.needs_tree or limits.count is not None):
         return prepared
-    with log.stage("segment"):
+    with stage("segment"):
         return with_tree(prepared)
 
 
@@ -341,7 +333,7 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
 
 
 def drop_repeats(
-    scene: PixelScene | UnalignedScene, options: CompactOptions, log: RunLog
+    scene: PixelScene | UnalignedScene, options: CompactOptions
 ) -> tuple[PixelScene | UnalignedScene, CompactOptions, tuple[int, ...]]:
     """The scene with every view once, the options with budgets that stay shares of the whole, and places of views."""
     views, places = distinct_views(scene)
@@ -351,5 +343,5 @@ def drop_repeats(
     count = exact_count(options.budget, scene.num_gaussians, scene.gaussians.sh_degree)
     if count is not None:
         options = replace(options, budget=replace(options.budget, budget=min(count, few.num_gaussians)))
-    log.notes.append(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
+    note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
     return few, options, tuple(places)

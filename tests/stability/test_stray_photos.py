@@ -11,7 +11,6 @@ import pytest
 import scenes
 
 from gsmerge import CompactResult, Gaussians, PixelScene, UnalignedScene, compact
-from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.check_photos import odd_photos
 from gsmerge.stages.fit import FitOptions, fit_photos
 
@@ -202,7 +201,7 @@ def test_no_note_on_good_photos(unspoilt: CompactResult) -> None:
 
 
 def test_the_views_of_a_fit(room: PixelScene) -> None:
-    full, half = fit_photos(room, FitOptions(), RunLog(), (0, 2, 5))
+    full, half = fit_photos(room, FitOptions(), (0, 2, 5))
     assert room.images is not None
     np.testing.assert_array_equal(full.images, room.images[[0, 2, 5]])
     assert len(half) == 3

@@ -8,7 +8,7 @@ import scenes
 import torch
 
 from gsmerge import CompactOptions, PixelScene, compact
-from gsmerge.runtime.run_log import STAGES
+from gsmerge.runtime.record import STAGES
 from gsmerge.stages.segment import SEGMENTATIONS
 
 USUAL = [stage for stage in STAGES if stage not in ("curve", "reduce", "members", "refine", "cover", "choose", "join")]

@@ -15,7 +15,7 @@ from gsmerge.research.charts.record import HIGHER_IS_BETTER, INPUT, RunRecord
 from gsmerge.research.charts.run import SCORING
 from gsmerge.research.charts.series import Getter, Line, Point
 from gsmerge.research.charts.statistics import Verdict, judge, paired_intervals
-from gsmerge.runtime.run_log import STAGES
+from gsmerge.runtime.record import STAGES
 
 RATIOS = (0.0045, 0.22)  # of the points of baselines that are compared: 0.5 % to 20 %, with room for rounding
 SAME_COUNT = 0.01  # counts that differ by less than this share are drawn once

@@ -2,7 +2,10 @@
 
 from gsmerge.stages.fit.options import Fit, FitOptions, LearningRates
 from gsmerge.stages.fit.photos import fit_photos
-from gsmerge.stages.fit.report import FitReport
+from gsmerge.stages.fit.report import FitReport, Fitted, record_fit, report_steps
 from gsmerge.stages.fit.stage import fit, start_share, visible_mask
 
-__all__ = ["Fit", "FitOptions", "FitReport", "LearningRates", "fit", "fit_photos", "start_share", "visible_mask"]
+__all__ = [
+    "Fit", "FitOptions", "FitReport", "Fitted", "LearningRates", "fit", "fit_photos", "record_fit", "report_steps",
+    "start_share", "visible_mask",
+]  # fmt: skip

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from gsmerge.render.photos import EPS2D, Photos, scene_photos
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.stages.fit.options import FitOptions
 from gsmerge.types import PixelScene, UnalignedScene
@@ -19,24 +19,24 @@ ALIKE = 0.01  # of the scale: the rounding of sizes
 
 
 def fit_photos(
-    scene: PixelScene | UnalignedScene, options: FitOptions, log: RunLog, views: Sequence[int] | None = None
+    scene: PixelScene | UnalignedScene, options: FitOptions, views: Sequence[int] | None = None
 ) -> tuple[Photos, ...]:
     """The photos at full and at half size, and at the scale of the options where they look at larger ones.
 
-    Those of ``views``, None: of all. The log's choices get ``photo_scale`` where it is not 1, its notes what differs
-    from what was asked for.
+    Those of ``views``, None: of all. The record gets the choice ``photo_scale`` where it is not 1, and a note on what
+    differs from what was asked for.
     """
     views = range(len(scene)) if views is None else views
     photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
     scale, problem = photo_scale(scene, options)
     if problem is not None:
-        log.notes.append(problem)
+        note(problem)
     if scale == 1:
         return photos
     large = large_photos(scene, scale)[views]
     size = f"{large.width} x {large.height}"
-    log.choices["photo_scale"] = round(scale, 4)
-    log.notes.append(
+    choose(photo_scale=round(scale, 4))
+    note(
         f"the photos are larger than the views of {photos[0].width} x {photos[0].height}: the fit looks at them at"
         f" {size} as well, which takes time; --photo-scale 1 does without"
     )

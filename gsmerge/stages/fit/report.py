@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
+
+from gsmerge.runtime.record import choose, note, report_progress
+from gsmerge.types import Cameras, Gaussians
 
 
 @dataclass(frozen=True)
@@ -28,3 +31,34 @@ class FitReport:
     holdout_after: float
     stopped: str
     viewmats: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Gaussians after the fit.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        cameras: The scene's cameras, canonical, moved where the fit moved them.
+        report: What the fit did; None where nothing was fitted.
+    """
+
+    gaussians: Gaussians
+    cameras: Cameras
+    report: FitReport | None
+
+
+def record_fit(report: FitReport | None) -> None:
+    """Add what a fit did to the current record; None: nothing was fitted."""
+    if report is None:
+        return
+    numbers = asdict(report)
+    del numbers["viewmats"]
+    choose(fit=numbers)
+    if not report.accepted:
+        note("the fit was not accepted: held-out parts of the photos did not get better")
+
+
+def report_steps(step: int, steps: int, photos: float, held_out: float) -> None:
+    """Report a step of the fit and the PSNR (dB) of the photos and of their held-out blocks."""
+    report_progress(f"fit: photos {photos:.1f} dB, held out {held_out:.1f} dB", step, steps)

@@ -12,7 +12,7 @@ import gsmerge
 from gsmerge import PixelScene
 from gsmerge.moments import scene_members
 from gsmerge.options import CompactOptions
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import record_run
 from gsmerge.stages.agreement import choose_superpixels, contradicted_share, weaken_contradicted
 from gsmerge.stages.encode import EncodeOptions, encode
 from gsmerge.types import Groups
@@ -60,8 +60,8 @@ def test_share_that_other_views_see_through(wall: PixelScene) -> None:
 def test_views_that_agree_get_more_superpixels(wall: PixelScene) -> None:
     shares = []
     for scene in (wall, with_nearer_half(wall, [1]), with_nearer_half(wall, [0, 2])):
-        log = RunLog(None)
-        options = choose_superpixels(scene, scene_members(scene), AUTO, log)
+        with record_run() as log:
+            options = choose_superpixels(scene, scene_members(scene), AUTO)
         shares.append(options.segment.share)
         assert log.choices["superpixels"]["share"] == pytest.approx(options.segment.share, rel=0.05)
         assert len(log.notes) == 1
@@ -72,8 +72,8 @@ def test_views_that_agree_get_more_superpixels(wall: PixelScene) -> None:
 def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: PixelScene) -> None:
     alone = scenes.take_views(wall, [0])
     for scene, members in ((alone, scene_members(alone)), (wall, None)):
-        log = RunLog(None)
-        assert choose_superpixels(scene, members, AUTO, log).segment == CompactOptions().segment
+        with record_run() as log:
+            assert choose_superpixels(scene, members, AUTO).segment == CompactOptions().segment
         assert "cannot be compared" in log.notes[0]
         assert "superpixels" not in log.choices
 

@@ -9,7 +9,6 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, PixelScene
-from gsmerge.runtime.run_log import RunLog
 from gsmerge.stages.group import default_count, largest_count, segment_scene
 from gsmerge.stages.prepare import PreparedScene, prepare
 
@@ -22,7 +21,7 @@ def scene() -> PixelScene:
 
 
 def prepared_scene(scene: PixelScene, **settings: object) -> PreparedScene:
-    return prepare(scene, CompactOptions().with_settings({"fit": "none", "robust": False} | settings), RunLog())
+    return prepare(scene, CompactOptions().with_settings({"fit": "none", "robust": False} | settings))
 
 
 def test_gaussians_follow_the_number_of_superpixels(scene: PixelScene) -> None:

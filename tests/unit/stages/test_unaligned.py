@@ -10,7 +10,7 @@ import scenes
 from gsmerge import CompactOptions, PixelScene, UnalignedScene, compact
 from gsmerge.errors import UsageError
 from gsmerge.moments import scene_members, unaligned_members
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import record_run
 from gsmerge.stages.assign import (
     ContributionOptions,
     Owners,
@@ -129,13 +129,13 @@ def test_density_is_of_the_gaussians_where_those_are_fewer(room: PixelScene) -> 
 
 def test_unknown_cameras_are_placed(room: PixelScene) -> None:
     blind = UnalignedScene(room.gaussians, loose.NO_CAMERAS, None, ())
-    log = RunLog()
-    whole = add_views(blind, log)
+    with record_run() as log:
+        whole = add_views(blind)
     assert len(whole) == len(whole.names) >= 1
     assert len(log.notes) == 1
     assert "no cameras" in log.notes[0]
-    log = RunLog()
-    prepared = prepare(blind, CompactOptions(), log)
+    with record_run() as log:
+        prepared = prepare(blind, CompactOptions())
     assert prepared.scene.images is not None
     assert prepared.scene.images.min() >= 0
     assert prepared.scene.images.max() <= 1
@@ -143,7 +143,7 @@ def test_unknown_cameras_are_placed(room: PixelScene) -> None:
 
 
 def test_placed_cameras_see_most(room: PixelScene) -> None:
-    blind = add_views(UnalignedScene(room.gaussians, loose.NO_CAMERAS, None, ()), RunLog())
+    blind = add_views(UnalignedScene(room.gaussians, loose.NO_CAMERAS, None, ()))
     groups = Groups(np.zeros((len(blind), blind.cameras.height, blind.cameras.width), np.int32), (1,) * len(blind))
     owners = find_owners(blind, groups, near=1e-3)
     assert (owners.values > 0).mean() > 0.8
@@ -181,6 +181,6 @@ def test_nothing_seen_at_all(room: PixelScene) -> None:
 
 
 def test_members_of_a_grid_need_no_pixels(room: PixelScene) -> None:
-    members = prepare(room, CompactOptions(), RunLog()).members
+    members = prepare(room, CompactOptions()).members
     assert members is not None
     assert members.pixels is None

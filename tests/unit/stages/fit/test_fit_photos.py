@@ -13,7 +13,7 @@ import scenes
 from gsmerge import Gaussians, PixelScene, compact
 from gsmerge.geometry import project
 from gsmerge.render.photos import EPS2D, photo_psnr
-from gsmerge.runtime.run_log import RunLog
+from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.fit import FitOptions, fit, fit_photos
 from gsmerge.stages.fit.full import affordable_steps, fit_full, plan_run
@@ -71,8 +71,8 @@ def test_scale_is_chosen(scene: PixelScene, larger: float, settings: dict[str, A
 def test_less_than_asked_for_is_said(
     scene: PixelScene, larger: float, settings: dict[str, Any], expected: float, reason: str
 ) -> None:
-    log = RunLog()
-    photos = fit_photos(with_large(scene, larger), FitOptions(**settings), log)
+    with record_run() as log:
+        photos = fit_photos(with_large(scene, larger), FitOptions(**settings))
     assert len(photos) == (3 if expected > 1 else 2)
     assert log.notes[0].startswith(reason)
     assert log.choices.get("photo_scale", 1) == pytest.approx(expected, rel=0.02)
@@ -134,7 +134,7 @@ def test_some_views_have_their_own_photos(scene: PixelScene) -> None:
 
 def test_steps_look_at_half_full_and_larger_photos(scene: PixelScene) -> None:
     options = FitOptions(fit_steps=200)
-    plan = plan_run(fit_photos(with_large(scene, 2), options, RunLog()), options, 0)
+    plan = plan_run(fit_photos(with_large(scene, 2), options), options, 0)
     levels = [plan.level_at(step + 1, step / 200) for step in range(200)]
     assert [levels.count(level) for level in (1, 0, 2)] == [120, 48, 32]
     assert levels[:120] == [1] * 120
@@ -144,20 +144,18 @@ def test_steps_look_at_half_full_and_larger_photos(scene: PixelScene) -> None:
 
 def test_the_users_share_of_half_size_steps_stays(scene: PixelScene) -> None:
     options = FitOptions(half_res_share=0.8)
-    assert plan_run(fit_photos(with_large(scene, 2), options, RunLog()), options, 0).half_part == 0.8
+    assert plan_run(fit_photos(with_large(scene, 2), options), options, 0).half_part == 0.8
 
 
 def test_large_photos_count_in_every_pixel(scene: PixelScene) -> None:
-    plan = plan_run(fit_photos(with_large(scene, 2), LONG, RunLog()), LONG, 0)
+    plan = plan_run(fit_photos(with_large(scene, 2), LONG), LONG, 0)
     assert all((weight == 1).all() for weight in plan.step_weights[2])
 
 
 def test_time_budget_counts_larger_photos(scene: PixelScene) -> None:
     options = replace(LONG, time_budget=1.0)
     steps = [
-        affordable_steps(
-            0.06, plan_run(fit_photos(with_large(scene, s), replace(options, photo_scale=s), RunLog()), o, 0)
-        )
+        affordable_steps(0.06, plan_run(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o, 0))
         for s, o in ((1, replace(options, half_res_share=0.6)), (2, options), (3, options))
     ]
     assert steps[0] > steps[1] > steps[2]
@@ -167,9 +165,7 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: PixelScene) 
     large, start = with_large(scene, 2), scenes.spoil(truth)
     near = large_photos(large, 2)
     near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
-    usual, sharp = (
-        fit_full(start, fit_photos(large, replace(LONG, photo_scale=scale), RunLog()), LONG)[0] for scale in (1, 2)
-    )
+    usual, sharp = (fit_full(start, fit_photos(large, replace(LONG, photo_scale=scale)), LONG)[0] for scale in (1, 2))
     assert scenes.identical(usual, fit_full(start, scenes.pair_of(scene), LONG)[0])
     views = range(len(near))
     assert photo_psnr(sharp, near, views) > photo_psnr(usual, near, views) + 0.3
@@ -179,7 +175,7 @@ def test_result_does_not_depend_on_threads(truth: Gaussians, scene: PixelScene) 
     results, start = [], scenes.spoil(truth)
     for threads in (1, 3):
         with use_threads(threads):
-            photos = fit_photos(with_large(scene, 2), LONG, RunLog())
+            photos = fit_photos(with_large(scene, 2), LONG)
             results.append(fit(start, photos, LONG, count=len(start) + 20)[0])
     assert scenes.identical(*results)
 

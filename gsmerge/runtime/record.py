@@ -1,0 +1,116 @@
+"""The record of a run: seconds of each stage, choices, notes for the user, and progress.
+
+It is ambient. A run begins one with :func:`record_run`; whatever works within the run writes to it by
+:func:`stage`, :func:`note` and :func:`choose`, on the thread that began it. Outside of any run these do nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any
+
+from gsmerge.runtime.memory import release_memory
+
+Progress = Callable[[str, int, int], None]
+# stages that leave much behind that was freed in other threads
+RELEASED = ("prepare", "segment", "encode", "robust", "match", "refine", "close", "choose", "fit")
+STAGES = (
+    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "close",
+    "cover", "decode", "choose", "join", "fit", "score", "input",
+)  # fmt: skip
+
+
+@dataclass
+class Record:
+    """What a run did so far."""
+
+    progress: Progress | None = None  # Called with (stage, done, total)
+    seconds: dict[str, float] = field(default_factory=dict)  # Wall time of each stage
+    choices: dict[str, Any] = field(default_factory=dict)  # What the stages decided
+    notes: list[str] = field(default_factory=list)  # Warnings and adaptations, one sentence each
+    running: str | None = None  # The stage that is being timed
+
+
+_current: ContextVar[Record | None] = ContextVar("record", default=None)
+
+
+@contextmanager
+def record_run(progress: Progress | None = None) -> Iterator[Record]:
+    """Begin a record, to which everything in the block reports."""
+    record = Record(progress)
+    token = _current.set(record)
+    try:
+        yield record
+    finally:
+        _current.reset(token)
+
+
+def current_record() -> Record:
+    """Return the record of the current run; an empty one outside of any."""
+    return _current.get() or Record()
+
+
+@contextmanager
+def record_part(*, silent: bool = False) -> Iterator[Record]:
+    """Begin a record of its own for a part of the current run; ``silent``: without its progress."""
+    outer = _current.get()
+    with record_run(None if silent or outer is None else outer.progress) as record:
+        yield record
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Time a block, or a function that this decorates, as one of ``STAGES``; inside another stage, as part of that."""
+    record = _current.get()
+    if record is None or record.running is not None:
+        yield
+        return
+    report_progress(name, STAGES.index(name), len(STAGES))
+    record.running, start = name, time.perf_counter()
+    try:
+        yield
+    finally:
+        record.running = None
+        if name in RELEASED:
+            release_memory()
+        add_seconds({name: time.perf_counter() - start})
+
+
+def note(text: str) -> None:
+    """Add a sentence for the user to the current record."""
+    record = _current.get()
+    if record is not None:
+        record.notes.append(text)
+
+
+def choose(**choices: Any) -> None:
+    """Add what a stage decided to the current record, by name."""
+    record = _current.get()
+    if record is not None:
+        record.choices |= choices
+
+
+def add_seconds(seconds: Mapping[str, float]) -> None:
+    """Add the wall time of stages to the current record, by name."""
+    record = _current.get()
+    if record is not None:
+        for name, value in seconds.items():
+            record.seconds[name] = record.seconds.get(name, 0.0) + value
+
+
+def adopt(part: Record) -> None:
+    """Take the choices and notes of a part of the current run over into its record."""
+    choose(**part.choices)
+    for text in part.notes:
+        note(text)
+
+
+def report_progress(text: str, done: int, total: int) -> None:
+    """Report a stage, or a step of one as ``"stage: detail"``, to whoever watches the current run."""
+    record = _current.get()
+    if record is not None and record.progress is not None:
+        record.progress(text, done, total)

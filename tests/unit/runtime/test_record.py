@@ -1,0 +1,92 @@
+"""The ambient record: what is written where, and that nothing is lost or counted twice."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from gsmerge.runtime.record import (
+    STAGES,
+    adopt,
+    choose,
+    current_record,
+    note,
+    record_part,
+    record_run,
+    report_progress,
+    stage,
+)
+
+
+def test_nothing_is_recorded_outside_of_a_run() -> None:
+    with stage("fit"):
+        note("lost")
+        choose(count=1)
+    assert current_record().notes == []
+    assert current_record().seconds == {}
+
+
+def test_stages_notes_and_choices_go_to_the_current_run() -> None:
+    @stage("encode")
+    def encode() -> int:
+        note("odd")
+        choose(groups=3)
+        return 3
+
+    events: list[tuple[str, int, int]] = []
+    with record_run(lambda *event: events.append(event)) as record:
+        assert encode() == encode() == 3
+        report_progress("fit: step", 1, 2)
+    assert list(record.seconds) == ["encode"]
+    assert record.notes == ["odd", "odd"]
+    assert record.choices == {"groups": 3}
+    assert events == [("encode", STAGES.index("encode"), len(STAGES))] * 2 + [("fit: step", 1, 2)]
+
+
+def test_a_stage_inside_another_is_part_of_it() -> None:
+    with record_run() as record, stage("prepare"), stage("segment"):
+        pass
+    assert list(record.seconds) == ["prepare"]
+
+
+def test_a_stage_that_fails_ends() -> None:
+    with record_run() as record:
+        with pytest.raises(KeyError), stage("prepare"):
+            raise KeyError
+        with stage("segment"):
+            pass
+    assert list(record.seconds) == ["prepare", "segment"]
+
+
+def test_a_part_has_a_record_of_its_own_until_it_is_adopted() -> None:
+    events: list[str] = []
+    with record_run(lambda text, *_: events.append(text)) as record:
+        note("first")
+        with record_part() as part, stage("fit"):
+            note("second")
+            choose(steps=2)
+        with record_part(silent=True), stage("decode"):
+            pass
+        assert record.notes == ["first"]
+        assert record.seconds == {}
+        adopt(part)
+    assert record.notes == ["first", "second"]
+    assert record.choices == {"steps": 2}
+    assert events == ["fit"]
+
+
+def test_threads_of_the_caller_have_runs_of_their_own() -> None:
+    notes: list[list[str]] = []
+
+    def run() -> None:
+        with record_run() as own:
+            note("other")
+        notes.append(own.notes)
+
+    with record_run() as record:
+        thread = threading.Thread(target=run)
+        thread.start()
+        thread.join()
+    assert record.notes == []
+    assert notes == [["other"]]
