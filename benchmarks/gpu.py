@@ -31,7 +31,7 @@ from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.stages.prepare import prepare
 from gsmerge.types import PixelScene, UnalignedScene
 
-MERGING = {"fit": "none", "robust": False, "checkpoint": "none"}  # superpixels to Gaussians, with no photo looked at
+MERGING = {"fit": "none", "checkpoint": "none"}  # superpixels to Gaussians, with no photo looked at
 ALONE = ("prepare", "segment", "encode", "match", "decode")  # the stages of that
 MILLIONS = 2.0  # Gaussians that merging alone is said for, as in the literature
 

@@ -44,7 +44,7 @@ class Condition:
     learned: tuple[bool, ...] = (False, True)
 
 
-PLAIN = {"fit": "none", "robust": False}
+PLAIN = {"fit": "none"}
 BUDGET = {1: "4.4%", 2: "8.8%", 4: "17.6%"}
 ONE = {"budget": BUDGET[1]}
 GAIN = (

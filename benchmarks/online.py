@@ -1,7 +1,7 @@
 """Views that arrive in batches against all of them at once: growth, seconds per step, memory, quality.
 
 python benchmarks/online.py desk,carton                          # 84 views of each, in steps of 12
-python benchmarks/online.py eval --order cycle --whole color full  # every batch sees the whole scene; and in one go
+python benchmarks/online.py eval --order cycle --whole none full  # every batch sees the whole scene; and in one go
 
 Scenes have fewer views: they are repeated from jittered poses (benchmarks/many_views.py). Every run is a process of
 its own. Quality is that of held-out views, visible pixels.
@@ -72,7 +72,7 @@ def online(args: argparse.Namespace) -> dict:
         compactor.save(Path(folder) / "state.gsm")
         size = (Path(folder) / "state.gsm").stat().st_size
     results = {"steps": steps, "peak_GB": round(peak, 2), "state_MB": round(size / 1e6, 1)}
-    for fit, k in (("none", 1), ("none", 2), ("none", 4), ("color", 1), ("full", 1), ("full", 2), ("full", 4)):
+    for fit, k in (("none", 1), ("none", 2), ("none", 4), ("full", 1), ("full", 2), ("full", 4)):
         start = time.perf_counter()
         gaussians = compactor.decode(k=k, fit=fit)
         results[f"{fit} k{k}"] = _scored(gaussians, targets, time.perf_counter() - start, args.lpips)
@@ -86,7 +86,7 @@ def whole(args: argparse.Namespace, fit: str) -> dict:
     start = time.perf_counter()
     if fit == "input":
         return _scored(scene.gaussians, targets, 0.0, args.lpips)
-    result = gsmerge.compact(scene, fit=fit, checkpoint="none")
+    result = gsmerge.compact(scene, fit=fit)
     seconds = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return _scored(result.gaussians, targets, seconds, args.lpips) | {"peak_GB": round(peak, 2)}
@@ -105,9 +105,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=12, help="views of a batch")
     parser.add_argument("--order", choices=("trajectory", "cycle"), default="trajectory")
     parser.add_argument("--replay", type=int, default=96)
-    parser.add_argument(
-        "--whole", nargs="*", default=[], choices=("input", "none", "color", "full"), help="also in one go"
-    )
+    parser.add_argument("--whole", nargs="*", default=[], choices=("input", "none", "full"), help="also in one go")
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, see benchmarks/quality.py")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-online")
     parser.add_argument("--run", help=argparse.SUPPRESS)

@@ -155,16 +155,14 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(scales, MIN_SCALE), quats
 
 
-def to_gaussians(
-    covars: np.ndarray, extinctions: np.ndarray, spreads: np.ndarray, means: np.ndarray, sh: np.ndarray
-) -> Gaussians:
-    """Gaussians of given moments; opacity from the conserved optical depth over the (unspread) disc."""
+def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
+    """Gaussians of given moments; opacity from the conserved optical depth over the disc."""
     scales, quats = principal_axes(covars)
     opacities = 1 - np.exp(-extinctions / (scales[:, 1] * scales[:, 2]))
     return Gaussians(
         means=to_float32(means),
         quats=to_float32(quats),
-        scales=to_float32(scales * spreads[:, None]),
+        scales=to_float32(scales),
         opacities=np.clip(opacities, 0, MAX_OPACITY).astype(np.float32),
         sh0=sh[:, :1],
         shN=sh[:, 1:],
@@ -176,7 +174,6 @@ def feature_to_gaussians(features: FeatureGaussians) -> Gaussians:
     return to_gaussians(
         features.covars,
         features.extinctions.astype(np.float64) * features.gains,
-        features.spreads.astype(np.float64),
         features.means,
         np.concatenate([features.sh0, features.shN], 1),
     )

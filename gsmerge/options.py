@@ -8,8 +8,6 @@ from typing import Any
 
 from gsmerge.budget import BudgetOptions, new_settings
 from gsmerge.stages.assign import ContributionOptions
-from gsmerge.stages.backing import BackingOptions
-from gsmerge.stages.choose_merge import RobustOptions, photos_choose
 from gsmerge.stages.clean import CleanOptions
 from gsmerge.stages.decode import MIXED, DecodeOptions
 from gsmerge.stages.encode import EncodeOptions
@@ -19,7 +17,7 @@ from gsmerge.stages.region_tree import AllocateOptions
 from gsmerge.stages.segment import SegmentOptions
 
 METHODS = (
-    "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "moment-matching", "voxel", "opacity", "contribution",
+    "gsmerge", "unmerged", "unmerged-fit", "moment-matching", "voxel", "opacity", "contribution",
     "random", "blocks", "greedy", "splat-transform",
 )  # fmt: skip
 
@@ -28,7 +26,7 @@ CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
 # saliency seeds, networks whose outputs are absolute, matching by latents and boxes of the decoded geometry, no fit.
 RECIPES: Mapping[str, Mapping[str, Any]] = {
     "paper": {
-        "segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "robust": False, "fit": "none",
+        "segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "fit": "none",
         "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
     },
 }  # fmt: skip
@@ -45,8 +43,6 @@ class CompactOptions:
         allocate: How a budget is spread over the views.
         contribution: Gaussians that are not one per pixel.
         encode: How a group becomes one Gaussian.
-        robust: Choice among merges by the photos.
-        backing: The coarse layer that the choice may add.
         match: Merging across views.
         decode: Gaussians per group.
         fit: Fit to the photos.
@@ -72,8 +68,6 @@ class CompactOptions:
     allocate: AllocateOptions = field(default_factory=AllocateOptions)
     contribution: ContributionOptions = field(default_factory=ContributionOptions)
     encode: EncodeOptions = field(default_factory=EncodeOptions)
-    robust: RobustOptions = field(default_factory=RobustOptions)
-    backing: BackingOptions = field(default_factory=BackingOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     decode: DecodeOptions = field(default_factory=DecodeOptions)
     fit: FitOptions = field(default_factory=FitOptions)
@@ -123,15 +117,13 @@ class CompactOptions:
             return "none"
         short = not photos or self.fit.fit == "none" or (self.fit.fit == "full" and self.fit.steps <= SHORT_STEPS)
         hasty = self.fit.effort in ("draft", "fast")
-        return "shipped" if short and not hasty and not self.robust.robust and self.encode.rule == "depth" else "none"
+        return "shipped" if short and not hasty and self.encode.rule == "depth" else "none"
 
     def resolved(self, *, photos: bool) -> dict[str, Any]:
         """As :meth:`to_dict`, with the checkpoint and the matching that are used where nothing else was asked for."""
-        robust = photos_choose(self.robust.robust, self.fit.fit, self.fit.effort)
         return self.to_dict() | {
             "checkpoint": self.networks(photos=photos),
             "match": self.match.method,
-            "robust": robust,
         }
 
     def with_auto_steps(self) -> CompactOptions:

@@ -36,8 +36,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.search import Build, choose_count, level_counts, search_quality
 from gsmerge.stages.agreement import weaken_contradicted
 from gsmerge.stages.assign import assign_members
-from gsmerge.stages.backing import encode_backing
-from gsmerge.stages.choose_merge import choose_merge, choose_start, close_holes
+from gsmerge.stages.choose_start import choose_start
 from gsmerge.stages.clean import clean, make_clean
 from gsmerge.stages.decode import MIXED, decode_merged
 from gsmerge.stages.encode import encode
@@ -206,16 +205,9 @@ def merge_with(
     What it holds besides the scene is as large as the result, several times: nothing of it outlives this function.
     """
     scene, options = prepared.scene, prepared.options
-    robust = None
     with stage("encode"):
         features = encode(scene, members, segmentation.groups, options.encode, networks)
-    if prepared.limits.robust and (networks is None or options.robust.robust):  # networks stand in for the choice
-        with stage("robust"):
-            coarse = encode_backing(scene, members, segmentation.coarse, options.backing, features)
-            photos, aligned = scene_photos(scene, 2), isinstance(scene, PixelScene)
-            robust = choose_merge(features, coarse, photos, options.robust, leave_out=aligned)
-            features = robust.features
-    elif networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
+    if networks is None and options.encode.agreement and prepared.limits.share < 1:  # a long fit follows
         features = weaken_contradicted(features, members, scene.cameras)
     with stage("match"):
         matches = match(features, options.match, networks)
@@ -225,11 +217,7 @@ def merge_with(
     if networks is not None:
         with stage("refine"):
             merged = refine(merged, networks)
-    if robust is None:
-        return merged, choices
-    with stage("close"):
-        closed = close_holes(merged, replace(robust, features=merged), options.robust)
-    return closed.features, choices | closed.choices
+    return merged, choices
 
 
 def score(fitted: Fitted, prepared: PreparedScene) -> CompactResult:

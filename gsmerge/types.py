@@ -341,7 +341,6 @@ class Segmentation:
     """The superpixels of a scene and the number of Gaussians that they become."""
 
     groups: Groups  # Superpixels of every view
-    coarse: Groups | None  # Coarse ones for the backing layer; None: no such layer
     count: int  # Gaussians in the end; never more
     exact: bool  # Whether that number was asked for as such, and is to be met
 
@@ -369,19 +368,17 @@ class FeatureGaussians:
     masses: np.ndarray  # [g] opacity-weighted volume (paper eq. mass)
     extinctions: np.ndarray  # [g] optical depth integrated over the members' discs, world units squared
     gains: np.ndarray  # [g] factor on the optical depth: 1, or what the other views' photos say
-    spreads: np.ndarray  # [g] factor on the standard deviations at decoding
     sh0: np.ndarray  # [g,1,3] base colour
     shN: np.ndarray  # [g,k-1,3]
     footprints: np.ndarray  # [g] size of one pixel at the group's depth, world units
     views: np.ndarray  # [g] int64, the view of the group, -1 when it was merged from several
-    backing: np.ndarray  # [g] bool: belongs to the coarse layer behind the surfaces
     starts: np.ndarray  # [g+1] int64 into `members`
     members: np.ndarray  # [m] int32 rows of the scene's Gaussians, group by group: as many as they are, in every copy
     latents: Array  # [g,d] what the networks remember of the group (paper section 4.2), a tensor; without: d = 0
 
     def __post_init__(self) -> None:
         g = self.means.shape[0]
-        for name in ("weights", "masses", "extinctions", "gains", "spreads", "footprints", "views", "backing"):
+        for name in ("weights", "masses", "extinctions", "gains", "footprints", "views"):
             _expect(name, getattr(self, name), (g,))
         _expect("covars", self.covars, (g, 3, 3))
         _expect("starts", self.starts, (g + 1,))

@@ -14,7 +14,7 @@ from gsmerge.online.state import GroupSet, OnlineState
 from gsmerge.stages.merge import take
 from gsmerge.types import SH_C0, Gaussians
 
-FAST: dict[str, Any] = {"superpixels": "10%", "robust": False, "checkpoint": "none"}
+FAST: dict[str, Any] = {"superpixels": "10%", "checkpoint": "none"}
 
 
 def room(num_views: int = 6, width: int = 36, height: int = 24, **settings: Any) -> PixelScene:

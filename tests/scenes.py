@@ -298,7 +298,7 @@ def compacted(scene: PixelScene, **settings: Any) -> CompactResult:
 
 def plain(scene: PixelScene, **settings: Any) -> Gaussians:
     """The merge alone: no choice by photos, no networks, no fit."""
-    return compacted(scene, **{"robust": False, "fit": "none", "checkpoint": "none", **settings}).gaussians
+    return compacted(scene, **{"fit": "none", "checkpoint": "none", **settings}).gaussians
 
 
 def identical(a: Gaussians, b: Gaussians) -> bool:

@@ -11,11 +11,9 @@ from gsmerge.options import CompactOptions
 from gsmerge.stages.fit import FitOptions
 from gsmerge.types import PixelScene, UnalignedScene
 
-COLOR_FIT_SETTINGS = ("iterations", "prior_weight", "huber", "min_gain", "max_gain", "holdout")
 FULL_FIT_SETTINGS = tuple(f.name for f in fields(FitOptions) if f.name != "fit")
 _ALL = (
     Baseline("unmerged", simple.unmerged, uses=()),
-    Baseline("unmerged-color", simple.unmerged_color, needs=("photos",), uses=COLOR_FIT_SETTINGS),
     Baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS),
     Baseline("moment-matching", simple.match_moments),
     Baseline("voxel", voxel.run),

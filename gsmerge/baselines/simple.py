@@ -24,11 +24,6 @@ def unmerged(prepared: PreparedScene, count: int) -> Gaussians:
     return own_gaussians(prepared.scene)
 
 
-def unmerged_color(prepared: PreparedScene, count: int) -> Gaussians:
-    """The colour fit on all Gaussians, none left out; whatever the count."""
-    return _fit_input(prepared, replace(prepared.options.fit, fit="color", min_contribution=0.0))
-
-
 def unmerged_fit(prepared: PreparedScene, count: int) -> Gaussians:
     """The full fit, with as many steps or as much time as ours: what merging has to beat; whatever the count.
 

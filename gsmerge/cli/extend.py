@@ -28,8 +28,8 @@ from gsmerge.errors import UsageError
     f"effort {opt.MERGE} {opt.NETWORKS}",
     *opt.panel(
         opt.FITTING,
-        opt.option("fit", ("color", "none"), "What is fitted to a batch's photos; gsmerge decode makes the full fit.",
-                   wording="color"),
+        opt.option("fit_colors", bool, "Fit the colours to each batch's photos; gsmerge decode makes the full fit.",
+                   "--fit-colors/--no-fit-colors", wording="fit"),
         opt.option("replay", int, "Most photos that the state keeps for the full fit of gsmerge decode.", wording="96",
                    min=0),
     ),

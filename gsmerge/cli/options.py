@@ -239,7 +239,7 @@ HINTS = "opacity exporter quats order scene_scale max_side"
 READING = f"cameras images {HINTS}"
 TARGETS = "targets target_images"
 COUNTS = "k k_low k_high k_rule superpixels budget quality levels"
-MERGE = "segmentation robust match geometry neighbors overlap iou similarity max_color unseen min_opacity"
+MERGE = "segmentation match geometry neighbors overlap iou similarity max_color unseen min_opacity"
 CLEAN = "crop drop_floaters drop_sky"
 FIT = "fit effort device fit_steps photo_scale time_budget poses"
 NETWORKS = "recipe checkpoint require_checkpoint"
@@ -292,8 +292,6 @@ _TABLE = (
         MERGING,
         option("segmentation", ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid"), "Superpixel method.",
                wording="rdseg", rare=True),
-        option("robust", bool, "Choose among merges by comparing them with the photos.", "--robust/--no-robust",
-               wording="unless --fit full or a draft", rare=True),
         option("match", ("overlap", "aabb", "none"), "How Gaussians of different views are matched and merged.",
                wording="overlap, none for a draft", rare=True),
         option("geometry", ("analytic", "decoded"), "What is matched where networks are loaded: moments, or the "
@@ -310,7 +308,7 @@ _TABLE = (
         option("unseen", ("drop", "keep"), "Gaussians that no view sees, where they are not one per pixel: drop (the "
                "default), or keep, merged.", rare=True),
         option("method", (
-            "gsmerge", "unmerged", "unmerged-color", "unmerged-fit", "moment-matching", "voxel", "opacity",
+            "gsmerge", "unmerged", "unmerged-fit", "moment-matching", "voxel", "opacity",
             "contribution", "random", "blocks", "greedy", "splat-transform",
         ), "gsmerge, or a baseline to compare it with.", wording="gsmerge", rare=True),
         option("recipe", ("paper",), "Settings that belong together. paper: the superpixel merging paper's own method, "
@@ -322,7 +320,7 @@ _TABLE = (
     ),
     panel(
         FITTING,
-        option("fit", ("full", "color", "none"), "What is fitted to the photos.", wording="full"),
+        option("fit", ("full", "none"), "What is fitted to the photos.", wording="full"),
         option("effort", ("draft", "fast", "default", "best"), "How much work goes into superpixels and fit.",
                wording="default"),
         option("device", ("cpu", "cuda", "auto"), "Where the stages run; cuda needs gsmerge[cuda]. auto: a GPU "

@@ -37,7 +37,7 @@ def plan_document(
 ) -> dict[str, Any]:
     """What a run would make of a scene, and an estimate of its time and memory, as plain JSON types."""
     from gsmerge.options import to_schema
-    from gsmerge.runtime.estimate import estimate_run, fit_of, is_robust
+    from gsmerge.runtime.estimate import estimate_run, fit_of
     from gsmerge.runtime.threads import available_threads
     from gsmerge.stages.fit.photos import photo_scale
     from gsmerge.stages.group import budget_count, default_count, largest_count, superpixels_per_view
@@ -62,7 +62,6 @@ def plan_document(
         "output": {"path": str(out), "num_gaussians_at_most": min(num_gaussians, max_count)},
         "method": settings.method,
         "superpixels_per_view": per_view,
-        "robust": is_robust(options, photos=photos),
         "fit": fit_of(options, photos=photos),
         "estimate": estimate_run(
             grid, options, pixels, photos=photos, threads=settings.threads or available_threads(),
@@ -88,8 +87,7 @@ def plan_lines(plan: Mapping[str, Any]) -> list[str]:
         superpixels = f"{per_view:,} per view{' at the start' * adapts}, {chosen['k']} Gaussian(s) each"
     steps = [
         f"superpixels  {superpixels}",
-        f"merging      {'the best of a family, judged by the photos' if plan['robust'] else 'plain'},"
-        f" across views: {plan['options']['match']}",
+        f"merging      across views: {plan['options']['match']}",
         f"networks     {plan['options']['checkpoint']}",
     ]
     return [

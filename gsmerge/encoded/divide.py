@@ -12,9 +12,9 @@ from gsmerge.types import FeatureGaussians, Gaussians
 
 
 def divide_all(features: FeatureGaussians, members: Members, max_k: int, rule: Rule) -> Division:
-    """All children of every group, up to ``max_k`` of each; the backing layer is never divided."""
+    """All children of every group, up to ``max_k`` of each."""
     count = len(features)
-    rows = np.flatnonzero(~features.backing)
+    rows = np.arange(count)
     sizes = np.diff(features.starts)[rows][:, None]
     none = np.zeros(0, np.int64)
     parts = [pool_children(features, members, np.zeros(1, np.int64), none, none, rule)]

@@ -38,10 +38,9 @@ REMEDY = "copy it again, or encode the scene again"
 MAX_COUNT = 1 << 40
 MAX_NUMBER = 1e37  # of any array: float32 ends at 3e38
 MAX_FACTOR = 1e6  # of what is multiplied with others
-FACTORS = ("gains", "spreads", "quats")
+FACTORS = ("gains", "quats")
 NOT_NEGATIVE = (
     "gains",
-    "spreads",
     "weights",
     "masses",
     "extinctions",
@@ -68,9 +67,7 @@ ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind
 PREFIXES = (
     "features.", "division.", "children.", "kept.", "cameras.", "frame.", "heads.", "networks.", "replay.",
 )  # fmt: skip
-FEATURE_COLUMNS = tuple(
-    f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views", "backing")
-)
+FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 
 
 def write_gsm(
@@ -102,7 +99,6 @@ def write_gsm(
     kept = children[1][:0] if stored.kept is None else stored.kept
     content = {f"features.{name}": _float32(getattr(features, name)) for name in FEATURE_COLUMNS}
     content |= {"features.views": features.views.astype(np.int32)}
-    content |= {"features.backing": features.backing.astype(np.uint8)}
     content |= {"cameras.viewmats": cameras.viewmats.astype(np.float64), "cameras.Ks": cameras.Ks.astype(np.float64)}
     content |= {"frame.origin": frame.origin.astype(np.float64)}
     for prefix, gaussians in (children, ("kept", kept)):
@@ -193,7 +189,6 @@ class GsmFile:
         return FeatureGaussians(
             **{name: self.array(f"features.{name}", np.float32, g, *shapes.get(name, ())) for name in FEATURE_COLUMNS},
             views=self.array("features.views", np.int32, g).astype(np.int64),
-            backing=self.array("features.backing", np.uint8, g).astype(bool),
             starts=np.zeros(g + 1, np.int64),
             members=np.zeros(0, np.int64),
         )

@@ -115,7 +115,6 @@ def apply_encoding(
     Gradients flow through the latents and the corrections, never through the geometry.
     """
     shift = networks.options.bounds.mean * HALF * tanh_bounded(encoded[:, -3:])
-    shift = torch.where(as_tensor(features.backing)[:, None], 0, shift)
     residuals = torch.cat([shift, torch.zeros(len(features), RESIDUAL - 3)], 1)
     moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
     return replace(moved, latents=tanh_bounded(encoded[:, :-3])), residuals
@@ -214,13 +213,11 @@ def run_refiner(
 
 
 def find_neighbors(features: FeatureGaussians, count: int) -> np.ndarray:
-    """``[g,k]`` int64 nearest other Feature Gaussians of the same layer in 3D; -1 where there are fewer."""
+    """``[g,k]`` int64 nearest other Feature Gaussians in 3D; -1 where there are fewer."""
     means, neighbors = features.means.astype(np.float64), np.full((len(features), count), -1, np.int64)
-    finite = np.isfinite(means).all(1)
-    for layer in (features.backing, ~features.backing):
-        rows = np.flatnonzero(layer & finite)
-        near = nearest_points(means[rows], count)
-        neighbors[rows] = np.where(near < 0, -1, rows[near])
+    rows = np.flatnonzero(np.isfinite(means).all(1))
+    near = nearest_points(means[rows], count)
+    neighbors[rows] = np.where(near < 0, -1, rows[near])
     return neighbors
 
 
@@ -229,12 +226,11 @@ def apply_corrections(
 ) -> tuple[FeatureGaussians, Tensor]:
     """Feature Gaussians with the raw corrections of merger or refiner, and the bounded ones ``[g,13]``.
 
-    The backing layer stays as it is. Gradients flow through the latents and the corrections alone.
+    Gradients flow through the latents and the corrections alone.
     """
-    own = torch.where(as_tensor(features.backing)[:, None], 0, raw)
-    residuals = bound_residuals(own[:, :RESIDUAL], networks.options.bounds, HALF)
+    residuals = bound_residuals(raw[:, :RESIDUAL], networks.options.bounds, HALF)
     moved = move_features(features, group_features.base, residuals.detach(), group_features.frames)
-    return replace(moved, latents=features.latents + tanh_bounded(own[:, RESIDUAL:])), residuals
+    return replace(moved, latents=features.latents + tanh_bounded(raw[:, RESIDUAL:])), residuals
 
 
 def decode_gaussians(
@@ -278,13 +274,13 @@ def prepare_children(
     """The Gaussians that the heads correct: the children; for absolute outputs a round Gaussian for each.
 
     It lies at its group's mean and has its base colour, from which the head's outputs are offsets (paper section 4.3).
-    It is as large as the group, half transparent, with the axes of the group's frame. Children of the backing layer,
-    and five or more of one parent, stay as they are: no head corrects them.
+    It is as large as the group, half transparent, with the axes of the group's frame. Five or more
+    children of one parent stay as they are: no head corrects them.
     """
     if networks.options.outputs == "residual":
         return children
     sizes = np.bincount(parents, minlength=len(features))[parents]
-    replaced = torch.from_numpy((sizes <= networks.max_children) & ~features.backing[parents])
+    replaced = torch.from_numpy(sizes <= networks.max_children)
     own = torch.from_numpy(parents)
     means, scales = group_features.base.means[own], group_features.sizes[own, None].expand(-1, 3)
     quats = as_tensor(rotmat_to_quat(as_array(group_features.frames.double())))[own].to(children.quats)
@@ -310,7 +306,7 @@ def run_heads(
     first, sizes, owners = _families(parents, len(features), halves=networks.max_children > SLOTS[-1])
     residuals = torch.zeros(len(children), RESIDUAL)
     for slots, fewest in zip(SLOTS, (1, 2, 3), strict=True):
-        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots) & ~features.backing[owners])
+        rows = np.flatnonzero((sizes >= fewest) & (sizes <= slots))
         if len(rows) == 0:
             continue
         places = np.arange(slots)[None]

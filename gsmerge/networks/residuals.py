@@ -114,7 +114,7 @@ def _move_rows(
     features: FeatureGaussians, base: Gaussians, residuals: Tensor, frames: Tensor, rows: slice
 ) -> dict[str, np.ndarray]:
     """The columns of some rows that :func:`move_features` changes."""
-    names = ("means", "covars", "masses", "extinctions", "sh0", "spreads")
+    names = ("means", "covars", "masses", "extinctions", "sh0")
     f = {name: as_tensor(getattr(features, name)[rows]) for name in names}
     base, residuals = base[rows], residuals[rows]
     wide, frames = residuals.double(), frames[rows].double()
@@ -124,7 +124,7 @@ def _move_rows(
     covars = change @ f["covars"].double() @ change.transpose(1, 2)
     depth = wide[:, LOGIT]
     disc = wide[:, SIZE][:, 1:].sum(1)  # of the two larger axes: principal axes are in ascending order
-    sizes = gaussian_sizes(base.scales / f["spreads"][:, None]).double()
+    sizes = gaussian_sizes(base.scales).double()
     shift = rotate_vectors(frames, wide[:, MEAN] * sizes[:, None])
     shift = torch.where(shift.isfinite(), shift, 0)  # for means as far away as float32 allows
     moved = {

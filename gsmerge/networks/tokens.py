@@ -49,7 +49,7 @@ def compute_group_features(features: FeatureGaussians, members: Members, cameras
 def make_group_features(features: FeatureGaussians, views: Array, group: Array, cameras: Cameras) -> GroupFeatures:
     """Inputs from known ``views [g]`` and numbers ``group [g,GROUP]``, without the scene's members."""
     base, views = feature_to_gaussians(features).to("cpu"), as_tensor(views)
-    sizes = gaussian_sizes(base.scales / as_tensor(features.spreads)[:, None]).clamp_min(TINY)
+    sizes = gaussian_sizes(base.scales).clamp_min(TINY)
     footprints = as_tensor(features.footprints).clamp_min(TINY)
     return GroupFeatures(
         base, _ray_frames(base.means, views, cameras.to("cpu")), sizes, footprints, views, as_tensor(group)

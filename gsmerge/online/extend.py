@@ -78,7 +78,7 @@ def extend(
     Args:
         state: What earlier batches left; None: this is the first one.
         scene: The new views, in the same world as the earlier ones; of tensors, too, the state has arrays.
-        options: Settings of all stages; None: the defaults, with the fit of the colours.
+        options: Settings of all stages; None: the defaults, without a fit.
         online: What of the batch enters the state, and how; None: the defaults.
         progress: As of :func:`gsmerge.compact`.
 
@@ -89,7 +89,7 @@ def extend(
         ValueError: If a setting is out of range or asks for what a state cannot have, or the degree of the harmonics
             is not that of the state.
     """
-    options, online = options or CompactOptions().with_settings({"fit": "color"}), online or OnlineOptions()
+    options, online = options or CompactOptions().with_settings({"fit": "none"}), online or OnlineOptions()
     max_k = online.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
     with use_threads(options.threads), record_run(progress) as record:
@@ -145,7 +145,7 @@ def _add_batch(
     if prepared.given.images is None:
         return state, counts
     groups = state.groups
-    if options.fit.fit == "color":
+    if online.fit_colors:
         with stage("fit"):
             groups, report = fit_batch_colors(groups, photos, options.fit, options.seed)
             choose(fit=asdict(report))
@@ -158,9 +158,7 @@ def _check(state: OnlineState | None, scene: PixelScene | UnalignedScene, option
     for name in options.whole_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
-        raise UsageError(
-            "fit full: goes with all photos together; expected color or none, and the full fit at decoding"
-        )
+        raise UsageError("fit full: goes with all photos together; expected none, and the full fit at decoding")
     if options.decode.max_k > max_k:
         raise UsageError(f"max k: expected at least {options.decode.k}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree

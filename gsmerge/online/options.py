@@ -23,6 +23,7 @@ class OnlineOptions:
         margin: See ``tolerance``.
         replay: Most photos that are stored, spread evenly over all views, for a full fit when decoding. Colours are
             fitted batch by batch and need none.
+        fit_colors: Fit the base colours to the photos of each batch.
 
     Raises:
         ValueError: If a setting is out of range.
@@ -32,6 +33,7 @@ class OnlineOptions:
     tolerance: float = 0.06
     margin: float = 1.0
     replay: int = 96
+    fit_colors: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_k <= MAX_CHILDREN:
@@ -49,12 +51,12 @@ def merge_settings(
 ) -> tuple[CompactOptions, OnlineOptions]:
     """All settings: as given, otherwise those that the state was made with, otherwise the defaults.
 
-    By default colours are fitted batch by batch; the full fit comes when decoding.
+    Nothing but colours is fitted batch by batch; the full fit comes when decoding.
     """
     names = OnlineOptions.__dataclass_fields__.keys()
     known = names | CompactOptions().to_dict().keys()
     stored = {} if state is None else from_schema(state.about["options"])
     before = {name: value for name, value in stored.items() if name in known}
-    merged = {"fit": "color"} | before | dict(settings)
+    merged = {"fit": "none"} | before | dict(settings)
     online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})
     return CompactOptions().with_settings(merged), online

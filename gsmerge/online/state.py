@@ -44,8 +44,8 @@ def no_photos(cameras: Cameras) -> Replay:
 class GroupSet:
     """Groups with the Gaussians that they divide into."""
 
-    # g Feature Gaussians, canonical, with gains and spreads of one and without latents: what gains, spreads and
-    # networks did to them is in their moments. Their members are rows of `children`.
+    # g Feature Gaussians, canonical, with gains of one and without latents: what gains and networks did to them
+    # is in their moments. Their members are rows of `children`.
     features: FeatureGaussians
     children: Gaussians  # The Gaussians of the finest division, group by group
     # [g,1,3] base colours (sh0) that fit the photos so far. `features.sh0` stays as exported, for the full fit to
@@ -82,7 +82,7 @@ class OnlineState(StoredScene):
 def bake(
     features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int, rule: Rule = "depth"
 ) -> GroupSet:
-    """Groups as what they decode to, so that gains, spreads, latents and decoder heads are needed no more."""
+    """Groups as what they decode to, so that gains, latents and decoder heads are needed no more."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -99,7 +99,7 @@ def _group_set(features: FeatureGaussians, ones: Gaussians, children: Gaussians,
     """Groups with the moments of what they decode to (``ones``); ``parents``: the rising group of each child."""
     count = len(features)
     neutral, no_latents = np.ones(count, np.float32), np.zeros((count, 0), np.float32)
-    same = replace(features, gains=neutral, spreads=neutral, latents=no_latents, **moments_of(ones))
+    same = replace(features, gains=neutral, latents=no_latents, **moments_of(ones))
     return GroupSet(with_child_rows(same, parents), children, ones.sh0, np.zeros(count, np.float32))
 
 
@@ -127,7 +127,7 @@ def from_encoded(encoded: Encoded) -> OnlineState:
 
 
 def moments_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """The fields of Feature Gaussians that decode to given Gaussians, at gains and spreads of one."""
+    """The fields of Feature Gaussians that decode to given Gaussians, at gains of one."""
     scales = gaussians.scales.astype(np.float64)
     _, middle, largest = np.sort(scales, -1).T
     opacities = gaussians.opacities.astype(np.float64).clip(0, MAX_OPACITY)

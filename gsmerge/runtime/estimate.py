@@ -18,8 +18,6 @@ COST_SEGMENT = {"rdseg": 0.5, "bass": 1.5, "bass-st": 1.5, "bass-adaptive": 6.0,
 COST_MERGE = 0.5
 COST_NETWORKS = 2.8  # at the default superpixels
 COST_SCORE = 0.07  # for each scored view: rendering from input and output
-COST_ROBUST = 1.6
-COST_COLOR_FIT = 0.9
 COST_FIT_RENDERS = 1.5  # what the full fit renders of all views besides its steps
 COST_BASELINES = {"moment-matching": 1.7, "voxel": 1.8, "contribution": 0.7, "greedy": 25.0, "splat-transform": 60.0}
 COST_OTHER_BASELINE = 0.2
@@ -53,12 +51,12 @@ def work_seconds(
     """
     method, fit, views = options["method"], fit_of(options, photos=photos), pixels / max(view_pixels, 1)
     if method == "gsmerge":
-        work = COST_MERGE + COST_SEGMENT[options["segmentation"]] + COST_ROBUST * is_robust(options, photos=photos)
+        work = COST_MERGE + COST_SEGMENT[options["segmentation"]]
         work += COST_NETWORKS * (options["checkpoint"] != "none")
     else:
         work = COST_BASELINES.get(method, COST_OTHER_BASELINE)
     work += COST_READ + score_cost(views) * photos
-    work += COST_COLOR_FIT * (fit == "color") + COST_FIT_RENDERS * (fit == "full")
+    work += COST_FIT_RENDERS * (fit == "full")
     steps = fit_steps if fit == "full" else 0
     step = COST_FULL_FIT * (1 + COST_LARGE_PHOTOS * (photo_scale**2 - 1))
     seconds = pixels / 1e6 * work + view_pixels / 1e6 * step * steps
@@ -89,14 +87,9 @@ def memory_problem(needed: int, available: int | None) -> str | None:
 
 
 def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
-    """What is fitted to the photos: full, color or none."""
-    own = {"gsmerge": options["fit"], "unmerged-fit": "full", "unmerged-color": "color"}
+    """What is fitted to the photos: full or none."""
+    own = {"gsmerge": options["fit"], "unmerged-fit": "full"}
     return own.get(options["method"], "none") if photos else "none"
-
-
-def is_robust(options: Mapping[str, Any], *, photos: bool) -> bool:
-    """Whether the photos choose among merges."""
-    return photos and options["method"] == "gsmerge" and bool(options["robust"])
 
 
 def estimate_run(

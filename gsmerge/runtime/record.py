@@ -17,9 +17,9 @@ from gsmerge.runtime.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
 # stages that leave much behind that was freed in other threads
-RELEASED = ("prepare", "segment", "encode", "robust", "match", "refine", "close", "choose", "fit")
+RELEASED = ("prepare", "segment", "encode", "match", "refine", "choose", "fit")
 STAGES = (
-    "prepare", "segment", "curve", "reduce", "members", "encode", "robust", "match", "refine", "close",
+    "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
     "cover", "decode", "choose", "join", "fit", "score", "input",
 )  # fmt: skip
 

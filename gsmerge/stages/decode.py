@@ -79,7 +79,7 @@ def decode(
     rule: Rule = "depth",
     networks: NetworkContext | None = None,
 ) -> Gaussians:
-    """K Gaussians for each Feature Gaussian, fewer where its members are alike; the backing layer stays at one.
+    """K Gaussians for each Feature Gaussian, fewer where its members are alike.
 
     Children are found by halving the members again and again across their widest direction in colour and
     position, so that those of K = 2 are unions of those of K = 4, and are pooled by the encoder's rule.
@@ -88,8 +88,7 @@ def decode(
         features: The Feature Gaussians; at K > 1 their members are looked up again.
         members: The scene's Gaussians that ``features.members`` points into.
         options: K and the least opacity.
-        counts: ``[g]`` a K for every group instead, from 1 on; those of the backing layer do not matter. Needed where
-            K is mixed.
+        counts: ``[g]`` a K for every group instead, from 1 on. Needed where K is mixed.
         rule: How children are pooled, the encoder's.
         networks: Networks whose heads correct the children; None: none does.
 
@@ -201,9 +200,8 @@ def mixed_counts(
     pixels = ids if members.pixels is None else members.pixels[ids]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     means = np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
-    front = ~features.backing
-    low, high = np.percentile(means[front], (options.k_low, options.k_high)) if front.any() else (0.0, 0.0)
-    counts = np.where(front, 1 + (means > low) + 2 * (means > high), 1)
+    low, high = np.percentile(means, (options.k_low, options.k_high)) if len(means) else (0.0, 0.0)
+    counts = 1 + (means > low) + 2 * (means > high)
     if options.k_rule == "distortion":
         return split_counts(features, members, int((counts - 1).sum()), MIXED_COUNTS[-1])
     return counts
@@ -233,7 +231,7 @@ def divide(
     features: FeatureGaussians, members: Members, counts: np.ndarray, rule: Rule = "depth"
 ) -> tuple[Gaussians, np.ndarray]:
     """The analytic children of :func:`decode`, however faint, and the Feature Gaussian ``[n]`` of each, rising."""
-    divided = (counts > 1) & ~features.backing
+    divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
         children, of_children = _children(features, members, np.flatnonzero(divided), counts, rule)
@@ -283,17 +281,17 @@ def halve(
 def pool_children(
     features: FeatureGaussians, members: Members, starts: np.ndarray, ids: np.ndarray, parents: np.ndarray, rule: Rule
 ) -> Gaussians:
-    """One Gaussian for each run of members, with gain and spread of the Feature Gaussian that it is a child of."""
+    """One Gaussian for each run of members, with the gain of the Feature Gaussian that it is a child of."""
     moments = pool_members(members, starts, ids, rule)
-    gains, spreads = features.gains[parents], features.spreads[parents].astype(np.float64)
-    return to_gaussians(moments.covars, moments.extinctions * gains, spreads, moments.means, moments.sh)
+    extinctions = moments.extinctions * features.gains[parents]
+    return to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
     """Children of every Feature Gaussian when ``extra`` more Gaussians are spent where they lower distortion most.
 
     A step that only pays together with the next one is judged by the two together (the convex hull of the
-    group's distortion), so a larger ``extra`` never takes a child away. The backing layer stays at one.
+    group's distortion), so a larger ``extra`` never takes a child away.
 
     Args:
         features: g Feature Gaussians.
@@ -321,17 +319,16 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
 
     See :func:`split_counts`, which takes the first ones.
     """
-    front = np.flatnonzero(~features.backing)
-    if max_children == 1 or len(front) == 0:
+    if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
-    gains = hull_gains(_child_errors(features, members, front, max_children))
+    gains = hull_gains(_child_errors(features, members, max_children))
     # Stable, group by group: of equal gains of one group the first step comes first.
     order = np.argsort(-gains.reshape(-1), kind="stable")
-    return front[order[: int(np.isfinite(gains).sum())] // gains.shape[1]]
+    return order[: int(np.isfinite(gains).sum())] // gains.shape[1]
 
 
-def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarray, max_children: int) -> np.ndarray:
-    """``[f,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
+def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
+    """``[g,max_children]`` distortion of 1, 2, ... children; NaN where members do not give that many."""
     starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
@@ -342,7 +339,8 @@ def _child_errors(features: FeatureGaussians, members: Members, front: np.ndarra
             local, own, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children, PLANE_WEIGHT
         )
 
-    tasks = [front[i : i + GROUPS_PER_TASK] for i in range(0, len(front), GROUPS_PER_TASK)]
+    every = np.arange(len(features))
+    tasks = [every[i : i + GROUPS_PER_TASK] for i in range(0, len(every), GROUPS_PER_TASK)]
     return np.concatenate(parallel_map(run, tasks))
 
 

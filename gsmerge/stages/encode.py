@@ -101,7 +101,7 @@ def group_rows(scene: PixelScene, groups: Groups) -> tuple[np.ndarray, np.ndarra
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
-    """Feature Gaussians of pooled groups, with neutral gains and spreads."""
+    """Feature Gaussians of pooled groups, with neutral gains."""
     count = len(moments.means)
     return FeatureGaussians(
         means=to_float32(moments.means),
@@ -110,12 +110,10 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
         masses=to_float32(moments.masses),
         extinctions=to_float32(moments.extinctions),
         gains=np.ones(count, np.float32),
-        spreads=np.ones(count, np.float32),
         sh0=moments.sh[:, :1],
         shN=moments.sh[:, 1:],
         footprints=to_float32(moments.footprints),
         views=views,
-        backing=np.zeros(count, bool),
         starts=starts,
         members=ids,
         latents=np.zeros((count, 0), np.float32),

@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.stages.assign import seen_depths
-from gsmerge.stages.choose_merge import MIN_VIEWS, photos_choose
 from gsmerge.stages.fit import start_share
 from gsmerge.stages.region_tree import RegionTree, auto_count, cut_tree, pixel_depths, region_tree
 from gsmerge.stages.segment import MAX_FACTOR, count_for, segment
-from gsmerge.types import Groups, PixelScene, Segmentation, UnalignedScene
+from gsmerge.types import PixelScene, Segmentation, UnalignedScene
 
 if TYPE_CHECKING:
     from gsmerge.options import CompactOptions
@@ -31,7 +28,6 @@ class CountLimits:
         min_count: Fewest Gaussians that the scene can be cut to: one for each view.
         max_count: Most Gaussians that a budget, a size or a device allows.
         exact: Gaussians that a budget or a size asks for; None without either.
-        robust: Whether the photos choose the merge.
         share: Part of the Gaussians that the fit begins with; it adds the others where the error is.
     """
 
@@ -40,7 +36,6 @@ class CountLimits:
     min_count: int
     max_count: int
     exact: int | None
-    robust: bool
     share: float
 
     @property
@@ -64,7 +59,6 @@ def count_limits(scene: PixelScene | UnalignedScene, options: CompactOptions) ->
         min_count=len(scene),
         max_count=max_count,
         exact=exact,
-        robust=photos and photos_choose(options.robust.robust, options.fit.fit, options.fit.effort),
         share=start_share(options.fit) if photos else 1.0,
     )
 
@@ -128,33 +122,19 @@ def segment_scene(prepared: PreparedScene, count: int | None) -> Segmentation:
     views = len(pictures)
     if count is None:
         each = max(1, int(limits.per_view * limits.share))
-        num_coarse = min(round(backing_share(prepared) * each), each - 1)
-        num_fine, coarse = each - num_coarse, _coarse(pictures, options, num_coarse)
         if not options.segment.adapts:
-            return Segmentation(segment(pictures, options.segment, num_fine), coarse, limits.default, exact=False)
+            return Segmentation(segment(pictures, options.segment, each), limits.default, exact=False)
         # to the number in the end, of which the fit begins with a share
-        groups = segment(pictures, options.segment, limits.per_view, adapt=num_fine / limits.per_view)
-        count = round(limits.default * len(groups) / (num_fine * views))
+        groups = segment(pictures, options.segment, limits.per_view, adapt=each / limits.per_view)
+        count = round(limits.default * len(groups) / (each * views))
         if count <= limits.max_count:
-            return Segmentation(groups, coarse, count, exact=False)
+            return Segmentation(groups, count, exact=False)
         count = limits.max_count
     tree = prepared.tree
     first = max(views, int(count * limits.share))
     if tree is None or first > len(tree):
         tree = scene_tree(prepared, count)
-    num_coarse = int(backing_share(prepared) * first / views)
-    groups = cut_tree(tree, max(views, first - num_coarse * views))
-    return Segmentation(groups, _coarse(pictures, options, num_coarse), count, exact=True)
-
-
-def _coarse(pictures: np.ndarray, options: CompactOptions, count: int) -> Groups | None:
-    return segment(pictures, options.segment, count) if count else None
-
-
-def backing_share(prepared: PreparedScene) -> float:
-    """Share of the superpixels that the backing layer takes."""
-    used = prepared.limits.robust and len(prepared.pictures) >= MIN_VIEWS
-    return prepared.options.backing.backing if used else 0.0
+    return Segmentation(cut_tree(tree, first), count, exact=True)
 
 
 def with_tree(prepared: PreparedScene) -> PreparedScene:

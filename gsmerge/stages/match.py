@@ -77,8 +77,8 @@ class MatchOptions:
 def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
     """Clusters of Feature Gaussians of different views.
 
-    The backing layer is matched by itself. The result does not depend on the order of the Feature Gaussians: leaders
-    are taken by weight, ties by position. What is fully transparent is left alone.
+    The result does not depend on the order of the Feature Gaussians: leaders are taken by weight, ties by position.
+    What is fully transparent is left alone.
     """
     if networks is not None and options.geometry == "decoded" and options.method != "none":
         from gsmerge.networks.apply import match_geometry
@@ -88,13 +88,9 @@ def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkCo
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0
     if options.method != "none" and len(np.unique(features.views)) > 1:
-        solid = features.extinctions > 0
-        for layer in (solid & ~features.backing, solid & features.backing):
-            rows = np.flatnonzero(layer)
-            if len(rows) > 1:
-                of_layer, num_layer = _clusters(features, rows, options)
-                clusters[rows] = num_clusters + of_layer
-                num_clusters += num_layer
+        solid = np.flatnonzero(features.extinctions > 0)
+        if len(solid) > 1:
+            clusters[solid], num_clusters = _clusters(features, solid, options)
     alone = np.flatnonzero(clusters < 0)
     clusters[alone] = num_clusters + np.arange(len(alone))
     return Matches(clusters, num_clusters + len(alone))

@@ -247,7 +247,7 @@ def test_nothing_left_is_bad_input(scene_copy: Path, run: Run) -> None:
     gaussians = gsmerge.read_ply(scene_copy / "scene.ply").gaussians
     points = replace(gaussians, scales=np.full_like(gaussians.scales, 1e-30))
     gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
-    outcome = run("compact", scene_copy, "--fit", "none", "--no-robust")
+    outcome = run("compact", scene_copy, "--fit", "none")
     assert outcome.code == 3
     assert "found none that is left" in outcome.err
     assert not (scene_copy / "scene.compact.ply").exists()

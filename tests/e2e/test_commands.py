@@ -108,7 +108,7 @@ def test_dry_run_writes_nothing(scene_copy: Path, run: Run) -> None:
 
 
 def test_progress_only_when_a_terminal_is_there(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    fast = (*SMALL, "--no-robust", "--fit", "none", "--overwrite")
+    fast = (*SMALL, "--fit", "none", "--overwrite")
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     assert "segment" not in run("compact", scene_copy, *fast).err
     monkeypatch.setenv("FORCE_COLOR", "1")

@@ -16,8 +16,8 @@ from .conftest import Run, listing
 
 VIEWS = 5
 WRITERS: dict[str, tuple[str, ...]] = {
-    "compact": ("small.ply", "--superpixels", "100", "--no-robust", "--fit", "none"),
-    "encode": ("small.gsm", "--superpixels", "100", "--no-robust"),
+    "compact": ("small.ply", "--superpixels", "100", "--fit", "none"),
+    "encode": ("small.gsm", "--superpixels", "100"),
     "segment": ("overlays", "--superpixels", "100"),
     "render": ("renders",),
     "preview": ("sheet.png", "--views", "1"),

@@ -23,7 +23,7 @@ from gsmerge.online.file import load_state
 
 from .conftest import Outcome, Run, listing
 
-SMALL = ("--superpixels", 60, "--no-robust", "--checkpoint", "none")
+SMALL = ("--superpixels", 60, "--checkpoint", "none")
 PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
@@ -132,7 +132,7 @@ def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run:
     first = load_state(state).about["options"]
     document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]
     assert document["num_covered"] == 0
-    same = {"superpixels": 60, "fit": "none", "tolerance": 0.0, "max_k": 2, "replay": 2, "seed": 5, "robust": False}
+    same = {"superpixels": 60, "fit": "none", "tolerance": 0.0, "max_k": 2, "replay": 2, "seed": 5}
     assert same.items() <= first.items()
     assert same.items() <= document["options"].items()
     assert len(load_state(state).replay) <= 2
@@ -226,7 +226,7 @@ def test_wrong_decoding_is_one_line(
     assert listing(tmp_path) == {}
 
 
-@pytest.mark.parametrize("fit", ["color", "full"])
+@pytest.mark.parametrize("fit", ["full"])
 def test_an_encoded_scene_has_no_photos(fit: str, encoded: Path, tmp_path: Path, run: Run) -> None:
     outcome = run("decode", encoded, "--fit", fit, "-o", tmp_path / "a.ply")
     assert_refused(outcome, 2, f"fit {fit}: expected a state with photos, found none")

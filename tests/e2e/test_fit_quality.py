@@ -80,7 +80,7 @@ def test_hardly_any_time_costs_little(
 def test_plain_merging_without_photos(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:
-    result, actual = compacted(superpixels=256, robust=False, fit="none")
+    result, actual = compacted(superpixels=256, fit="none")
     assert len(result.gaussians) <= NUM_VIEWS * 256
     floor(actual)
 

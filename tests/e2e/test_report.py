@@ -13,9 +13,7 @@ from .conftest import Run
 @pytest.fixture
 def small(scene_copy: Path, run: Run) -> Path:
     out = scene_copy / "small.ply"
-    outcome = run(
-        "compact", scene_copy, "-o", out, "--fit", "none", "--no-robust", "-q", "--report", scene_copy / "run.json"
-    )
+    outcome = run("compact", scene_copy, "-o", out, "--fit", "none", "-q", "--report", scene_copy / "run.json")
     assert outcome.code == 0
     return out
 

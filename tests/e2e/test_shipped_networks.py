@@ -26,7 +26,7 @@ def gain(
     scene = gsmerge.read_scene(made)
 
     def psnr(checkpoint: str) -> float:
-        result = gsmerge.compact(scene, fit="none", robust=False, checkpoint=checkpoint)
+        result = gsmerge.compact(scene, fit="none", checkpoint=checkpoint)
         gsmerge.write_ply(folder / "small.ply", result.gaussians, overwrite=True)
         return target_psnr(made / "targets", folder / "small.ply")
 

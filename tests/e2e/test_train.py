@@ -25,7 +25,7 @@ from gsmerge.research.training.windows import whole_photo
 
 from .conftest import Run, listing
 
-FAST = ("--superpixels", 100, "--fit", "none", "--no-robust")
+FAST = ("--superpixels", 100, "--fit", "none")
 TINY = {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}}
 CONFIG = {
     "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,

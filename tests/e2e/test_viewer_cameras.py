@@ -14,7 +14,7 @@ import gsmerge
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 
 Run = Callable[..., Any]
-QUICK = ("--superpixels", 40, "--fit", "none", "--no-robust", "--checkpoint", "none")
+QUICK = ("--superpixels", 40, "--fit", "none", "--checkpoint", "none")
 
 
 def test_the_views_are_written_and_named(scene_copy: Path, run: Run) -> None:

@@ -69,7 +69,7 @@ def test_each_gaussian_is_in_at_most_one_superpixel(count: int, least: float) ->
 @given(st.integers(0, 1000), st.sampled_from([{}, {"k": 2}, {"budget": 200}]))
 def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     one, other = (
-        compact(scene, superpixels="10%", robust=False, fit="none", **options).gaussians
+        compact(scene, superpixels="10%", fit="none", **options).gaussians
         for scene in (loose.loosened(ROOM), loose.shuffled(ROOM, seed))
     )
     assert abs(len(one) - len(other)) <= 2
@@ -85,7 +85,7 @@ def test_threads_change_no_owner(count: int) -> None:
     assert all(owners_equal(a, b) for a, b in itertools.pairwise(actual))
 
 
-@pytest.mark.parametrize("options", [{"fit": "color"}, {"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
+@pytest.mark.parametrize("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
 def test_threads_change_no_bit(options: dict) -> None:
     scene = loose.voxels(ROOM, 0.06)
     actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 2, 8)]
@@ -100,9 +100,7 @@ def test_similarity(seed: int, exponent: float) -> None:
     factor = 10.0**exponent
     transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)
     moved = scenes.move(ROOM, *transform)
-    one, other = (
-        compact(loose.loosened(scene), superpixels="10%", robust=False, fit="none").gaussians for scene in (ROOM, moved)
-    )
+    one, other = (compact(loose.loosened(scene), superpixels="10%", fit="none").gaussians for scene in (ROOM, moved))
     expected = scenes.move_gaussians(one, *transform)
     assert abs(len(one) - len(other)) <= 2
     distances = cKDTree(expected.means.astype(np.float64)).query(other.means.astype(np.float64))[0] / factor

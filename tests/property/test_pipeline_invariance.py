@@ -47,7 +47,7 @@ def test_map_coordinates(east: float, north: float) -> None:
 
 
 CASES = [
-    {}, {"fit": "color", "k": 4, "seed": 3}, {"robust": False, "match": "aabb", "fit": "color"},
+    {}, {"match": "aabb", "fit": "color"},
     {"segmentation": "bass-st", "fit": "none"}, {"robust": True, "dropout": 0.2, "k": 2, "seed": 5},
 ]  # fmt: skip
 

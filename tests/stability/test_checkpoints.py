@@ -17,7 +17,7 @@ from gsmerge.networks.modules import Networks
 from gsmerge.networks.options import Bounds
 from gsmerge.types import SH_C0
 
-PLAIN = {"fit": "none", "match": "none", "robust": False, "superpixels": 100}
+PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ PLAIN = {"fit": "none", "match": "none", "robust": False, "superpixels": 100}
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(3))
     path = written(tmp_path / "a.safetensors", Networks())
-    chosen = {"robust": False, "superpixels": 80, "fit": "color", **settings}
+    chosen = {"superpixels": 80, "fit": "color", **settings}
     plain, networks = (
         gsmerge.compact(scene, **chosen, checkpoint="none"),
         gsmerge.compact(scene, **chosen, checkpoint=str(path)),
@@ -48,7 +48,7 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
 
 def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(3))
-    chosen = {"robust": False, "fit": "none", "superpixels": "10%"}
+    chosen = {"fit": "none", "superpixels": "10%"}
     path = written(tmp_path / "a.safetensors", Networks())
     loose = shuffled(scene)
     plain = gsmerge.compact(loose, **chosen, checkpoint="none")

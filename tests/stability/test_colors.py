@@ -100,7 +100,7 @@ def shiny(scene: PixelScene, strength: float) -> PixelScene:
     return replace(made, images=images.astype(np.float32))
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"k": 2}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
 def test_harmonics_survive(room: PixelScene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = scenes.compacted(scene, **settings).gaussians
@@ -125,9 +125,9 @@ def test_base_colours_outside_the_range_are_kept(room: PixelScene) -> None:
     images = scenes.images_of(offset.gaussians, offset.cameras)[0].clip(0, 1)
     offset = replace(offset, images=images.astype(np.float32))
     for fit in ("none", "color"):
-        result, usual = (scenes.compacted(s, robust=False, fit=fit) for s in (offset, scene))
+        result, usual = (scenes.compacted(s, fit=fit) for s in (offset, scene))
         assert result.report.psnr_after > usual.report.psnr_after - 1.0  # type: ignore[operator]
-    full = scenes.compacted(offset, robust=False)
+    full = scenes.compacted(offset)
     assert full.report.choices["fit"]["method"] == "full"
     assert full.report.psnr_after > result.report.psnr_after + 1.0  # type: ignore[operator]
 

@@ -38,16 +38,14 @@ def coverage(gaussians: Gaussians, scene: PixelScene) -> tuple[float, float]:
 # 47: more children, more detail
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none", "checkpoint": "none"}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"fit": "none", "checkpoint": "none"}], ids=str)
 def test_more_children_show_more(scene: PixelScene, settings: dict) -> None:
     actual = [scenes.compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in actual]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in actual]) > -0.05).all()
 
 
-@pytest.mark.parametrize("fit", ["color", "full"])
+@pytest.mark.parametrize("fit", ["full"])
 def test_more_superpixels_show_more(scene: PixelScene, fit: str) -> None:
     actual = [scenes.compacted(scene, superpixels=share, fit=fit).gaussians for share in ("1%", "3%", "10%")]
     assert (np.diff([len(g) for g in actual]) > 0).all()
@@ -57,7 +55,7 @@ def test_more_superpixels_show_more(scene: PixelScene, fit: str) -> None:
 # 48: coverage and brightness
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "color", "k": 4}, {"fit": "none", "match": "none"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"fit": "none", "match": "none"}], ids=str)
 def test_photos_keep_coverage_and_brightness(scene: PixelScene, settings: dict) -> None:
     """With the full fit or the choice among merges, within a hundredth."""
     before = coverage(scene.gaussians, scene)
@@ -99,9 +97,7 @@ def test_merging_across_views_keeps_coverage(clean: PixelScene) -> None:
 # 55: glass
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"fit": "color"}, {"robust": False, "fit": "none"}, {"match": "none"}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"match": "none"}], ids=str)
 def test_faint_scenes_are_not_pruned(scene: PixelScene, settings: dict) -> None:
     opacities = np.full_like(scene.gaussians.opacities, 0.05)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))
@@ -127,7 +123,7 @@ def test_faint_scenes_keep_their_coverage(clean: PixelScene, match: str) -> None
 # 46: a compact scene compacted once more
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "color"}], ids=str)
+@pytest.mark.parametrize("settings", [{}], ids=str)
 def test_a_second_pass_neither_blurs_nor_darkens(scene: PixelScene, settings: dict) -> None:
     once = scenes.compacted(scene, superpixels="4.4%", **settings).gaussians
     loose = UnalignedScene(once, scene.cameras, scene.images, scene.names)

@@ -13,7 +13,7 @@ from gsmerge import PixelScene, UnalignedScene, compact
 from gsmerge.errors import UsageError
 
 VIEWS = 4
-PLAIN = {"fit": "none", "robust": False, "checkpoint": "none"}
+PLAIN = {"fit": "none", "checkpoint": "none"}
 
 
 @pytest.fixture(scope="module")

@@ -154,7 +154,7 @@ def test_the_fit_does_without_some(
 
 
 @pytest.mark.parametrize("change", [all_black, all_noise, moved_on, another_scene])
-@pytest.mark.parametrize("settings", [{}, {"budget": 500}, {"budget": "auto"}, {"fit": "color"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"budget": 500}, {"budget": "auto"}], ids=str)
 def test_no_fit_where_most_are_wrong(
     room: PixelScene, change: Callable[[Photos], Photos], settings: dict[str, Any]
 ) -> None:

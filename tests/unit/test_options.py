@@ -37,7 +37,7 @@ def test_a_draft_merges_no_views_and_takes_few_steps() -> None:
 
 def test_settings_reach_their_stage() -> None:
     options = CompactOptions().with_settings(
-        {"k": 2, "superpixels": "1%", "match": "aabb", "robust": False, "fit": "none", "backing": 0.01, "seed": 3}
+        {"k": 2, "superpixels": "1%", "match": "aabb", "fit": "none", "backing": 0.01, "seed": 3}
     )
     assert options.decode.k == 2
     assert options.segment.share == 0.01

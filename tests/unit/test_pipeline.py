@@ -73,7 +73,7 @@ def test_robust_merging_is_left_to_the_full_fit(scene: PixelScene) -> None:
     assert list(asked.seconds) == USUAL
     assert "merge" in asked.choices
     assert "merge" in scenes.compacted(scene, fit="none", checkpoint="none").report.choices
-    assert "merge" not in scenes.compacted(scene, fit="color", robust=False).report.choices
+    assert "merge" not in scenes.compacted(scene, fit="color").report.choices
     assert "merge" not in scenes.compacted(scene, fit="none", effort="draft").report.choices
 
 
@@ -110,9 +110,9 @@ def test_few_views_choose_among_spreads(scene: PixelScene, views: list[int]) -> 
 
 
 def test_options_and_settings_combine(scene: PixelScene) -> None:
-    options = CompactOptions().with_settings({"fit": "none", "robust": False})
+    options = CompactOptions().with_settings({"fit": "none"})
     one = compact(scene, options, superpixels=30)
-    two = compact(scene, superpixels=30, fit="none", robust=False)
+    two = compact(scene, superpixels=30, fit="none")
     assert np.array_equal(one.gaussians.means, two.gaussians.means)
     assert one.report.options == two.report.options
 
@@ -261,7 +261,7 @@ def test_networks_are_used_where_they_show_the_views_better(scene: PixelScene) -
 
 @pytest.mark.parametrize(
     "settings",
-    [{"effort": "draft"}, {"effort": "fast"}, {"fit": "color"}, {}, {"robust": True}, {"checkpoint": "none"}],
+    [{"effort": "draft"}, {"effort": "fast"}, {}, {"robust": True}, {"checkpoint": "none"}],
 )
 def test_networks_are_left_out(scene: PixelScene, settings: dict) -> None:
     assert not {"networks", "start_scores"} & set(scenes.compacted(scene, **settings).report.choices)
@@ -269,7 +269,7 @@ def test_networks_are_left_out(scene: PixelScene, settings: dict) -> None:
 
 def test_networks_without_photos_are_judged_by_the_colours_of_the_pixels(scene: PixelScene) -> None:
     actual = scenes.compacted(replace(scene, images=None)).report.choices["start_scores"]
-    with_photos = scenes.compacted(scene, fit="none", robust=False).report.choices["start_scores"]
+    with_photos = scenes.compacted(scene, fit="none").report.choices["start_scores"]
     assert actual == pytest.approx(with_photos, abs=0.5)
 
 

@@ -19,7 +19,7 @@ from gsmerge.research.charts.record import INPUT
 OURS = "gsmerge"
 ALL = "all"  # word for all views
 SIZES = ("budget", "superpixels")
-ONE_SIZE = ("unmerged", "unmerged-color", "unmerged-fit")  # methods that keep all Gaussians
+ONE_SIZE = ("unmerged", "unmerged-fit")  # methods that keep all Gaussians
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
 FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
 NUMBERS = ("k", "budgets", "superpixels", "views")  # lists whose values may be numbers

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 Device = Literal["cpu", "cuda", "auto"]
-Fit = Literal["none", "color", "full"]
+Fit = Literal["none", "full"]
 Poses = Literal["auto", "fixed", "free"]
 STEPS = {"draft": 30, "fast": 55, "default": 240, "best": 1000}  # of the full fit, by effort
 LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
@@ -62,7 +62,7 @@ class FitOptions:
     """What is fitted to the photos.
 
     Args:
-        fit: ``"full"``: all parameters; ``"color"``: the base colours; ``"none"``: nothing.
+        fit: ``"full"``: all parameters; ``"none"``: nothing.
         effort: ``"draft"``, ``"fast"``, ``"default"`` or ``"best"``: what ``fit_steps`` are unless given.
         fit_steps: Steps of the full fit, one view each; None: by effort, and more for more Gaussians, see
             :meth:`with_steps_for`.
@@ -162,8 +162,8 @@ class FitOptions:
     def __post_init__(self) -> None:
         if isinstance(self.rates, dict):  # as CompactOptions.to_dict() and JSON have it
             object.__setattr__(self, "rates", LearningRates(**self.rates))
-        if self.fit not in ("none", "color", "full"):
-            raise ValueError(f'fit: expected "none", "color" or "full", got "{self.fit}"')
+        if self.fit not in ("none", "full"):
+            raise ValueError(f'fit: expected "none" or "full", got "{self.fit}"')
         if self.poses not in ("auto", "fixed", "free"):
             raise ValueError(f'poses: expected "auto", "fixed" or "free", got {self.poses!r}')
         if self.effort not in STEPS:

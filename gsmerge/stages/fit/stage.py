@@ -94,20 +94,18 @@ def fit_with(
         return gaussians, None
     full, half = photos[:2]
     keep = backend.visible_mask(gaussians, half, options.min_contribution)
-    kept, close = gaussians[keep], CLOSE
+    kept = gaussians[keep]
     if options.fit == "none":
         return kept, None
-    if options.fit == "full":
-        fitted, report = backend.fit_full(kept, photos, options, count, seed, progress, baseline_start=baseline_start)
-        fitted, report = _better_of(backend, full, kept, fitted, report, close)
-        if report.accepted:
-            return fitted, report
-        close = ALWAYS
-        if options.grows:  # the stages before left room for a growth that did not happen
-            fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
-            return _better_of(backend, full, kept, fitted, report, close) if report.accepted else (kept, report)
+    fitted, report = backend.fit_full(kept, photos, options, count, seed, progress, baseline_start=baseline_start)
+    fitted, report = _better_of(backend, full, kept, fitted, report, CLOSE)
+    if report.accepted:
+        return fitted, report
+    if options.grows:  # the stages before left room for a growth that did not happen
+        fitted, report = backend.fit_colors(backend.grow(kept, half, count), half, options, seed)
+        return _better_of(backend, full, kept, fitted, report, ALWAYS) if report.accepted else (kept, report)
     fitted, report = backend.fit_colors(gaussians, half, options, seed)
-    return _better_of(backend, full, kept, fitted[keep], report, close)
+    return _better_of(backend, full, kept, fitted[keep], report, ALWAYS)
 
 
 def _better_of(

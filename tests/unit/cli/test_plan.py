@@ -65,7 +65,7 @@ def test_plan_says_what_will_not_run() -> None:
 
     assert runs() == (False, "full")
     assert runs(fit="color") == (True, "color")
-    assert runs(fit="color", robust=False) == (False, "color")
+    assert runs(fit="color") == (False, "color")
     assert runs(fit="none", effort="draft") == (False, "none")
     assert runs(robust=True) == (True, "full")
     assert runs(photos=False) == (False, "none")
@@ -73,7 +73,7 @@ def test_plan_says_what_will_not_run() -> None:
 
 
 def test_plan_of_less_work_takes_less() -> None:
-    full, lean = plan()["estimate"], plan(robust=False, fit="none")["estimate"]
+    full, lean = plan()["estimate"], plan(fit="none")["estimate"]
     assert lean["seconds"] < full["seconds"]
     assert plan(photos=False)["estimate"]["memory_bytes"] < full["memory_bytes"]
     assert all(line for line in plan_lines(plan()))

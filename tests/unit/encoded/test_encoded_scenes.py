@@ -92,7 +92,7 @@ def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: PixelScene
         {"k": 8},
         {"budget": "auto"},
         {"effort": "draft", "k": 2},
-        {"robust": False, "match": "aabb", "k": 2},
+        {"match": "aabb", "k": 2},
         {"rule": "paper", "k": 2},
         {"min_opacity": 0.3, "k": 2},
         {"min_contribution": 0.2},
@@ -202,7 +202,7 @@ def test_wishes_that_cannot_be_met(wish: dict[str, Any], words: str, encoded: En
     ("settings", "words"),
     [
         ({"fit": "full"}, "fit full: cannot be encoded"),
-        ({"fit": "color"}, "fit color: cannot be encoded"),
+        ("fit color: cannot be encoded"),
         ({"method": "voxel"}, "method voxel: cannot be encoded"),
         ({"levels": 2}, "levels: cannot be encoded"),
         ({"quality": "-0.1dB"}, "quality -0.1dB: cannot be encoded"),

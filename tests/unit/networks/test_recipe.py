@@ -42,7 +42,7 @@ def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_recipe_is_its_settings(scene: PixelScene, absolute: Path) -> None:
     actual = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute))
-    settings = {"segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "robust": False, "fit": "none"}
+    settings = {"segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "fit": "none"}
     expected = scenes.compacted(scene, **settings, checkpoint=str(absolute))
     assert np.array_equal(actual.gaussians.means, expected.gaussians.means)
     assert actual.report.options["recipe"] == "paper"

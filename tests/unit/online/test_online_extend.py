@@ -234,7 +234,7 @@ def test_what_no_view_sees_is_kept(pairs: list[PixelScene]) -> None:
     kept = state_of(compactor).kept
     assert kept is not None
     num = len(kept)
-    for wish in ({"fit": "none"}, {"fit": "color"}, {"fit": "full", "fit_steps": 30}):
+    for wish in ({"fit": "none"}, {"fit": "full", "fit_steps": 30}):
         actual = compactor.decode(**wish)
         assert int((actual.means[:, 2] < -10).sum()) == num, wish
         expected = len(compactor) + num + 60
@@ -295,7 +295,7 @@ def test_higher_harmonics_of_the_same_degree() -> None:
 # decoding
 
 
-@pytest.mark.parametrize("fit", ["none", "color", "full"])
+@pytest.mark.parametrize("fit", ["none", "full"])
 def test_a_budget_is_met(fit: str, pairs: list[PixelScene]) -> None:
     compactor = fed(pairs)
     expected = len(compactor) + 60

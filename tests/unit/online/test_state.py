@@ -255,7 +255,7 @@ def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: PixelSce
 
 @pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"k": 2, "rule": "paper"}], ids=str)
 def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: PixelScene) -> None:
-    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False, **settings)
+    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", **settings)
     state = from_encoded(encoded)
     assert state.settings.target_count is None
     assert state.settings.max_k == encoded.settings.max_k
@@ -268,7 +268,7 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Pixel
 def test_division_between_one_and_most_is_about_as_good(pixels: PixelScene) -> None:
     """Children are divided again, of what they are and not of the pixels: close, not equal."""
     for rule in ("depth", "paper"):
-        encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False, rule=rule)
+        encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", rule=rule)
         again = to_encoded(from_encoded(encoded))
         for k in (2, 3):
             before, after = (scenes.psnr_of(decode_scene(one, k=k), pixels) for one in (encoded, again))
@@ -301,7 +301,7 @@ def test_what_is_told_of_an_encoded_scene(pixels: PixelScene) -> None:
 
 
 def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: PixelScene) -> None:
-    state = from_encoded(encode_scene(pixels, superpixels="5%", checkpoint="none", robust=False))
+    state = from_encoded(encode_scene(pixels, superpixels="5%", checkpoint="none"))
     state = replace(state, groups=replace(state.groups, fitted_sh0=state.groups.fitted_sh0 + 0.2 / SH_C0))
     as_came, fitted = to_encoded(state, fitted_colors=False), to_encoded(state)
     np.testing.assert_array_equal(as_came.features.sh0, state.groups.features.sh0)

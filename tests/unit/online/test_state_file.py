@@ -153,7 +153,7 @@ def test_what_is_not_known_is_not_looked_at(path: Path, state: OnlineState) -> N
 
 
 def test_an_encoded_scene_is_one_too(tmp_path: Path) -> None:
-    encoded = encode_scene(room(2), superpixels="10%", robust=False, checkpoint="none")
+    encoded = encode_scene(room(2), superpixels="10%", checkpoint="none")
     save_encoded(tmp_path / "scene.gsm", encoded)
     assert isinstance(load_stored(tmp_path / "scene.gsm"), Encoded)
     assert len(load_state(tmp_path / "scene.gsm")) == len(encoded)

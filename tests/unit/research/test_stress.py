@@ -20,7 +20,7 @@ from gsmerge.research.stress import CASES, cases, run, stress
 from gsmerge.research.stress.cases import StressScene
 from gsmerge.types import PixelScene, UnalignedScene
 
-FAST = CompactOptions().with_settings({"fit": "none", "robust": False})
+FAST = CompactOptions().with_settings({"fit": "none"})
 
 
 @pytest.fixture(scope="module")

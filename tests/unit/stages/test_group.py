@@ -21,7 +21,7 @@ def scene() -> PixelScene:
 
 
 def prepared_scene(scene: PixelScene, **settings: object) -> PreparedScene:
-    return prepare(scene, CompactOptions().with_settings({"fit": "none", "robust": False} | settings))
+    return prepare(scene, CompactOptions().with_settings({"fit": "none"} | settings))
 
 
 def test_gaussians_follow_the_number_of_superpixels(scene: PixelScene) -> None:

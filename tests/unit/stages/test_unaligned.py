@@ -158,11 +158,11 @@ def test_neighbours_are_merged(room: PixelScene) -> None:
     assert np.allclose(all_of_them.means.sum(0), room.gaussians.means[:20].sum(0), atol=1e-4)
 
 
-@pytest.mark.parametrize("settings", [{}, {"budget": 150}, {"fit": "color"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"budget": 150}], ids=str)
 def test_unseen_ones_are_dropped_or_kept(room: PixelScene, settings: dict) -> None:
     hidden = loose.far_behind(room.gaussians, 600)
     scene = replace(loose.loosened(room), gaussians=type(hidden).concat([room.gaussians, hidden]))
-    options = {"superpixels": "10%", "robust": False, "fit": "none", **settings}
+    options = {"superpixels": "10%", "fit": "none", **settings}
     dropped, kept = (compact(scene, unseen=unseen, **options) for unseen in ("drop", "keep"))
     behind = [int((result.gaussians.means[:, 2] < -5).sum()) for result in (dropped, kept)]
     assert behind[0] == 0

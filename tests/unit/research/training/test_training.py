@@ -175,7 +175,7 @@ def test_training_lowers_the_loss(shard: Shard, tmp_path: Path) -> None:
 
 def test_a_trained_checkpoint_works(shard: Shard, tmp_path: Path) -> None:
     done = train([shard], [], tmp_path, replace(OPTIONS, steps=4))
-    chosen = {"fit": "none", "superpixels": "10%", "robust": False}
+    chosen = {"fit": "none", "superpixels": "10%"}
     plain = gsmerge.compact(scene(), **chosen)
     learned = gsmerge.compact(scene(), **chosen, checkpoint=str(done.last), require_checkpoint=True)
     assert not np.array_equal(plain.gaussians.means, learned.gaussians.means)

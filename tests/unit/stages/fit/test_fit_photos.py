@@ -48,7 +48,7 @@ def with_large(scene: PixelScene, scale: float, read: list[int] | None = None) -
     ("larger", "settings", "expected"),
     [
         (4, {}, 2), (1.5, {}, 1.5), (1.2, {}, 1), (4, {"effort": "fast"}, 1), (4, {"effort": "best"}, 2),
-        (4, {"fit": "color"}, 1), (4, {"fit_steps": 12}, 1), (4, {"photo_scale": 1}, 1), (4, {"photo_scale": 3}, 3),
+        (4, 1), (4, {"fit_steps": 12}, 1), (4, {"photo_scale": 1}, 1), (4, {"photo_scale": 3}, 3),
         (4, {"photo_scale": 1.5, "effort": "fast"}, 1.5), (1.2, {"photo_scale": 1.1}, 1.1),
     ],
     ids=str,

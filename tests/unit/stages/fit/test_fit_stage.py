@@ -83,7 +83,7 @@ def test_stage_prunes_before_it_fits(truth: Gaussians, photos: Pair) -> None:
         assert len(both) == len(alone)
 
 
-@pytest.mark.parametrize("method", ["none", "color", "full"])
+@pytest.mark.parametrize("method", ["none", "full"])
 def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
     result, _ = fit(truth[:0], photos, replace(QUICK, fit=method))  # type: ignore[arg-type]
     assert len(result) == 0

@@ -1,0 +1,81 @@
+"""merged views -> merged views: the start with networks or the one without, whichever shows the views better."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from gsmerge.moments import Rule
+from gsmerge.render.photos import Photos, photo_errors, scene_photos, scene_pictures
+from gsmerge.runtime.memory import release_memory
+from gsmerge.stages.decode import DecodeOptions, decode
+from gsmerge.stages.merge import MergedViews
+from gsmerge.types import Gaussians, PixelScene, UnalignedScene
+from gsmerge.views import pick_views
+
+MAX_VIEWS = 6  # that a start is judged by
+
+
+def choose_start(
+    starts: Sequence[MergedViews], scene: PixelScene | UnalignedScene, options: DecodeOptions, rule: Rule
+) -> MergedViews:
+    """With or without networks: the start whose Gaussians, one for each Feature Gaussian, show the views better.
+
+    The choice does not depend on K, so what is encoded once is what every K begins with. Networks learn what real
+    exports suffer from; a scene without those errors is better left as it is.
+
+    Args:
+        starts: The learned start, then the analytic one.
+        scene: The canonical scene.
+        options: Of decoding; K = 1 is taken.
+        rule: How children are pooled.
+
+    Returns:
+        The better start, of equal ones the analytic, with its Gaussians and the PSNR (dB) of both among its choices.
+    """
+    scores: dict[str, float] = {}
+    best = starts[0]
+    for start in starts:
+        name = "analytic" if start.networks is None else "learned"
+        ones = decode(start.features, start.members, replace(options, k=1), None, rule, start.networks)
+        release_memory()  # of the networks, in other threads
+        scores[name] = views_psnr(ones, scene)
+        if scores[name] >= max(scores.values()):
+            best = replace(start, k1_gaussians=ones)
+    return replace(best, choices={**best.choices, "start_scores": scores})
+
+
+def views_psnr(gaussians: Gaussians, scene: PixelScene | UnalignedScene) -> float:
+    """PSNR (dB) of the views at half size, over the pixels that have a Gaussian of their own.
+
+    Args:
+        gaussians: Canonical Gaussians.
+        scene: The canonical scene; without photos, the colours of its pixels stand in for them.
+    """
+    photos = _photos(scene)
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> tuple[float, float]:
+        error = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).sum(-1)
+        weight = _weight(scene, view, photos)
+        return float((error * weight).sum(dtype=np.float64)), float(weight.sum(dtype=np.float64))
+
+    error, count = np.sum(photo_errors(gaussians, photos, score, pick_views(len(photos), MAX_VIEWS)), axis=0)
+    return float(-10 * np.log10(max(error / max(3 * count, 1), 1e-12)))
+
+
+def _photos(scene: PixelScene | UnalignedScene) -> Photos:
+    """The photos at half size, or the pictures that stand in for them."""
+    if scene.images is None:
+        scene = replace(scene, images=scene_pictures(scene))
+    return scene_photos(scene, 2)
+
+
+def _weight(scene: PixelScene | UnalignedScene, view: int, photos: Photos) -> np.ndarray:
+    """``[h,w]`` share of each half-size pixel that has Gaussians; ones where Gaussians belong to no pixels."""
+    size = photos.width, photos.height
+    if isinstance(scene, UnalignedScene):
+        return np.ones(size[::-1], np.float32)
+    return cv2.resize(scene.valid[view].astype(np.float32), size, interpolation=cv2.INTER_AREA)
